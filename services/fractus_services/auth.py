@@ -50,7 +50,7 @@ class Caller:
         Raises:
             NotAuthenticated: The certificate has expired.
         """
-        if not self.left_s:
+        if self.until_s <= steady_s():
             raise NotAuthenticated("the client certificate has expired; reconnect with the renewed one")
 
 

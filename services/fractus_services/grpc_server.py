@@ -1,35 +1,157 @@
-"""gRPC server of both services: binding, a server interceptor, and the lifetime of the process."""
+"""gRPC server of both services: admission of calls, conversion of errors to a status, and lifetime of the process."""
 
 from __future__ import annotations
 
 import asyncio
 import logging
 import os
-from collections.abc import Awaitable, Callable, Coroutine
+import time
+from collections import Counter
+from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine
+from contextlib import asynccontextmanager
 from typing import Any
 
 import grpc
+from fractus_core.policy.decision_types import Verdict
 from fractus_runtime import tracing
+from google.protobuf.message import DecodeError
 
-from fractus_services.admission import CallAdmission
-from fractus_services.auth import SERVER_OPTIONS, TlsFiles
+from fractus_services.auth import SERVER_OPTIONS, Caller, Callers, TlsFiles
+from fractus_services.error_details import abort
+from fractus_services.errors import (
+    InternalError,
+    InvalidRequest,
+    NotAuthenticated,
+    PolicyDenied,
+    Refused,
+    ResourceExhausted,
+)
+from fractus_services.grant_files import ActiveGrant, GrantFiles
 from fractus_services.options import CannotServe
 
 log = logging.getLogger(__name__)
 
+CALLS_PER_S = 50.0
+BURST = 100.0
+"""Rate and burst of calls of one identity. A driver that streams setpoints stays far below it."""
+
+URGENT_PER_S = 20.0
+URGENT_BURST = 40.0
+"""Rate and burst of urgent calls, which only make the flight safer. They are counted separately from other calls."""
+
+MAX_OPEN_CALLS = 32
+"""Maximum number of concurrent calls of one identity, including streams."""
+
+REQUEST_TIMEOUT_S = 10.0
+"""Time between the start of a call and its request message. Clients send both together, but a bad link may delay the second."""
+
 STOP_TIMEOUT_S = 2.0
+"""Time for which open calls may continue when the server stops."""
+
+_MAX_COUNTED = 1_000
 
 
-class CallInterceptor(grpc.aio.ServerInterceptor):  # type: ignore[misc]  # grpc has no types
-    """Traces calls, and decodes requests after their callers are authenticated and counted.
+class RateLimiter:
+    """A token bucket for each caller, so that a flood affects its sender only."""
+
+    def __init__(self, rate: float = CALLS_PER_S, burst: float = BURST) -> None:
+        self._rate = rate
+        self._burst = burst
+        self._buckets: dict[str, tuple[float, float]] = {}
+
+    def take(self, identity: str, time_s: float) -> None:
+        """Take one token of a caller.
+
+        Args:
+            identity: Identity of the caller.
+            time_s: Monotonic time in seconds.
+
+        Raises:
+            ResourceExhausted: The caller has no token left. The error contains the time until the next token.
+        """
+        tokens, updated_s = self._buckets.get(identity, (self._burst, time_s))
+        tokens = min(self._burst, tokens + max(time_s - updated_s, 0.0) * self._rate)
+        if tokens < 1.0:
+            self._buckets[identity] = (tokens, time_s)
+            reason = f"more than {self._rate:.0f} calls per second; slow down"
+            raise ResourceExhausted("TooManyCalls", reason, retry_after_s=(1.0 - tokens) / self._rate)
+        self._buckets[identity] = (tokens - 1.0, time_s)
+        if len(self._buckets) > _MAX_COUNTED:
+            full_s = self._burst / self._rate
+            self._buckets = {name: bucket for name, bucket in self._buckets.items() if time_s - bucket[1] < full_s}
+
+
+class CallAdmission(grpc.aio.ServerInterceptor):  # type: ignore[misc]  # grpc has no types
+    """Admits the calls of one service, traces them, and ends failed calls with a status.
 
     Args:
-        admission: Authenticates and limits callers.
+        grants: Grants of this node.
+        clock: Returns Unix time.
+        translate: Converts an exception of the service to a refusal, or returns None for an unknown exception.
+        failed: Callback invoked with the verdict on an unexpected exception.
+        on_passenger: Callback invoked with the Grant of a caller that is no driver, whenever its Grant is looked up.
     """
 
-    def __init__(self, admission: CallAdmission) -> None:
-        self._admission = admission
+    def __init__(
+        self,
+        grants: GrantFiles,
+        clock: Callable[[], float],
+        translate: Callable[[Exception], Refused | None] = lambda _error: None,
+        failed: Callable[[Verdict], None] = lambda _verdict: None,
+        on_passenger: Callable[[ActiveGrant], None] = lambda _grant: None,
+    ) -> None:
+        self._grants = grants
+        self._callers = Callers(clock)
+        self._translate = translate
+        self._failed = failed
+        self._on_passenger = on_passenger
+        self._limiter = RateLimiter()
+        self._urgent_limiter = RateLimiter(URGENT_PER_S, URGENT_BURST)
+        self._open: Counter[str] = Counter()
         self._handlers: dict[str, grpc.RpcMethodHandler] = {}
+
+    @asynccontextmanager
+    async def call(self, context: Any, urgent: bool = False, lasting: bool = False) -> AsyncIterator[Caller]:
+        """Admit a call, and yield its caller. Exceptions within the block end the call with a status.
+
+        Args:
+            context: gRPC context of the call.
+            urgent: True if the call only makes the flight safer. It needs no deadline, may use a certificate that has expired
+                since the handshake, and has its own rate limit.
+            lasting: True for a stream that keeps the caller's control lease alive. It needs no deadline.
+        """
+        admitted = ""
+        try:
+            caller = self._callers.of(context.auth_context(), urgent)
+            tracing.call_span().set_attribute("fractus.caller", caller.identity)
+            limiter = self._urgent_limiter if urgent else self._limiter
+            limiter.take(caller.identity, time.monotonic())
+            if not urgent and self._open[caller.identity] >= MAX_OPEN_CALLS:
+                reason = f"{MAX_OPEN_CALLS} calls are in progress; end one before the next"
+                raise ResourceExhausted("TooManyCalls", reason, retry_after_s=1.0)
+            admitted = caller.identity
+            self._open[admitted] += 1
+            if not (urgent or lasting) and context.time_remaining() is None:
+                reason = "the call has no deadline; set a timeout, as the SDK does"
+                raise InvalidRequest("DeadlineMissing", reason)
+            yield caller
+        except Refused as refusal:
+            await abort(context, refusal)
+        except grpc.aio.AbortError:
+            raise
+        except Exception as error:
+            known = self._translate(error)
+            if known is not None:
+                await abort(context, known)
+            log.exception("rpc: unexpected error, call refused")
+            reason = "the service failed; nothing was done"
+            self._failed(Verdict("deny", None, "InternalError", reason, (), "hover"))
+            await abort(context, InternalError("InternalError", reason))
+        finally:
+            if admitted:
+                self._open[admitted] -= 1
+                if not self._open[admitted]:
+                    del self._open[admitted]
 
     async def intercept_service(
         self,
@@ -42,21 +164,85 @@ class CallInterceptor(grpc.aio.ServerInterceptor):  # type: ignore[misc]  # grpc
             handler = await continuation(details)
             if handler is None:
                 return None
-            wrapped = _traced(details.method.lstrip("/"), self._admission.decoded(handler))
+            wrapped = self.wrap(details.method.lstrip("/"), handler)
             self._handlers[details.method] = wrapped
         return wrapped
 
+    def wrap(self, method: str, handler: grpc.RpcMethodHandler) -> grpc.RpcMethodHandler:
+        """Wrap a handler so that its calls are traced, and requests are decoded after their caller is counted.
 
-def _traced(method: str, handler: grpc.RpcMethodHandler) -> grpc.RpcMethodHandler:
-    """Wrap a handler of a request stream in a span that begins before its caller is authenticated."""
-    handle = handler.stream_unary or handler.stream_stream
+        Malformed requests then count as well. gRPC starts the handler of a method with a single request only after the request
+        has arrived, and keeps calls whose request never arrives. The wrapped handler therefore has a request stream, and reads
+        one message from it.
 
-    async def behaviour(requests: Any, context: Any) -> Any:
-        with tracing.server_span(method, context.invocation_metadata(), grpc.aio.AbortError):
-            return await handle(requests, context)
+        Args:
+            method: `package.Service/Method`.
+            handler: Handler with a single request.
+        """
+        decode = handler.request_deserializer
+        handle = handler.unary_unary or handler.unary_stream
+        unsent: Counter[str] = Counter()
 
-    build = grpc.stream_unary_rpc_method_handler if handler.stream_unary else grpc.stream_stream_rpc_method_handler
-    return build(behaviour, handler.request_deserializer, handler.response_serializer)
+        async def behaviour(_requests: Any, context: Any) -> Any:
+            with tracing.server_span(method, context.invocation_metadata(), grpc.aio.AbortError):
+                body = await self._received(unsent, context)
+                try:
+                    request = None if body is grpc.aio.EOF else decode(body)
+                except DecodeError:
+                    request = None
+                if request is not None:
+                    return await handle(request, context)
+                async with self.call(context, lasting=True):
+                    raise InvalidRequest(
+                        "InvalidArgument", "cannot decode the request; send the request message of this method"
+                    )
+
+        build = grpc.stream_unary_rpc_method_handler if handler.unary_unary else grpc.stream_stream_rpc_method_handler
+        return build(behaviour, None, handler.response_serializer)
+
+    async def _received(self, unsent: Counter[str], context: Any) -> Any:
+        """Return the request of a call as bytes, or EOF. End the call if the request is late, or if too many calls wait.
+
+        Args:
+            unsent: Number of calls of each identity whose request has not arrived.
+            context: gRPC context of the call.
+        """
+        try:
+            identity = self._callers.of(context.auth_context(), True).identity
+        except NotAuthenticated:
+            identity = ""
+        if unsent[identity] >= MAX_OPEN_CALLS:
+            reason = f"{MAX_OPEN_CALLS} calls of this method wait for their request; send the request with the call"
+            await abort(context, ResourceExhausted("TooManyCalls", reason, retry_after_s=1.0))
+        unsent[identity] += 1
+        try:
+            async with asyncio.timeout(REQUEST_TIMEOUT_S):
+                return await context.read()
+        except TimeoutError:
+            reason = f"no request arrived within {REQUEST_TIMEOUT_S:.0f} s of the call; send the request with the call"
+            await abort(context, InvalidRequest("InvalidArgument", reason))
+        finally:
+            unsent[identity] -= 1
+            if not unsent[identity]:
+                del unsent[identity]
+
+    def grant_of(self, caller: Caller) -> ActiveGrant:
+        """Return the Grant of a caller.
+
+        Raises:
+            PolicyDenied: The caller has no Grant on this node.
+        """
+        grant = self._grants.of(caller.identity)
+        if grant is None:
+            log.warning(
+                "policy: call refused because the caller has no Grant on this node (caller=%s)",
+                caller.identity,
+                extra={"limit_by": caller.identity},
+            )
+            raise PolicyDenied("NoGrant", f"{caller.identity} has no Grant on this node")
+        if grant.spec.class_ != "driver":
+            self._on_passenger(grant)
+        return grant
 
 
 async def serve_grpc(
@@ -79,7 +265,7 @@ async def serve_grpc(
     # Importing the tracing libraries takes seconds on a small computer. A thread keeps the service responsive for a drone in
     # flight.
     close_tracing = await asyncio.to_thread(tracing.configure, name, node, os.environ)
-    server = grpc.aio.server(interceptors=[CallInterceptor(admission)], options=SERVER_OPTIONS)
+    server = grpc.aio.server(interceptors=[admission], options=SERVER_OPTIONS)
     try:
         try:
             server.add_secure_port(listen, tls.server_credentials())

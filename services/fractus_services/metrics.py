@@ -15,8 +15,12 @@ MAX_POLICIES = 200
 """Maximum number of policies with their own label. Verdicts of further policies have the label `other`."""
 
 
-class DecisionMetrics:
-    """Counters of decisions, fed with the entries of the audit log."""
+class ServiceMetrics:
+    """All metrics of a service.
+
+    Decisions are counted from the entries of the audit log. Metrics of the components are collected when Prometheus scrapes
+    them.
+    """
 
     def __init__(self) -> None:
         self._verdicts = Counter(
@@ -41,9 +45,10 @@ class DecisionMetrics:
             registry=None,
         )
         self._named: set[str] = set()
+        self._callbacks: list[Callable[[], Iterator[Metric]]] = []
 
     def take_entry(self, entry: dict[str, Any]) -> None:
-        """Count an entry if it contains a decision."""
+        """Count an entry of the audit log if it contains a decision."""
         match entry:
             case {"kind": "call", "action": str(action), "code": str(code), "policies": policies}:
                 self._verdicts.labels(action, code).inc()
@@ -54,39 +59,21 @@ class DecisionMetrics:
             case {"kind": "monitor", "action": str(action), "code": str(code)}:
                 self._interventions.labels(action, code).inc()
 
-    def collect(self) -> Iterator[Metric]:
-        """Yield the current counts."""
-        for counter in (self._verdicts, self._by_policy, self._takeovers, self._interventions):
-            yield from counter.collect()
-
-    def _name(self, policy: str) -> str:
-        if len(self._named) < MAX_POLICIES:
-            self._named.add(policy)
-        return policy if policy in self._named else "other"
-
-
-class ServiceMetrics:
-    """All metrics of a service.
-
-    Metrics of the components are collected when Prometheus scrapes them.
-    """
-
-    def __init__(self) -> None:
-        self._decisions = DecisionMetrics()
-        self._callbacks: list[Callable[[], Iterator[Metric]]] = [self._decisions.collect]
-
-    def take_entry(self, entry: dict[str, Any]) -> None:
-        """Count an entry of the audit log if it contains a decision."""
-        self._decisions.take_entry(entry)
-
     def add_callback(self, callback: Callable[[], Iterator[Metric]]) -> None:
         """Add a callback that returns metrics at each scrape."""
         self._callbacks.append(callback)
 
     def collect(self) -> Iterator[Metric]:
         """Yield all metrics."""
+        for counter in (self._verdicts, self._by_policy, self._takeovers, self._interventions):
+            yield from counter.collect()
         for callback in self._callbacks:
             yield from callback()
+
+    def _name(self, policy: str) -> str:
+        if len(self._named) < MAX_POLICIES:
+            self._named.add(policy)
+        return policy if policy in self._named else "other"
 
 
 def telemetry_age(age_s: float) -> Metric:

@@ -21,7 +21,7 @@ from fractus_core.linking import NO_LINK, PathMetrics, Peer
 from fractus_runtime.audit import AuditLog
 from fractus_runtime.metrics import metrics_text
 from fractus_services.grant_files import GrantFiles
-from fractus_services.metrics import MAX_POLICIES, DecisionMetrics, ServiceMetrics, common_metrics
+from fractus_services.metrics import MAX_POLICIES, ServiceMetrics, common_metrics
 from fractus_services.mobility.rpc.flight_metrics import flight_metrics
 from mobility_world import World, spec
 from prometheus_client import Metric
@@ -38,7 +38,7 @@ def entry(kind: str, action: str, *policies: str, **more: str) -> dict[str, Any]
 
 
 def test_decision_metrics_count_entries_of_the_audit_log() -> None:
-    decisions = DecisionMetrics()
+    decisions = ServiceMetrics()
     for each in (
         entry("call", "allow"),
         entry("call", "correct", "fence"),
@@ -61,7 +61,7 @@ def test_decision_metrics_count_entries_of_the_audit_log() -> None:
 
 
 def test_decision_metrics_limit_the_number_of_policy_labels() -> None:
-    decisions = DecisionMetrics()
+    decisions = ServiceMetrics()
     for number in range(MAX_POLICIES + 10):
         decisions.take_entry(entry("call", "deny", f"policy-{number}"))
     seen = values(text(decisions.collect))

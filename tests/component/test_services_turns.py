@@ -13,7 +13,7 @@ import grpc
 import pytest
 from fractus_core.policy.decision_types import Call, TakeoffArgs, Verdict
 from fractus_proto.v1 import mobility_pb2
-from fractus_services import admission, background
+from fractus_services import background, grpc_server
 from fractus_services.auth import Caller
 from fractus_services.background import in_slices
 from fractus_services.grant_files import ActiveGrant
@@ -64,7 +64,7 @@ class Context:
 
 @pytest.fixture
 def world(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[], World]:
-    monkeypatch.setattr(admission.Callers, "of", lambda _self, grant, _urgent: Caller(grant.identity, math.inf))
+    monkeypatch.setattr(grpc_server.Callers, "of", lambda _self, grant, _urgent: Caller(grant.identity, math.inf))
     return lambda: World(tmp_path)
 
 

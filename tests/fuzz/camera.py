@@ -30,11 +30,11 @@ with atheris.instrument_imports(include=["fractus_services.camera"]):
 import numpy as np
 from camera_world import Drone, Finder, active_grant, private
 from fractus_proto.v1 import camera_pb2, camera_pb2_grpc
-from fractus_services.admission import CallAdmission
 from fractus_services.camera.camera_properties import CameraProperties
 from fractus_services.camera.drivers.driver import CameraFailed, CaptureRequest
 from fractus_services.camera.pixels import Pixels, limit_width
 from fractus_services.grant_files import ActiveGrant
+from fractus_services.grpc_server import CallAdmission
 from mobility_world import Grants
 from policy_world import NOW
 from virtual_time import fly

@@ -21,7 +21,7 @@ import grpc
 # Imported first, without instrumentation, because the simulation would be several times slower with it.
 from mobility_world import World, spec, touring, zone
 
-with atheris.instrument_imports(include=["fractus_services.mobility.rpc", "fractus_services.admission"]):
+with atheris.instrument_imports(include=["fractus_services.mobility.rpc", "fractus_services.grpc_server"]):
     from fractus_services.mobility.rpc.handlers import MobilityHandlers
 from fractus_core.api.names import node_identity
 from fractus_proto.v1 import mobility_pb2, mobility_pb2_grpc
@@ -88,7 +88,7 @@ class Flight:
             chains += [*STRANGE, (of(active.identity, 1),), node]
             handlers = MobilityHandlers(
                 world.service, world.control, world.streams, grants=world.grants, node=NODE, clock=time.time,  # type: ignore[arg-type]
-                on_call=world.tours.passenger_called,
+                on_passenger=world.tours.passenger_called,
             )  # fmt: skip
             registry = Registry(handlers.admission)
             mobility_pb2_grpc.add_MobilityServiceServicer_to_server(handlers, registry)

@@ -96,7 +96,7 @@ class Registry:
 
     def add_registered_method_handlers(self, _service: str, handlers: dict[str, grpc.RpcMethodHandler]) -> None:
         """Keep the handlers as the service wraps them: requests are decoded after the admission of their caller."""
-        self.handlers |= {name: self._admission.decoded(handler) for name, handler in handlers.items()}
+        self.handlers |= {name: self._admission.wrap(name, handler) for name, handler in handlers.items()}
 
 
 class Context:
@@ -111,6 +111,10 @@ class Context:
 
     async def read(self) -> Any:
         return self.body
+
+    def invocation_metadata(self) -> tuple[tuple[str, str], ...]:
+        """Return no metadata."""
+        return ()
 
     def auth_context(self) -> dict[str, Any]:
         return {"x509_pem_cert": list(self._chain)}

@@ -22,7 +22,7 @@ from fractus_core.api.names import OPERATOR_IDENTITY, component_identity, node_i
 from fractus_proto.v1 import camera_pb2, camera_pb2_grpc, mobility_pb2_grpc, types_pb2
 from fractus_proto.v1 import mobility_pb2 as pb
 from fractus_runtime.audit_chain import verify
-from fractus_services.admission import BURST, CALLS_PER_S, MAX_OPEN_CALLS
+from fractus_services.grpc_server import BURST, CALLS_PER_S, MAX_OPEN_CALLS
 from google.rpc import error_details_pb2
 from grpc_status import rpc_status
 from mobility_rig import (

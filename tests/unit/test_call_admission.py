@@ -12,10 +12,10 @@ from typing import Any, cast
 import grpc
 import pytest
 from fractus_proto.v1 import types_pb2
-from fractus_services import admission
-from fractus_services.admission import BURST, MAX_OPEN_CALLS, URGENT_BURST, CallAdmission
+from fractus_services import grpc_server
 from fractus_services.auth import Caller
 from fractus_services.errors import PolicyDenied
+from fractus_services.grpc_server import BURST, MAX_OPEN_CALLS, URGENT_BURST, CallAdmission
 from google.protobuf import any_pb2
 from google.rpc import error_details_pb2, status_pb2
 
@@ -49,6 +49,9 @@ class Context:
     def time_remaining(self) -> float | None:
         return self.remaining_s
 
+    def invocation_metadata(self) -> tuple[tuple[str, str], ...]:
+        return ()
+
     async def abort(self, code: grpc.StatusCode, text: str, metadata: Any) -> None:
         status = status_pb2.Status()
         status.ParseFromString(dict(metadata)["grpc-status-details-bin"])
@@ -58,8 +61,8 @@ class Context:
 @pytest.fixture
 def calls(monkeypatch: pytest.MonkeyPatch) -> CallAdmission:
     known = Caller("spiffe://fractus.dev/a", math.inf)
-    monkeypatch.setattr(admission.Callers, "of", lambda _self, _context, _urgent: known)
-    monkeypatch.setattr(admission.time, "monotonic", lambda: 1.0)
+    monkeypatch.setattr(grpc_server.Callers, "of", lambda _self, _context, _urgent: known)
+    monkeypatch.setattr(grpc_server.time, "monotonic", lambda: 1.0)
     return CallAdmission(cast("Any", None), lambda: 0.0)
 
 
@@ -106,7 +109,9 @@ async def test_number_of_calls_waiting_for_request_is_limited(calls: CallAdmissi
     async def echo(request: bytes, _context: Any) -> bytes:
         return request + b", answered"
 
-    method = calls.decoded(grpc.unary_unary_rpc_method_handler(echo, lambda body: body)).stream_unary
+    method = calls.wrap(
+        "fractus.v1.Service/Method", grpc.unary_unary_rpc_method_handler(echo, lambda body: body)
+    ).stream_unary
     waiting = [asyncio.create_task(method(None, Slow())) for _ in range(MAX_OPEN_CALLS)]
     await asyncio.sleep(0)
     with pytest.raises(Aborted, match="RESOURCE_EXHAUSTED: 32 calls of this method wait") as refusal:
@@ -132,7 +137,7 @@ async def test_call_without_deadline_is_refused(calls: CallAdmission, urgent: bo
 async def test_unexpected_error_refuses_call_and_is_reported(
     error: Callable[[], Exception], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(admission.Callers, "of", lambda _self, _context, _urgent: Caller("a", math.inf))
+    monkeypatch.setattr(grpc_server.Callers, "of", lambda _self, _context, _urgent: Caller("a", math.inf))
     codes: list[str] = []
     calls = CallAdmission(cast("Any", None), lambda: 0.0, failed=lambda verdict: codes.append(verdict.code))
     with pytest.raises(Aborted, match="INTERNAL: the service failed; nothing was done"):

@@ -11,9 +11,10 @@ from typing import Any
 import pytest
 from fractus_core.policy.compiled_grant import CompiledGrant, compile_grant
 from fractus_services import grant_files as module
-from fractus_services.admission import RateLimiter
+from fractus_services.errors import ResourceExhausted
 from fractus_services.grant_files import ActiveGrant, GrantFiles
 from fractus_services.grant_verifier import GrantVerifier
+from fractus_services.grpc_server import RateLimiter
 from grant_signing import CA_PEM, signed
 from policy_world import spec
 
@@ -207,12 +208,21 @@ def test_grant_files_call_other_listeners_when_one_fails(tmp_path: Path) -> None
     assert missions == ["u1"]
 
 
+def retry_after_s(limiter: RateLimiter, identity: str, time_s: float) -> float:
+    """Take a token and return the seconds until the next one; 0 if there was one."""
+    try:
+        limiter.take(identity, time_s)
+    except ResourceExhausted as refusal:
+        return refusal.retry_after_s
+    return 0.0
+
+
 def test_rate_limiter_delays_burst_and_refills() -> None:
     limiter = RateLimiter(rate=10, burst=5)
-    assert [limiter.take("a", 0.0) for _ in range(7)] == [0.0] * 5 + [0.1] * 2
-    assert limiter.take("b", 0.0) == 0.0, "other callers are not limited"
-    assert [limiter.take("a", 0.25) for _ in range(3)] == [0.0, 0.0, pytest.approx(0.05)]
-    assert [limiter.take("a", 100.0) for _ in range(6)] == [0.0] * 5 + [0.1]
+    assert [retry_after_s(limiter, "a", 0.0) for _ in range(7)] == [0.0] * 5 + [0.1] * 2
+    assert retry_after_s(limiter, "b", 0.0) == 0.0, "other callers are not limited"
+    assert [retry_after_s(limiter, "a", 0.25) for _ in range(3)] == [0.0, 0.0, pytest.approx(0.05)]
+    assert [retry_after_s(limiter, "a", 100.0) for _ in range(6)] == [0.0] * 5 + [0.1]
 
 
 def test_rate_limiter_forgets_inactive_callers() -> None:

@@ -12,13 +12,13 @@ from fractus_core.policy.decision_types import CaptureArgs
 from fractus_proto.v1 import camera_pb2, camera_pb2_grpc
 from grpc.aio import ServicerContext
 
-from fractus_services.admission import CallAdmission
 from fractus_services.auth import Caller
 from fractus_services.camera.image_capture import ImageCapture
 from fractus_services.camera.image_store import ImageRecord, NoSuchImage, owner_of
 from fractus_services.camera.stored_images import StoredImages
 from fractus_services.error_details import decision
 from fractus_services.errors import ResourceExhausted
+from fractus_services.grpc_server import CallAdmission
 
 CHUNK_BYTES = 256 * 1024
 READ_BYTES = 4 * CHUNK_BYTES

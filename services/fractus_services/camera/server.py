@@ -18,7 +18,6 @@ from fractus_runtime.audit import AuditLog
 from fractus_runtime.metrics import BackgroundReader, serve_metrics
 from prometheus_client import Metric
 
-from fractus_services.admission import CallAdmission
 from fractus_services.auth import TlsFiles
 from fractus_services.camera.camera_properties import CameraProperties
 from fractus_services.camera.drivers.connection import create_driver
@@ -38,7 +37,7 @@ from fractus_services.clock import Clock
 from fractus_services.decision_log import log_decision
 from fractus_services.grant_files import GrantFiles
 from fractus_services.grant_verifier import GrantVerifier
-from fractus_services.grpc_server import run_until, serve_grpc
+from fractus_services.grpc_server import CallAdmission, run_until, serve_grpc
 from fractus_services.metrics import ServiceMetrics, common_metrics, telemetry_age
 from fractus_services.node_description import NodeDescription
 from fractus_services.options import CannotServe

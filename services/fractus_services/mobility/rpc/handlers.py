@@ -13,12 +13,11 @@ from fractus_core.control import Authority
 from fractus_core.policy.decision_types import Call, PointGimbalArgs, SetSpeedArgs, TakeoffArgs, Verdict
 from fractus_proto.v1 import mobility_pb2, mobility_pb2_grpc
 
-from fractus_services.admission import CallAdmission
-from fractus_services.auth import Caller
 from fractus_services.clock import Clock
 from fractus_services.error_details import decision
 from fractus_services.errors import AutopilotError, PreconditionFailed, Refused, Unavailable
 from fractus_services.grant_files import ActiveGrant, GrantFiles
+from fractus_services.grpc_server import CallAdmission
 from fractus_services.mobility.authority.control_store import ControlStore
 from fractus_services.mobility.flight.service import MobilityService, Progress
 from fractus_services.mobility.rpc.control_streams import ControlStreams
@@ -57,7 +56,7 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
         grants: Grants of this node.
         node: Name of the node.
         clock: Unix time.
-        on_call: Called with the grant of the caller for every call.
+        on_passenger: Called with the Grant of the caller for every call of a component that is no driver.
         fixed_camera: Returns True if the node description declares a camera that does not move.
         recording_problem: Returns why flights are not recorded; an empty string if there is no problem.
     """
@@ -71,7 +70,7 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
         grants: GrantFiles,
         node: str,
         clock: Clock,
-        on_call: Callable[[ActiveGrant], None] = lambda _grant: None,
+        on_passenger: Callable[[ActiveGrant], None] = lambda _grant: None,
         fixed_camera: Callable[[], bool] = bool,
         recording_problem: Callable[[], str] = str,
     ) -> None:
@@ -80,15 +79,9 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
         self._service = service
         self._control = control
         self._streams = streams
-        self._on_call = on_call
         self._node = node_identity(node)
         self._clock = clock
-        self.admission = CallAdmission(grants, clock, _refusal_of, self._handle_internal_error)
-
-    def _grant_of(self, caller: Caller) -> ActiveGrant:
-        grant = self.admission.grant_of(caller)
-        self._on_call(grant)
-        return grant
+        self.admission = CallAdmission(grants, clock, _refusal_of, self._handle_internal_error, on_passenger)
 
     def _handle_internal_error(self, verdict: Verdict) -> None:
         """Brake if a driver is flying."""
@@ -100,7 +93,7 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
     async def GetControl(self, _request: mobility_pb2.GetControlRequest, context: CallContext) -> None:  # noqa: N802
         """See mobility.proto."""
         async with self.admission.call(context, lasting=True) as caller:
-            grant = self._grant_of(caller)
+            grant = self.admission.grant_of(caller)
             self._service.calls.allow(Call("GetControl"), grant)
             try:
                 # The stream ends at the latest when the certificate that authenticated the connection expires.
@@ -118,7 +111,7 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
     ) -> mobility_pb2.ReturnControlResponse:
         """See mobility.proto."""
         async with self.admission.call(context, urgent=True) as caller:
-            grant = self._grant_of(caller)
+            grant = self.admission.grant_of(caller)
             self._service.calls.cancel_pending(grant)
             self._service.calls.allow(Call("ReturnControl"), grant)
             last = await self._control.return_control(grant)
@@ -129,7 +122,7 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
     ) -> mobility_pb2.ReportProgressResponse:
         """See mobility.proto."""
         async with self.admission.call(context) as caller:
-            await self._control.report_waypoints(self._grant_of(caller), request.waypoints)
+            await self._control.report_waypoints(self.admission.grant_of(caller), request.waypoints)
             return mobility_pb2.ReportProgressResponse()
 
     # Calls without a motion
@@ -138,7 +131,7 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
         """See mobility.proto."""
         async with self.admission.call(context) as caller:
             patience_s = (context.time_remaining() or 0.0) - SETTINGS.arm_response_reserve_s
-            verdict = await self._service.arm(self._grant_of(caller), patience_s)
+            verdict = await self._service.arm(self.admission.grant_of(caller), patience_s)
             return mobility_pb2.ArmResponse(decision=decision(verdict))
 
     async def Disarm(  # noqa: N802
@@ -146,7 +139,7 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
     ) -> mobility_pb2.DisarmResponse:
         """See mobility.proto."""
         async with self.admission.call(context) as caller:
-            verdict = await self._service.disarm(self._grant_of(caller))
+            verdict = await self._service.disarm(self.admission.grant_of(caller))
             return mobility_pb2.DisarmResponse(decision=decision(verdict))
 
     async def Hover(  # noqa: N802
@@ -154,7 +147,7 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
     ) -> mobility_pb2.HoverResponse:
         """See mobility.proto."""
         async with self.admission.call(context, urgent=True) as caller:
-            verdict = await self._service.hover(self._grant_of(caller))
+            verdict = await self._service.hover(self.admission.grant_of(caller))
             return mobility_pb2.HoverResponse(decision=decision(verdict))
 
     async def SetSpeed(  # noqa: N802
@@ -162,8 +155,10 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
     ) -> mobility_pb2.SetSpeedResponse:
         """See mobility.proto."""
         async with self.admission.call(context) as caller:
-            await self._service.calls.throttle(self._grant_of(caller))
-            verdict, speed = await self._service.set_speed(self._grant_of(caller), SetSpeedArgs(request.speed_mps))
+            await self._service.calls.throttle(self.admission.grant_of(caller))
+            verdict, speed = await self._service.set_speed(
+                self.admission.grant_of(caller), SetSpeedArgs(request.speed_mps)
+            )
             return mobility_pb2.SetSpeedResponse(decision=decision(verdict), speed_mps=speed)
 
     async def PointGimbal(  # noqa: N802
@@ -172,9 +167,9 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
         """See mobility.proto."""
         async with self.admission.call(context) as caller:
             args = PointGimbalArgs(request.pitch_deg, request.yaw_deg)
-            await self._service.calls.throttle(self._grant_of(caller))
+            await self._service.calls.throttle(self.admission.grant_of(caller))
             fixed = self._fixed_camera()
-            verdict = await self._service.point_gimbal(self._grant_of(caller), args, fixed_camera=fixed)
+            verdict = await self._service.point_gimbal(self.admission.grant_of(caller), args, fixed_camera=fixed)
             return mobility_pb2.PointGimbalResponse(decision=decision(verdict))
 
     async def GetSpeed(  # noqa: N802
@@ -182,7 +177,7 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
     ) -> mobility_pb2.GetSpeedResponse:
         """See mobility.proto."""
         async with self.admission.call(context) as caller:
-            verdict = self._service.calls.allow(Call("GetSpeed"), self._grant_of(caller))
+            verdict = self._service.calls.allow(Call("GetSpeed"), self.admission.grant_of(caller))
             speed = self._control.autopilot.vehicle.speed_mps
             return mobility_pb2.GetSpeedResponse(decision=decision(verdict), speed_mps=speed)
 
@@ -192,8 +187,8 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
         """See mobility.proto."""
         async with self.admission.call(context) as caller:
             args = velocity_args(request)
-            await self._service.calls.throttle_motion(self._grant_of(caller))
-            verdict, setpoint = await self._service.set_velocity(self._grant_of(caller), args)
+            await self._service.calls.throttle_motion(self.admission.grant_of(caller))
+            verdict, setpoint = await self._service.set_velocity(self.admission.grant_of(caller), args)
             response = mobility_pb2.SetVelocityResponse(decision=decision(verdict))
             response.velocity.north_mps = setpoint.north_mps
             response.velocity.east_mps = setpoint.east_mps
@@ -206,15 +201,15 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
         """See mobility.proto."""
         async with self.admission.call(context) as caller:
             call = call_of(request)
-            await self._service.calls.throttle(self._grant_of(caller))
-            return check_call_response(self._service.calls.check(call, self._grant_of(caller)))
+            await self._service.calls.throttle(self.admission.grant_of(caller))
+            return check_call_response(self._service.calls.check(call, self.admission.grant_of(caller)))
 
     async def GetPosition(  # noqa: N802
         self, _request: mobility_pb2.GetPositionRequest, context: CallContext
     ) -> mobility_pb2.GetPositionResponse:
         """See mobility.proto."""
         async with self.admission.call(context) as caller:
-            verdict = self._service.calls.allow(Call("GetPosition"), self._grant_of(caller))
+            verdict = self._service.calls.allow(Call("GetPosition"), self.admission.grant_of(caller))
             vehicle = self._control.autopilot.vehicle
             if not located(self._control):
                 raise Unavailable("AutopilotUnavailable", "the drone's position is not known yet")
@@ -227,8 +222,8 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
     async def Takeoff(self, request: mobility_pb2.TakeoffRequest, context: CallContext) -> None:  # noqa: N802
         """See mobility.proto."""
         async with self.admission.call(context, lasting=True) as caller:
-            await self._service.calls.throttle_motion(self._grant_of(caller))
-            progress = self._service.take_off(self._grant_of(caller), TakeoffArgs(request.altitude_m))
+            await self._service.calls.throttle_motion(self.admission.grant_of(caller))
+            progress = self._service.take_off(self.admission.grant_of(caller), TakeoffArgs(request.altitude_m))
             await self._send_progress(progress, context)
 
     async def Goto(self, request: mobility_pb2.GotoRequest, context: CallContext) -> None:  # noqa: N802
@@ -236,21 +231,21 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
         async with self.admission.call(context, lasting=True) as caller:
             args = goto_args(request)
             reached_m = acceptance_radius_m(request)
-            await self._service.calls.throttle_motion(self._grant_of(caller))
-            progress = self._service.goto(self._grant_of(caller), args, reached_m)
+            await self._service.calls.throttle_motion(self.admission.grant_of(caller))
+            progress = self._service.goto(self.admission.grant_of(caller), args, reached_m)
             await self._send_progress(progress, context)
 
     async def Land(self, _request: mobility_pb2.LandRequest, context: CallContext) -> None:  # noqa: N802
         """See mobility.proto."""
         async with self.admission.call(context, urgent=True) as caller:
-            await self._send_progress(self._service.land(self._grant_of(caller)), context)
+            await self._send_progress(self._service.land(self.admission.grant_of(caller)), context)
 
     async def ReturnToLaunch(  # noqa: N802
         self, _request: mobility_pb2.ReturnToLaunchRequest, context: CallContext
     ) -> None:
         """See mobility.proto."""
         async with self.admission.call(context, urgent=True) as caller:
-            await self._send_progress(self._service.return_to_launch(self._grant_of(caller)), context)
+            await self._send_progress(self._service.return_to_launch(self.admission.grant_of(caller)), context)
 
     async def _send_progress(self, progress: AsyncGenerator[Progress, None], context: CallContext) -> None:
         """Send every step of a motion. Only the first message contains the decision and the target."""
@@ -284,7 +279,7 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
                     judged_at = loop.time()
                     caller.check()
                     if not is_node:
-                        self._service.calls.allow(Call("GetPosition"), self._grant_of(caller))
+                        self._service.calls.allow(Call("GetPosition"), self.admission.grant_of(caller))
                 if loop.time() >= due:
                     due = loop.time() + interval
                     sample = self._sample(missions=is_node, last_text=last_text)

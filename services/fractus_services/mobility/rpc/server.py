@@ -165,7 +165,7 @@ async def run(options: MobilityOptions, stop: asyncio.Event) -> None:
         grants=grants,
         node=node,
         clock=clock,
-        on_call=poi_missions.passenger_called,
+        on_passenger=poi_missions.passenger_called,
         fixed_camera=partial(_fixed_camera, description),
         recording_problem=lambda: recorder.problem,
     )

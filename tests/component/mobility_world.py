@@ -346,7 +346,7 @@ class World:
         self.monitor = parts.monitor
         self.supervisor = parts.supervisor
         self.observer = parts.observer  # fmt: skip
-        self.control.set_checked(Checked("", (), Airframe(retraces=retraces), 8.0, retraces))
+        self.control.checked = Checked("", (), Airframe(retraces=retraces), 8.0, retraces)
         self.plane.on_parameter = self.observer.parameter
         self._tasks = [asyncio.ensure_future(part) for part in (self.plane.run(), self.monitor.run(), self.tours.run())]
         self.events: list[ControlEvent] = []

@@ -18,7 +18,7 @@ from fractus_core.policy.compiled_grant import CompiledGrant
 from fractus_core.policy.decision_types import Airframe, Call, GotoArgs, SetSpeedArgs, Situation, VelocityArgs, Verdict
 from fractus_core.policy.engine import judge
 from fractus_core.policy.monitoring import monitor
-from fractus_services.mobility.mavlink.recent_setpoints import is_turning
+from fractus_services.mobility.mavlink.mavlink_autopilot import is_turning
 from numpy.typing import NDArray
 from policy_world import HOME, METHODS, NOW, compiled, policy, ring
 

@@ -85,16 +85,16 @@ def test_arming_is_refused_if_failsafe_verification_changes_meanwhile(
             raise_around = world.fence.raise_around
 
             async def chosen(name: str, value: float) -> float:
-                control.set_checked(verified)
+                control.checked = verified
                 return await write(name, value)
 
             async def raised(grant: GrantSpec, *, retraces: bool) -> None:
-                control.set_checked(verified)
+                control.checked = verified
                 await raise_around(grant, retraces=retraces)
 
             async def changed(mode: Any, *_: object) -> None:
                 await set_mode(mode)
-                control.set_checked(verified)
+                control.checked = verified
 
             if during == "choice":
                 control.dispatch(ArmingRequested(grant.key, grant.identity, (39.3604, 22.95, 10.0)))
@@ -128,7 +128,7 @@ def test_return_mode_is_kept_after_link_reconnects_in_flight(tmp_path: Path) -> 
             control = world.control
             plane = world.plane
             plane.parameters |= {"SRTL_POINTS": 300.0, "SYSID_MYGCS": 244.0, "WPNAV_ACCEL": 100.0}
-            control.set_checked(Checked("", (), Airframe(retraces=True, accel_mps2=1.0), 8.0, remembers=True))
+            control.checked = Checked("", (), Airframe(retraces=True, accel_mps2=1.0), 8.0, remembers=True)
             grant = world.grants.put(spec())
             await world.drive(grant)
             control.dispatch(ArmingRequested(grant.key, grant.identity, (39.3604, 22.95, 10.0)))

@@ -16,7 +16,6 @@ from fractus_core.policy.decision_types import GotoArgs, TakeoffArgs
 from fractus_runtime.mavlink_codec import Endpoint, Parser, message
 from fractus_services.errors import AutopilotError, Refused, Unavailable
 from fractus_services.grant_files import ActiveGrant
-from fractus_services.mobility.authority.home import home_moved
 from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
 from fractus_services.mobility.mavlink.telemetry_requests import HomePositionMonitor
 from fractus_services.mobility.mavlink.vehicle import Vehicle
@@ -304,7 +303,7 @@ def test_vertical_home_move_is_detected_without_home_position_message(
             await until(lambda: lost, 2.0)
             with contextlib.suppress(Refused):
                 await end(drone.service.goto(grant, GotoArgs(*at(0, 20), 15.0), 0.0))
-            await until(lambda: not home_moved(drone.control.state, drone.autopilot.vehicle), 3.0)
+            await until(lambda: not drone.control.home_moved, 3.0)
             assert abs(-sky.truth.body.down - 15.0) < 2.5
 
     sky_drone.fly(work, tmp_path)

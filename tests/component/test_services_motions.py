@@ -14,7 +14,7 @@ from fractus_core.policy.decision_types import Call, SetSpeedArgs, TakeoffArgs, 
 from fractus_core.policy.engine import judge
 from fractus_core.policy.monitoring import monitor
 from fractus_services.errors import AutopilotError, PreconditionFailed, Refused, Unavailable
-from fractus_services.mobility.authority.leases import FlightConstraints
+from fractus_services.mobility.authority.effects import FlightConstraints
 from fractus_services.mobility.flight import monitor as monitoring
 from fractus_services.mobility.flight.route_following import RouteFollower, SystemFlight
 from mobility_world import GUIDED, LOITER, World, area, clear_m, end, goto, partial, refusal, spec, zone

@@ -37,7 +37,6 @@ def numbers(given: atheris.FuzzedDataProvider) -> Call:
         request.target.altitude_m = number(given, 100)
         if given.ConsumeBool():
             request.yaw_deg = number(given, 360)
-        proto_conversion.acceptance_radius_m(request)
         return Call("Goto", proto_conversion.goto_args(request))
     if which == 1:
         velocity = mobility_pb2.SetVelocityRequest(hold_s=number(given, 2))

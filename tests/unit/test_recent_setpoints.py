@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from fractus_core.geo import LocalFrame
 from fractus_services.mobility.autopilot import LEG_MPS, VehicleState
-from fractus_services.mobility.mavlink.recent_setpoints import RecentSetpoints, Velocity
+from fractus_services.mobility.mavlink.mavlink_autopilot import RecentSetpoints, Velocity
 
 POSITION = (39.36, 22.95)
 WEST = (0.0, -LEG_MPS, 0.0)

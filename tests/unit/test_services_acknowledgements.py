@@ -7,10 +7,10 @@ from collections.abc import Callable
 
 import pytest
 from fractus_runtime.mavlink_codec import Endpoint, Message, Parser, message
-from fractus_services.mobility.mavlink.acknowledgements import (
+from fractus_services.mobility.mavlink.mavlink_autopilot import (
     ACK_TIMEOUT_S,
     MAX_ACK_TIMEOUT_S,
-    MAX_OPEN,
+    MAX_UNACKNOWLEDGED,
     Acknowledgements,
     Answer,
 )
@@ -217,9 +217,9 @@ async def test_transmissions_are_dropped_when_the_connection_breaks(caplog: pyte
 
 async def test_number_of_open_transmissions_is_limited() -> None:
     acks = link()
-    for at in range(10 * MAX_OPEN):
+    for at in range(10 * MAX_UNACKNOWLEDGED):
         acks.sent(SPEED, Answer(), float(at))
-    assert len(acks._sent[SPEED]) == MAX_OPEN
+    assert len(acks._sent[SPEED]) == MAX_UNACKNOWLEDGED
 
 
 async def test_later_command_overtakes_an_unanswered_one() -> None:

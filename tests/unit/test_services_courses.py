@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 from fractus_services.grant_files import ActiveGrant
-from fractus_services.mobility.authority.leases import FlightConstraints
+from fractus_services.mobility.authority.effects import FlightConstraints
 from fractus_services.mobility.flight import route_following
 from policy_world import at, compiled, spec
 

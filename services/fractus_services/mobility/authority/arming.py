@@ -176,7 +176,7 @@ class Arming:
     def _update_checked(self, before: Checked, after: Checked) -> Checked:
         """Store an updated result, unless the failsafes were set again meanwhile."""
         if self._control.checked is before:
-            self._control.set_checked(after)
+            self._control.checked = after
         return self._require_verified(after)
 
     def _require_verified(self, chosen: Checked | None = None) -> Checked:

@@ -41,14 +41,13 @@ from fractus_core.control.readiness import NOT_CONNECTED, Readiness, not_ready_r
 from fractus_core.control.state import VehicleFacts
 from fractus_core.geo import LocalFrame
 from fractus_core.policy.compiled_grant import CompiledGrant, compile_transit_grant
-from fractus_core.policy.decision_types import Verdict
+from fractus_core.policy.decision_types import Home, Verdict
 from fractus_runtime.audit import AuditLog
 
-from fractus_services.errors import PreconditionFailed, Unavailable
+from fractus_services.errors import AutopilotError, PreconditionFailed, Unavailable
 from fractus_services.grant_files import ActiveGrant, GrantFiles
-from fractus_services.mobility.authority.effects import ChangeSignal, EffectRunner
+from fractus_services.mobility.authority.effects import ChangeSignal, EffectRunner, FlightConstraints, Lease, Motion
 from fractus_services.mobility.authority.journal import Journal, record_of
-from fractus_services.mobility.authority.leases import FlightConstraints, Lease, Motion
 from fractus_services.mobility.authority.mode_controller import ModeController
 from fractus_services.mobility.autopilot import BEING_SET, Approach, Autopilot, Checked, Permit, always
 from fractus_services.mobility.settings import SETTINGS
@@ -74,6 +73,7 @@ class ControlStore:
         changes: Signal of changes that drivers and passengers wait for.
         effects: Execution of the state machine's actions.
         tasks: Background tasks.
+        checked: Result of the last failsafe verification; None if it is outdated.
     """
 
     def __init__(
@@ -107,7 +107,7 @@ class ControlStore:
         )
         self._timer: asyncio.TimerHandle | None = None
         self._closed = False
-        self._checked: Checked | None = None
+        self.checked: Checked | None = None
         self._constraints: FlightConstraints | None = None
         self._removed: ActiveGrant | None = None
         self._transit: tuple[ActiveGrant, CompiledGrant] | None = None
@@ -208,18 +208,9 @@ class ControlStore:
         return self.mission_grant or (self._removed if self._state.removed is not None else None)
 
     @property
-    def checked(self) -> Checked | None:
-        """Result of the last failsafe verification; None if it is outdated."""
-        return self._checked
-
-    def set_checked(self, checked: Checked | None) -> None:
-        """Store the result of a failsafe verification. None discards it."""
-        self._checked = checked
-
-    @property
     def retraces(self) -> bool:
         """True if the autopilot can return on the path it flew (SmartRTL)."""
-        capable = self._checked is not None and self._checked.airframe.retraces
+        capable = self.checked is not None and self.checked.airframe.retraces
         return capable and not self.autopilot.vehicle.path_lost
 
     @property
@@ -229,7 +220,7 @@ class ControlStore:
         corrects = state.motion is not None and state.motion.kind == CORRECTION
         if state.speed_mps is not None and state.authority is Authority.DRIVER and not corrects:
             return state.speed_mps
-        return self._checked.speed_mps if self._checked is not None else SETTINGS.default_speed_mps
+        return self.checked.speed_mps if self.checked is not None else SETTINGS.default_speed_mps
 
     def mission(self, grant: ActiveGrant) -> Mission:
         """Return the mission of a grant, or a new one if it is unknown."""
@@ -245,8 +236,8 @@ class ControlStore:
         vehicle = self.autopilot.vehicle
         located = vehicle.lat is not None and vehicle.home is not None
         # In flight, the last known result stands in for a verification that is not possible at the moment.
-        problem = "" if self._checked is None or vehicle.armed else self._checked.problem
-        unverified = BEING_SET if self._checked is None else problem
+        problem = "" if self.checked is None or vehicle.armed else self.checked.problem
+        unverified = BEING_SET if self.checked is None else problem
         readiness = Readiness(
             unverified, vehicle.unready(self.autopilot.now), located, self.autopilot.link_problem, vehicle.unclear
         )
@@ -258,7 +249,7 @@ class ControlStore:
         vehicle = self.autopilot.vehicle
         if not self.autopilot.connected:
             return vehicle.unclear or NOT_CONNECTED
-        unverified = BEING_SET if self._checked is None else self._checked.problem
+        unverified = BEING_SET if self.checked is None else self.checked.problem
         if unverified:
             return f"the autopilot's failsafes are not verified: {unverified}"
         return vehicle.unready(self.autopilot.now) or self.autopilot.link_problem
@@ -397,6 +388,56 @@ class ControlStore:
         if not mission.leg_flown:
             self.dispatch(WaypointsDone(grant.key, mission.waypoints, leg=True))
 
+    # Home: the position where the mission armed for its first takeoff. Altitudes are measured from it, and return flights lead there.
+
+    @property
+    def home_moved(self) -> bool:
+        """True if another station moved home under a drone in flight. A pilot may move it.
+
+        Until home is restored, neither the altitude above home nor the destination of the autopilot's return is known.
+        """
+        vehicle = self.autopilot.vehicle
+        state = self.state
+        mission = state.mission
+        if vehicle.home is None or mission is None or mission.home is None:
+            return False
+        if not vehicle.in_air or state.authority is Authority.PILOT:
+            return False
+        return _is_elsewhere(vehicle.home, mission.home)
+
+    @property
+    def home_altitude_inconsistent(self) -> bool:
+        """True if altitudes are not measured from the ground at the start of the flight, because home is elsewhere.
+
+        The same holds if home was not reported since the vehicle armed. A home moved by a pilot counts too.
+        """
+        vehicle = self.autopilot.vehicle
+        state = self.state
+        ground = vehicle.ground_home
+        if vehicle.home is None or not vehicle.in_air:
+            return False
+        origin = state.mission.home if state.mission is not None and not state.armed_by_others else None
+        if origin is None and ground is not None:
+            origin = ground.lat, ground.lon, ground.amsl_m
+        return origin is None or _is_elsewhere(vehicle.home, origin)
+
+    async def restore_home(self) -> None:
+        """Set home back to where the mission armed for its first takeoff, if it was moved.
+
+        Raises:
+            AutopilotError: The autopilot refused, or reported no new home.
+        """
+        mission = self.state.mission
+        if mission is None or mission.home is None or not self.home_moved:
+            return
+        await self.autopilot.set_home(*mission.home)
+        await self.autopilot.request_home()
+        deadline = self.autopilot.now + SETTINGS.home_timeout_s
+        while self.home_moved:
+            if self.autopilot.now > deadline:
+                raise AutopilotError("autopilot acknowledged DO_SET_HOME but sent no HOME_POSITION", link=True)
+            await self.autopilot.update(SETTINGS.home_timeout_s)
+
     # System flights
 
     def begin_transit(self, grant: ActiveGrant) -> FlightConstraints:
@@ -492,3 +533,9 @@ def _reference(grant: ActiveGrant | None) -> GrantRef | None:
     if grant is None:
         return None
     return GrantRef(grant.key, commands_vehicle=grant.spec.class_ == "driver" or bool(grant.spec.tour))
+
+
+def _is_elsewhere(home: Home, origin: tuple[float, float, float]) -> bool:
+    """Return True if home is not at the origin (latitude, longitude, altitude above mean sea level)."""
+    lat, lon, amsl_m = origin
+    return math.hypot(*LocalFrame(lat, lon).xy(home.lat, home.lon), home.amsl_m - amsl_m) > SETTINGS.home_moved_m

@@ -1,13 +1,15 @@
-"""Execution of the actions of the control state machine: streams, motions, system tasks, audit log, journal."""
+"""Actions of the control state machine, and the leases, motions and system tasks that the state refers to by id."""
 
 from __future__ import annotations
 
 import asyncio
+import itertools
 import logging
 from collections.abc import Coroutine, Sequence
+from dataclasses import dataclass, field
 from typing import Any, assert_never
 
-from fractus_core.control import Authority
+from fractus_core.control import Authority, ControlEvent
 from fractus_core.control.actions import (
     Action,
     Brake,
@@ -27,16 +29,94 @@ from fractus_core.control.actions import (
 from fractus_core.control.events import SystemTaskEnded
 from fractus_core.control.state import SystemTask
 from fractus_core.control.state_update import DRIVER_LOST
+from fractus_core.policy.compiled_grant import CompiledGrant
+from fractus_core.policy.decision_types import GotoArgs
 from fractus_runtime.audit import AuditLog
 
 from fractus_services.background import Background
 from fractus_services.errors import Aborted, AutopilotError, PreconditionFailed, Refused, Unavailable
+from fractus_services.grant_files import ActiveGrant
 from fractus_services.mobility.authority.journal import Journal, record_of
-from fractus_services.mobility.authority.leases import Lease, Motion
 from fractus_services.mobility.authority.mode_controller import ControlAccess, ModeController
 from fractus_services.mobility.autopilot import Approach, Autopilot, Permit
 
 log = logging.getLogger(__name__)
+
+
+_ids = itertools.count(1)
+
+
+class Lease:
+    """Control lease of one driver: its grant, and the events that its control stream still has to send.
+
+    Attributes:
+        lease_id: Id in the control state.
+        key: Key of the mission.
+        grant: Current Grant of the driver. Its key does not change.
+    """
+
+    def __init__(self, grant: ActiveGrant) -> None:
+        self.lease_id = next(_ids)
+        self.key = grant.key
+        self.grant = grant
+        self._events: asyncio.Queue[ControlEvent | None] = asyncio.Queue()
+
+    def send(self, event: ControlEvent | None) -> None:
+        """Queue an event for the driver. None ends the stream without an event."""
+        self._events.put_nowait(event)
+
+    async def receive(self, timeout_s: float) -> ControlEvent | None:
+        """Return the next event, or None at the end of the stream.
+
+        Raises:
+            TimeoutError: No event was queued in time.
+        """
+        async with asyncio.timeout(timeout_s):
+            return await self._events.get()
+
+
+@dataclass(eq=False, slots=True)
+class FlightConstraints:
+    """Flight constraints of a system flight. They follow changes of the grant."""
+
+    grant: ActiveGrant
+    compiled: CompiledGrant
+    flight_id: int = field(default_factory=lambda: next(_ids))
+
+
+class Motion:
+    """Motion call in progress, until it completes or is stopped.
+
+    Attributes:
+        motion_id: Id in the control state.
+        kind: Name of the method.
+        braking: True while the drone comes to rest before the motion, so that the monitor does not stop the motion.
+        leg: Leg being flown; None if there is none.
+        under_way: True if the autopilot acknowledged the leg.
+        speed_mps: Speed of the leg.
+    """
+
+    def __init__(self, kind: str) -> None:
+        self.motion_id = next(_ids)
+        self.kind = kind
+        self.braking = False
+        self.leg: GotoArgs | None = None
+        self.under_way = False
+        self.speed_mps: float | None = None
+        self._refusal: Refused | None = None
+
+    def stop(self, refusal: Refused) -> None:
+        """End the motion. Its caller receives the first refusal."""
+        self._refusal = self._refusal or refusal
+
+    def check(self) -> None:
+        """Return if the motion may continue.
+
+        Raises:
+            Refused: The motion was stopped.
+        """
+        if self._refusal is not None:
+            raise self._refusal
 
 
 class ChangeSignal:

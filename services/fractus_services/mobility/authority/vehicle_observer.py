@@ -15,7 +15,6 @@ from fractus_core.policy.decision_types import Verdict
 from fractus_services.errors import AutopilotError
 from fractus_services.grant_files import ActiveGrant
 from fractus_services.mobility.authority.control_store import ControlStore
-from fractus_services.mobility.authority.home import home_moved, restore_home
 from fractus_services.mobility.autopilot import BEING_SET, Failsafes, Fence
 from fractus_services.mobility.settings import SETTINGS
 
@@ -54,7 +53,7 @@ class VehicleObserver:
         """Handle a link to the autopilot that came up, for the first time or again."""
         checked = self._control.checked
         flying = self._control.autopilot.vehicle.armed
-        self._control.set_checked(replace(checked, problem=BEING_SET) if flying and checked is not None else None)
+        self._control.checked = replace(checked, problem=BEING_SET) if flying and checked is not None else None
         self._control.dispatch(VehicleFound())
         self._control.tasks.drop(self._preparing)
         self._preparing = self._control.tasks.spawn(self._prepare())
@@ -76,7 +75,7 @@ class VehicleObserver:
         control = self._control
         home = control.autopilot.vehicle.home
         noted = self._home_moved
-        self._home_moved = home_moved(control.state, control.autopilot.vehicle)
+        self._home_moved = control.home_moved
         if not self._home_moved or home is None:
             return
         if not noted:
@@ -90,7 +89,7 @@ class VehicleObserver:
 
     async def _restore_home(self) -> None:
         try:
-            await restore_home(self._control.autopilot, self._control)
+            await self._control.restore_home()
         except AutopilotError as error:
             log.warning("observer: home not restored yet (error=%s)", error)
             if not error.link:
@@ -109,7 +108,7 @@ class VehicleObserver:
             return
         log.warning("observer: parameter changed by another station (name=%s)", name)
         flying = control.autopilot.vehicle.armed
-        control.set_checked(self._failsafes.learn(checked) if flying else replace(checked, problem=BEING_SET))
+        control.checked = self._failsafes.learn(checked) if flying else replace(checked, problem=BEING_SET)
         self._changed.set()
 
     async def _prepare(self) -> None:
@@ -155,7 +154,7 @@ class VehicleObserver:
         if not checked.lost:
             self._unverified_since = None
         if not flying:
-            control.set_checked(checked)
+            control.checked = checked
             return
         problems = ["" if checked.lost else checked.problem]
         restored = checked.changed
@@ -170,7 +169,7 @@ class VehicleObserver:
             except OSError as error:
                 problems.append(f"cannot store the owner's settings: {error}")
         checked = self._failsafes.learn(checked)
-        control.set_checked(checked)
+        control.checked = checked
         for setting in restored:
             control.note("restored", f"set back in flight: {setting}", "SettingChanged")
         if before is not None and before.airframe != checked.airframe:

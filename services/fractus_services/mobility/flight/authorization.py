@@ -1,17 +1,33 @@
-"""Authorization of calls: rate of judgements, order of motions, verdict, and control of the drone."""
+"""Authorization of calls and of system flights: present situation, verdict, audit entry, throttling, and control of the drone."""
 
 from __future__ import annotations
 
 import asyncio
+import logging
+import math
 import time
+from collections.abc import Callable
+from dataclasses import asdict, replace
 
-from fractus_core.policy.decision_types import DENY_POSITION_UNKNOWN, Call, Verdict
+from fractus_core.policy.compiled_grant import CompiledGrant
+from fractus_core.policy.decision_types import DENY_POSITION_UNKNOWN, Airframe, Call, Situation, Verdict
+from fractus_core.policy.engine import judge
+from fractus_runtime import tracing
+from fractus_runtime.audit import AuditLog
 
 from fractus_services.errors import Aborted, Unavailable, denied
 from fractus_services.grant_files import ActiveGrant
 from fractus_services.mobility.authority.control_store import ControlStore
-from fractus_services.mobility.flight.policy_gate import PolicyGate
+from fractus_services.mobility.autopilot import LEG_MPS
 from fractus_services.mobility.settings import SETTINGS
+
+log = logging.getLogger(__name__)
+
+REFUSALS_ONLY = frozenset({"GetPosition", "GetSpeed"})
+"""Frequent methods that change nothing: only refusals are written to the audit log."""
+
+VERTICAL_MOTIONS = frozenset({"Takeoff", "Land", "ReturnToLaunch"})
+"""Motions during which the drone may climb or descend without a leg."""
 
 DRIVER_METHODS = frozenset(
     {
@@ -31,6 +47,123 @@ DRIVER_METHODS = frozenset(
 """Methods that only a driver may call."""
 
 
+class PolicyGate:
+    """Judges calls against the present situation.
+
+    Args:
+        control: Control state.
+        clock: Unix time, for the schedules of policies.
+        audit: Audit log for verdicts.
+    """
+
+    def __init__(self, control: ControlStore, clock: Callable[[], float], audit: AuditLog) -> None:
+        self._control = control
+        self._clock = clock
+        self._audit = audit
+
+    def situation(self) -> Situation:
+        """Return the present state of the drone as the policy engine judges it.
+
+        The position is unknown if it is stale, if the link is too slow, or if home was moved.
+        """
+        control = self._control
+        autopilot = control.autopilot
+        vehicle = autopilot.vehicle
+        motion = control.motion
+        airframe = control.checked.airframe if control.checked is not None else Airframe()
+        if airframe.retraces and not control.retraces:
+            airframe = replace(airframe, retraces=False)
+        unlocated = Situation(
+            time_s=self._clock(),
+            home=vehicle.home,
+            armed=vehicle.armed,
+            in_air=vehicle.in_air,
+            airframe=airframe,
+            altitude_m=vehicle.altitude_m,
+            speed_setpoint_mps=control.cruise_mps,
+        )
+        latency_s = autopilot.latency_s
+        fresh = vehicle.position_fresh(autopilot.now)
+        if not fresh or not math.isfinite(latency_s) or control.home_moved:
+            return unlocated
+        # Only the direction of a pending leg is known. Its speed is at most its commanded speed.
+        leg_mps = (motion.speed_mps or 0.0) if motion is not None else 0.0
+        max_mps = max(control.cruise_mps, leg_mps)
+        pending: list[tuple[float, float, float]] = []
+        for north, east, down in autopilot.pending:
+            if max(abs(north), abs(east), abs(down)) < LEG_MPS / 2:
+                pending.append((north, east, down))
+            else:
+                share = max_mps / LEG_MPS
+                pending.append((north * share, east * share, min(max(down, -max_mps), max_mps)))
+        return replace(
+            unlocated,
+            lat=vehicle.lat,
+            lon=vehicle.lon,
+            north_mps=vehicle.north_mps,
+            east_mps=vehicle.east_mps,
+            down_mps=vehicle.down_mps,
+            position_error_m=vehicle.position_error_m,
+            latency_s=latency_s,
+            forward_mps2=vehicle.forward_mps2,
+            pending=tuple(pending),
+            vertical=vehicle.mode.comes_down or (motion is not None and motion.kind in VERTICAL_MOTIONS),
+        )
+
+    def judge(
+        self,
+        call: Call,
+        grant: ActiveGrant,
+        compiled: CompiledGrant | None = None,
+        *,
+        kind: str = "call",
+        known: Verdict | None = None,
+    ) -> Verdict:
+        """Return the verdict on a call and write it to the audit log.
+
+        If the engine fails, the call is denied and a drone that its driver flies hovers.
+
+        Args:
+            call: Method and arguments.
+            grant: Grant of the caller.
+            compiled: Constraints to judge under instead of the grant's, for system flights.
+            kind: Kind of the audit entry; `check` if the call is not carried out.
+            known: Verdict that was just recorded. An equal verdict is not recorded again.
+        """
+        situation = self.situation()
+        with tracing.child_span("policy.judge") as span:
+            try:
+                verdict = judge(call, situation, compiled or grant.compiled)
+            except Exception:
+                log.exception("policy: engine failed, call denied (method=%s)", call.method)
+                reason = f"the policy engine failed on {call.method}; nothing was done"
+                verdict = Verdict("deny", None, "InternalError", reason, (), "hover")
+            tracing.set_verdict(span, verdict.action, verdict.code, verdict.policies)
+        if verdict != known and (call.method not in REFUSALS_ONLY or not verdict.permits):
+            self.record(call, grant.identity, verdict, situation, kind=kind)
+        return verdict
+
+    def record(self, call: Call, caller: str, verdict: Verdict, situation: Situation, *, kind: str = "call") -> None:
+        """Write one verdict to the audit log."""
+        self._audit.append(
+            kind,
+            {
+                "caller": caller,
+                "method": call.method,
+                "args": asdict(call.args) if call.args is not None else {},
+                "action": verdict.action,
+                "code": verdict.code,
+                "reason": verdict.reason,
+                "policies": list(verdict.policies),
+                "takeover": verdict.takeover,
+                "result": asdict(verdict.args) if verdict.args is not None and verdict.permits else {},
+                "lat": situation.lat,
+                "lon": situation.lon,
+                "alt": situation.altitude_m,
+            },
+        )
+
+
 class CallAuthorizer:
     """Throttles and judges calls.
 
@@ -47,11 +180,13 @@ class CallAuthorizer:
 
     async def throttle(self, grant: ActiveGrant) -> None:
         """Wait until the pause after the previous judgement for this kind of caller is over."""
-        wait_s = self._wait_s(grant)
-        while wait_s > 0:
+        while True:
+            wait_s = self._free_at[self._has_control(grant)] - self._control.autopilot.now
+            if wait_s <= 0:
+                return
+            # Look again after the sleep: another waiting call may have been judged first, and the caller may have gained or lost
+            # control.
             await asyncio.sleep(wait_s)
-            # Another waiting call may have gone first, and the caller may have gained or lost control.
-            wait_s = self._wait_s(grant)
 
     async def throttle_motion(self, grant: ActiveGrant) -> None:
         """Wait like `throttle` before a call that moves the drone.
@@ -68,9 +203,6 @@ class CallAuthorizer:
         """Number a motion call, which cancels waiting ones. Calls of callers without control cancel nothing."""
         self._motion_calls += self._has_control(grant)
         return self._motion_calls
-
-    def _wait_s(self, grant: ActiveGrant) -> float:
-        return self._free_at[self._has_control(grant)] - self._control.autopilot.now
 
     def _has_control(self, grant: ActiveGrant) -> bool:
         lease = self._control.lease

@@ -21,11 +21,11 @@ from fractus_runtime.audit import AuditLog
 from fractus_services.errors import Aborted, AutopilotError, Refused
 from fractus_services.grant_files import ActiveGrant
 from fractus_services.mobility.authority.control_store import CORRECTION, ControlStore
-from fractus_services.mobility.authority.leases import Motion
+from fractus_services.mobility.authority.effects import Motion
 from fractus_services.mobility.authority.supervisor import Supervisor
 from fractus_services.mobility.autopilot import Permit
+from fractus_services.mobility.flight.authorization import PolicyGate
 from fractus_services.mobility.flight.motions import fly_to
-from fractus_services.mobility.flight.policy_gate import PolicyGate
 from fractus_services.mobility.flight.return_to_launch import ReturnFlight
 from fractus_services.mobility.flight.route_following import REPLAN_CODES, limited_mps
 from fractus_services.mobility.settings import SETTINGS

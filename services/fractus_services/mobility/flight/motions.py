@@ -13,7 +13,7 @@ from fractus_core.policy.decision_types import GotoArgs, VelocityArgs
 
 from fractus_services.errors import Aborted, AutopilotError, Refused, Unavailable
 from fractus_services.mobility.authority.control_store import ControlStore
-from fractus_services.mobility.authority.leases import Motion
+from fractus_services.mobility.authority.effects import Motion
 from fractus_services.mobility.autopilot import Autopilot, Permit, VehicleState
 from fractus_services.mobility.settings import SETTINGS
 

@@ -22,10 +22,9 @@ from fractus_core.policy.return_route import (
 from fractus_services.errors import AutopilotError, PreconditionFailed, Refused, Unavailable
 from fractus_services.grant_files import ActiveGrant
 from fractus_services.mobility.authority.control_store import ControlStore
-from fractus_services.mobility.authority.home import home_moved, restore_home
-from fractus_services.mobility.authority.leases import Motion
+from fractus_services.mobility.authority.effects import Motion
+from fractus_services.mobility.flight.authorization import PolicyGate
 from fractus_services.mobility.flight.motions import Step
-from fractus_services.mobility.flight.policy_gate import PolicyGate
 from fractus_services.mobility.flight.route_following import (
     REPLAN_CODES,
     NextLeg,
@@ -125,13 +124,13 @@ class ReturnFlight:
         """
         control = self._control
         try:
-            await restore_home(control.autopilot, control)
+            await control.restore_home()
         except AutopilotError as error:
             raise AutopilotError(str(error), link=not control.autopilot.connected) from error
 
     def _path_is_home(self) -> bool:
         """Return True if home was moved, so that only the path flown leads to where the mission armed."""
-        return self._control.retraces and home_moved(self._control.state, self._control.autopilot.vehicle)
+        return self._control.retraces and self._control.home_moved
 
     def _give_up(self, grant: ActiveGrant, attempts: int) -> str:
         """Return why the system no longer flies home; an empty string if the straight return is legal."""
@@ -164,7 +163,7 @@ class ReturnFlight:
                 return ""
             if refusal.verdict.code == "NoLegalWay" or refusal.verdict.code in REPLAN_CODES:
                 return str(refusal)
-            moved = home_moved(control.state, control.autopilot.vehicle)
+            moved = control.home_moved
             raise AutopilotError(str(refusal), link=isinstance(refusal, Unavailable) and not moved) from refusal
         finally:
             control.end_system_flight(constraints)
@@ -178,7 +177,7 @@ class ReturnFlight:
             AutopilotError: The autopilot refused.
         """
         self.given_up = None
-        await restore_home(self._control.autopilot, self._control)
+        await self._control.restore_home()
         if self._blind():
             return
         try:
@@ -232,7 +231,7 @@ class ReturnFlight:
         Raises:
             Refused: There is no legal route.
         """
-        if home_moved(self._control.state, self._control.autopilot.vehicle):
+        if self._control.home_moved:
             raise Unavailable("AutopilotUnavailable", "another station moved home; it must be set back first")
         now = self._gate.situation()
         distance_m = self._home_distance_m()

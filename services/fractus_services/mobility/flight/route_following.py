@@ -20,10 +20,10 @@ from fractus_core.policy.route_search import route_steps
 from fractus_services.background import in_slices
 from fractus_services.errors import Aborted, PreconditionFailed, Refused, Unavailable
 from fractus_services.mobility.authority.control_store import ControlStore
-from fractus_services.mobility.authority.leases import FlightConstraints, Motion
+from fractus_services.mobility.authority.effects import FlightConstraints, Motion
 from fractus_services.mobility.autopilot import Permit
+from fractus_services.mobility.flight.authorization import PolicyGate
 from fractus_services.mobility.flight.motions import Step, come_to_rest, fly_to
-from fractus_services.mobility.flight.policy_gate import PolicyGate
 from fractus_services.mobility.settings import SETTINGS
 
 log = logging.getLogger(__name__)

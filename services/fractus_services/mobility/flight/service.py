@@ -22,7 +22,7 @@ from fractus_services.errors import Aborted, PreconditionFailed, Refused
 from fractus_services.grant_files import ActiveGrant
 from fractus_services.mobility.authority.arming import Arming
 from fractus_services.mobility.authority.control_store import ControlStore
-from fractus_services.mobility.authority.leases import Motion
+from fractus_services.mobility.authority.effects import Motion
 from fractus_services.mobility.autopilot import Autopilot, Permit
 from fractus_services.mobility.flight.authorization import CallAuthorizer
 from fractus_services.mobility.flight.motions import Step, VelocityHold, climb, come_down, come_to_rest, fly_to, rise
@@ -177,11 +177,9 @@ class MobilityService:
         """
         verdict = self.calls.allow_motion(Call("Goto", args), grant)
         _require_in_air(self._autopilot, "Goto")
-        radius = (
-            min(max(reached_m, SETTINGS.min_acceptance_radius_m), SETTINGS.max_acceptance_radius_m)
-            if reached_m > 0
-            else SETTINGS.reached_m
-        )
+        radius_m = SETTINGS.reached_m
+        if reached_m > 0:
+            radius_m = min(max(reached_m, SETTINGS.min_acceptance_radius_m), SETTINGS.max_acceptance_radius_m)
 
         async def steps(motion: Motion) -> AsyncGenerator[Progress, None]:
             permit = self._control.driver_permit(grant, motion)
@@ -189,10 +187,13 @@ class MobilityService:
             final = verdict
             for _ in range(SETTINGS.max_judgements):
                 final = await self._settle(call, grant, final, motion, permit)
-                leg = _leg(final, args, self._control.cruise_mps)
+                target = final.args if isinstance(final.args, GotoArgs) else args
+                leg = replace(target, speed_mps=target.speed_mps or self._control.cruise_mps)
                 judged = self._rejudging_permit(call, grant, final, permit)
                 try:
-                    async with aclosing(fly_to(self._autopilot, motion, leg, radius, permit, judged=judged)) as flying:
+                    async with aclosing(
+                        fly_to(self._autopilot, motion, leg, radius_m, permit, judged=judged)
+                    ) as flying:
                         async for step in flying:
                             if step.complete:
                                 self._control.count_leg(grant, args.lat, args.lon)
@@ -342,12 +343,6 @@ class MobilityService:
             self._control.fail_motion(motion)
             raise
         self._control.finish_motion(motion)
-
-
-def _leg(verdict: Verdict, args: GotoArgs, cruise_mps: float) -> GotoArgs:
-    """Return the leg of a goto as the verdict permits it, with its speed."""
-    target = verdict.args if isinstance(verdict.args, GotoArgs) else args
-    return replace(target, speed_mps=target.speed_mps or cruise_mps)
 
 
 def _require_in_air(autopilot: Autopilot, method: str) -> None:

@@ -15,9 +15,9 @@ from fractus_core.policy.decision_types import Call, TakeoffArgs
 from fractus_services.errors import AutopilotError, PreconditionFailed, Refused
 from fractus_services.mobility.authority.arming import Arming
 from fractus_services.mobility.authority.control_store import ControlStore
-from fractus_services.mobility.authority.leases import Lease
+from fractus_services.mobility.authority.effects import Lease
+from fractus_services.mobility.flight.authorization import PolicyGate
 from fractus_services.mobility.flight.motions import climb
-from fractus_services.mobility.flight.policy_gate import PolicyGate
 from fractus_services.mobility.flight.route_following import (
     INTERNAL_ERROR,
     RouteFollower,

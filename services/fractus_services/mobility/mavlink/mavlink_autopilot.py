@@ -1,28 +1,30 @@
-"""The vehicle behind a MAVLink link: commands that are acknowledged, repeated, or fail with a reason."""
+"""The vehicle behind a MAVLink link: commands, their acknowledgements, and setpoints."""
 
 from __future__ import annotations
 
 import asyncio
 import logging
 import math
+from collections import deque
 from collections.abc import Callable
 from contextlib import nullcontext, suppress
 
 from fractus_core.control.state import FlightMode
+from fractus_core.geo import LocalFrame
+from fractus_core.policy.decision_types import STATIONARY_MPS
 from fractus_runtime import tracing
 from fractus_runtime.mavlink_codec import Message, Value, enum_name, message
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fractus_services.errors import AutopilotError
-from fractus_services.mobility.autopilot import COURSE_S, Permit, always
-from fractus_services.mobility.mavlink.acknowledgements import ACK_TIMEOUT_S, Acknowledgements, Answer
+from fractus_services.mobility.autopilot import COURSE_S, LEG_MPS, Permit, VehicleState, always
 from fractus_services.mobility.mavlink.companion import SYSTEM_ID
 from fractus_services.mobility.mavlink.flight_stack import FlightStack
 from fractus_services.mobility.mavlink.gimbal import point
 from fractus_services.mobility.mavlink.link import Link, ignore
 from fractus_services.mobility.mavlink.parameters import Parameters
-from fractus_services.mobility.mavlink.recent_setpoints import RecentSetpoints, Velocity, is_moving
 from fractus_services.mobility.mavlink.telemetry_requests import HomePositionMonitor, TelemetryRates
+from fractus_services.mobility.mavlink.timing import Timing
 from fractus_services.mobility.mavlink.vehicle_identification import KnownVehicleFile
 
 log = logging.getLogger(__name__)
@@ -49,6 +51,174 @@ _VELOCITY_AND_YAW = (
     | mavlink.POSITION_TARGET_TYPEMASK_YAW_RATE_IGNORE
 )  # fmt: skip
 _VELOCITY_ONLY = _VELOCITY_AND_YAW | mavlink.POSITION_TARGET_TYPEMASK_YAW_IGNORE
+
+ACK_TIMEOUT_S = 0.7
+MAX_ACK_TIMEOUT_S = 3.0
+ACK_SLACK_S = 0.2
+"""An acknowledgement may be slower than the slowest recent answer by this time."""
+
+MAX_UNACKNOWLEDGED = 16
+"""Remembered transmissions of one command, so that a vehicle without acknowledgements cannot fill the memory."""
+
+Answer = asyncio.Future[int]
+
+Velocity = tuple[float, float, float]
+"""North, east and down, m/s."""
+
+MAX_SETPOINTS = 200
+"""More setpoints than can be sent within the longest latency with which the service flies."""
+
+TURNED_MPS = 0.5
+"""A vehicle whose drift across its course is no faster than this has turned onto the course."""
+
+LEVEL_M = 0.3
+"""A leg that ends within this height of the vehicle neither climbs nor sinks."""
+
+
+class Acknowledgements:
+    """Transmissions that are not acknowledged yet, by command.
+
+    A command that was sent twice is acknowledged twice, and the second acknowledgement must not count for the next command with the
+    same id. Links preserve the order, so each acknowledgement is assigned to the oldest transmission that can still be answered
+    according to the measured delay of the link.
+
+    Args:
+        sysid: System id of the sender of the commands. Acknowledgements for other systems are ignored.
+        timing: Delays of the link; receives the delay of each acknowledgement.
+    """
+
+    def __init__(self, sysid: int, timing: Timing) -> None:
+        self._sysid = sysid
+        self._timing = timing
+        self._sent: dict[int, deque[tuple[float, Answer]]] = {}
+        self._latest: dict[int, Answer] = {}
+        self._last: tuple[bytes, float] = b"", -math.inf
+
+    @property
+    def timeout_s(self) -> float:
+        """Time after which a transmission counts as lost."""
+        return max(ACK_TIMEOUT_S, min(self._timing.answer_s + ACK_SLACK_S, MAX_ACK_TIMEOUT_S))
+
+    def _answerable_s(self, now: float) -> float:
+        """Return for how long a transmission can still be answered.
+
+        A short time without answers means that the link is becoming slow. After a longer time the link was interrupted, and what was
+        sent is lost.
+        """
+        takes_s = max(self._timing.answer_s, min(self._timing.silence_s(now), MAX_ACK_TIMEOUT_S))
+        return max(ACK_TIMEOUT_S, takes_s + ACK_SLACK_S)
+
+    def sent(self, command: int, answer: Answer, now: float) -> None:
+        """Record that a command is being sent, for the first time or again.
+
+        Args:
+            command: MAV_CMD.
+            answer: Future that receives the result of this or another transmission of the same command.
+            now: Monotonic seconds.
+        """
+        self._sent.setdefault(command, deque(maxlen=MAX_UNACKNOWLEDGED)).append((now, answer))
+        self._latest[command] = answer
+
+    def overtaken(self, command: int, answer: Answer) -> bool:
+        """Return True if another command with the same id was sent after the command of this answer."""
+        return self._latest.get(command, answer) is not answer
+
+    def take(self, acknowledgement: Message, now: float) -> None:
+        """Assign an acknowledgement to its transmission and set the result."""
+        if acknowledgement.integer("target_system") not in {0, self._sysid} or self._is_duplicate(acknowledgement, now):
+            return
+        command = acknowledgement.integer("command")
+        result = acknowledgement.integer("result")
+        transmissions = self._sent.setdefault(command, deque(maxlen=MAX_UNACKNOWLEDGED))
+        # Keep the last transmission: when the link becomes slow, its answer arrives before the new delay is measured.
+        while len(transmissions) > 1 and now - transmissions[0][0] > self._answerable_s(now):
+            transmissions.popleft()
+        if not transmissions:
+            log.debug("commands: unexpected acknowledgement (command=%d, result=%d)", command, result)
+            return
+        sent_at, answer = transmissions.popleft()
+        # The acknowledgement of an abandoned command measures the link as well.
+        self._timing.acknowledged(sent_at, now)
+        if result == mavlink.MAV_RESULT_IN_PROGRESS:
+            transmissions.appendleft((now, answer))  # the final acknowledgement follows
+        elif answer.done():
+            log.debug("commands: acknowledgement of an earlier transmission (command=%d, result=%d)", command, result)
+        else:
+            answer.set_result(result)
+
+    def _is_duplicate(self, acknowledgement: Message, now: float) -> bool:
+        """Return True if the network delivered the last acknowledgement again. Frames contain sequence numbers."""
+        frame, at = self._last
+        self._last = acknowledgement.frame, now
+        return frame != b"" and frame == acknowledgement.frame and now - at < ACK_TIMEOUT_S
+
+    def forget(self) -> None:
+        """Drop all transmissions, because the connection broke."""
+        self._sent.clear()
+
+
+class RecentSetpoints:
+    """Velocity setpoints, each with the times at which it was first and last sent."""
+
+    def __init__(self) -> None:
+        self._sent: deque[tuple[float, float, Velocity]] = deque(maxlen=MAX_SETPOINTS)
+
+    def fly(self, velocity: Velocity, now: float) -> None:
+        """Add a velocity setpoint that is being sent."""
+        first = self._sent.pop()[0] if self._sent and self._sent[-1][2] == velocity else now
+        self._sent.append((first, now, velocity))
+
+    def go_to(self, lat: float, lon: float, altitude_m: float, vehicle: VehicleState, now: float) -> None:
+        """Add a leg from the vehicle's position to a point. The leg counts as a velocity of `LEG_MPS` towards the point."""
+        if vehicle.lat is None or vehicle.lon is None:
+            return
+        east, north = LocalFrame(vehicle.lat, vehicle.lon).xy(lat, lon)
+        share = LEG_MPS / max(math.hypot(east, north), 1e-3)
+        sink = vehicle.altitude_m - altitude_m
+        down = math.copysign(LEG_MPS, sink) if abs(sink) > LEVEL_M else 0.0
+        self.fly((north * share, east * share, down), now)
+
+    def since(self, earliest: float, measured: Velocity) -> tuple[Velocity, ...]:
+        """Return the setpoints that the vehicle may still be reacting to, the latest last; drop older ones.
+
+        Setpoints sent after `earliest` always count. The setpoint that was in force at `earliest` counts if the vehicle still
+        reacts to it. A vehicle that slows down to a held velocity does not continue to brake. A vehicle that turns onto a leg
+        does not continue in its measured direction.
+
+        Args:
+            earliest: Time on the clock of `fly`.
+            measured: The vehicle's measured velocity.
+        """
+        while len(self._sent) > 1 and self._sent[1][0] < earliest:
+            self._sent.popleft()
+        if self._sent and self._sent[0][1] < earliest:
+            setpoint = self._sent[0][2]
+            if not _is_held(setpoint) and not is_turning(measured, setpoint):
+                self._sent.popleft()
+        return tuple(dict.fromkeys(velocity for *_, velocity in reversed(self._sent)))[::-1]
+
+
+def _is_held(velocity: Velocity) -> bool:
+    """Return True for a velocity that the vehicle holds, False for a stop or a leg."""
+    return moves(velocity) and max(map(abs, velocity)) < LEG_MPS / 2
+
+
+def is_turning(velocity: Velocity, setpoint: Velocity) -> bool:
+    """Return True if a moving vehicle does not fly in the direction of its setpoint yet."""
+    north, east, _ = velocity
+    to_north, to_east, _ = setpoint
+    length = math.hypot(to_north, to_east)
+    if math.hypot(north, east) < STATIONARY_MPS or length < STATIONARY_MPS:
+        return False
+    along = (north * to_north + east * to_east) / length
+    across = (north * to_east - east * to_north) / length
+    return along < -TURNED_MPS or abs(across) > TURNED_MPS
+
+
+def moves(velocity: Velocity) -> bool:
+    """Return True if a vehicle with this velocity is not stationary."""
+    north, east, down = velocity
+    return math.hypot(north, east) >= STATIONARY_MPS or abs(down) >= STATIONARY_MPS
 
 
 class MavlinkAutopilot(Link):
@@ -117,7 +287,7 @@ class MavlinkAutopilot(Link):
     @property
     def at_rest(self) -> bool:
         """True if the vehicle is certainly stationary and has no pending setpoint."""
-        return self.vehicle.at_rest(self.now) and not any(map(is_moving, self.pending))
+        return self.vehicle.at_rest(self.now) and not any(map(moves, self.pending))
 
     def _probe(self, due: float) -> None:
         """Measure the delay of the link, by a command without effect if the vehicle does not answer TIMESYNC."""
@@ -184,11 +354,7 @@ class MavlinkAutopilot(Link):
                             link=True,
                         )
                     answer = Answer() if answer.done() else answer
-                    result = await self._attempt(
-                        _outgoing(command, params, place, frame, confirmation=attempt, **self.address()),
-                        command,
-                        answer,
-                    )
+                    result = await self._attempt(command, params, place, frame, answer, confirmation=attempt)
                     if result is None:
                         continue
                     if result == mavlink.MAV_RESULT_ACCEPTED:
@@ -199,8 +365,25 @@ class MavlinkAutopilot(Link):
                     raise AutopilotError(self._refusal(command, result), refused=True)
             raise AutopilotError(f"the autopilot did not answer command {enum_name('MAV_CMD', command)}", link=True)
 
-    async def _attempt(self, outgoing: Message, command: int, answer: Answer) -> int | None:
+    async def _attempt(
+        self,
+        command: int,
+        params: tuple[float, ...],
+        place: tuple[float, float, float] | None,
+        frame: int,
+        answer: Answer,
+        *,
+        confirmation: int,
+    ) -> int | None:
         """Send a command, for the first time or again, and return its result; None if no result arrives in time."""
+        values: dict[str, Value] = {f"param{i}": float(value) for i, value in enumerate(params, 1)}
+        values |= {"command": command, **self.address()}
+        if place is None:
+            outgoing = message("COMMAND_LONG", confirmation=confirmation, **values)
+        else:
+            # COMMAND_INT has degrees times 1e7. The 32-bit floats of COMMAND_LONG would be off by metres.
+            values |= {"frame": frame, "x": round(place[0] * 1e7), "y": round(place[1] * 1e7), "z": place[2]}
+            outgoing = message("COMMAND_INT", **values)
         self._acknowledgements.sent(command, answer, self.now)
         self.send(outgoing)
         if not answer.done():
@@ -320,21 +503,3 @@ class MavlinkAutopilot(Link):
     async def request_home(self) -> None:
         """Request HOME_POSITION now."""
         await self.command(mavlink.MAV_CMD_REQUEST_MESSAGE, mavlink.MAVLINK_MSG_ID_HOME_POSITION)
-
-
-def _outgoing(
-    command: int,
-    params: tuple[float, ...],
-    place: tuple[float, float, float] | None,
-    frame: int,
-    *,
-    confirmation: int,
-    **address: int,
-) -> Message:
-    values: dict[str, Value] = {f"param{i}": float(value) for i, value in enumerate(params, 1)}
-    values |= {"command": command, **address}
-    if place is None:
-        return message("COMMAND_LONG", confirmation=confirmation, **values)
-    # COMMAND_INT has degrees times 1e7. The 32-bit floats of COMMAND_LONG would be off by metres.
-    values |= {"frame": frame, "x": round(place[0] * 1e7), "y": round(place[1] * 1e7), "z": place[2]}
-    return message("COMMAND_INT", **values)

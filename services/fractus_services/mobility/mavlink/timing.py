@@ -115,7 +115,10 @@ class Timing:
         self._sampled = self._sampled + self._since(boot_ms) if self._samples else 0.0
         self._boot_ms = boot_ms
         self._arrived_at = now
-        while self._samples and self._at(self._samples[-1], now) <= self._sampled:
+        while self._samples:
+            arrived, stamp = self._samples[-1]
+            if stamp + self.pace * (now - arrived) > self._sampled:
+                break
             self._samples.pop()
         self._samples.append((now, self._sampled))
         while self._samples[0][0] < now - ENVELOPE_S:
@@ -135,11 +138,7 @@ class Timing:
 
     def _present(self, at: float) -> float:
         """Return the latest reading of the vehicle's clock that received positions prove for a time."""
-        return max(self._at(sample, at) for sample in self._samples)
-
-    def _at(self, sample: tuple[float, float], at: float) -> float:
-        arrived, stamp = sample
-        return stamp + self.pace * (at - arrived)
+        return max(stamp + self.pace * (at - arrived) for arrived, stamp in self._samples)
 
     def _compare(self, now: float) -> None:
         """Update the pace of the vehicle's clock. It is 1 unless that is certainly wrong."""

@@ -16,10 +16,9 @@ from fractus_services.mobility.authority.journal import Journal
 from fractus_services.mobility.authority.supervisor import Supervisor
 from fractus_services.mobility.authority.vehicle_observer import VehicleObserver
 from fractus_services.mobility.autopilot import Autopilot, Failsafes, Fence, ReturnLimits
-from fractus_services.mobility.flight.authorization import CallAuthorizer
+from fractus_services.mobility.flight.authorization import CallAuthorizer, PolicyGate
 from fractus_services.mobility.flight.monitor import MotionMonitor
 from fractus_services.mobility.flight.poi_mission import PoiMissions
-from fractus_services.mobility.flight.policy_gate import PolicyGate
 from fractus_services.mobility.flight.return_to_launch import ReturnFlight
 from fractus_services.mobility.flight.route_following import RouteFollower
 from fractus_services.mobility.flight.service import MobilityService

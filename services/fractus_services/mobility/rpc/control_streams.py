@@ -12,7 +12,7 @@ from fractus_core.control.state import ended_refusal
 from fractus_services.errors import PolicyDenied, PreconditionFailed
 from fractus_services.grant_files import ActiveGrant
 from fractus_services.mobility.authority.control_store import ControlStore
-from fractus_services.mobility.authority.leases import Lease
+from fractus_services.mobility.authority.effects import Lease
 from fractus_services.mobility.settings import SETTINGS
 
 

@@ -22,7 +22,6 @@ from fractus_services.mobility.authority.control_store import ControlStore
 from fractus_services.mobility.flight.service import MobilityService, Progress
 from fractus_services.mobility.rpc.control_streams import ControlStreams
 from fractus_services.mobility.rpc.proto_conversion import (
-    acceptance_radius_m,
     call_of,
     check_call_response,
     control_event,
@@ -230,9 +229,8 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
         """See mobility.proto."""
         async with self.admission.call(context, lasting=True) as caller:
             args = goto_args(request)
-            reached_m = acceptance_radius_m(request)
             await self._service.calls.throttle_motion(self.admission.grant_of(caller))
-            progress = self._service.goto(self.admission.grant_of(caller), args, reached_m)
+            progress = self._service.goto(self.admission.grant_of(caller), args, request.acceptance_radius_m)
             await self._send_progress(progress, context)
 
     async def Land(self, _request: mobility_pb2.LandRequest, context: CallContext) -> None:  # noqa: N802

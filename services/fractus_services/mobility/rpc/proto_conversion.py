@@ -49,13 +49,15 @@ def goto_args(request: mobility_pb2.GotoRequest) -> GotoArgs:
     """Return the arguments of a Goto request.
 
     Raises:
-        Refused: The target is missing or has an unknown altitude reference.
+        Refused: The target is missing, its altitude reference is unknown, or the acceptance radius is negative or not finite.
     """
     if not request.HasField("target"):
         raise _invalid("target is missing; give the position to fly to")
     target = request.target
     if target.altitude_reference not in _REFERENCES:
         raise _invalid(f"target.altitude_reference {target.altitude_reference} is unknown; use home, amsl or terrain")
+    if not math.isfinite(request.acceptance_radius_m) or request.acceptance_radius_m < 0:
+        raise _invalid(f"the acceptance radius must be 0 m or more, not {request.acceptance_radius_m:g}")
     return GotoArgs(
         lat=target.latitude_deg,
         lon=target.longitude_deg,
@@ -81,18 +83,6 @@ def velocity_args(request: mobility_pb2.SetVelocityRequest) -> VelocityArgs:
         yaw_deg=request.yaw_deg if request.HasField("yaw_deg") else None,
         hold_s=request.hold_s if request.hold_s != 0.0 else DEFAULT_HOLD_S,
     )
-
-
-def acceptance_radius_m(request: mobility_pb2.GotoRequest) -> float:
-    """Return the acceptance radius of a Goto request; 0 for the default of the service.
-
-    Raises:
-        Refused: The radius is negative or not finite.
-    """
-    value = request.acceptance_radius_m
-    if not math.isfinite(value) or value < 0:
-        raise _invalid(f"the acceptance radius must be 0 m or more, not {value:g}")
-    return value
 
 
 def call_of(request: mobility_pb2.CheckCallRequest) -> Call:

@@ -8,7 +8,6 @@ from fractus_core.control import Outcome, OutcomeKind
 from fractus_proto.v1 import mobility_pb2, types_pb2
 
 from fractus_services.mobility.authority.control_store import ControlStore
-from fractus_services.mobility.authority.home import home_altitude_inconsistent
 from fractus_services.mobility.autopilot import MAX_POSITION_AGE_S, WIND_MAX_AGE_S, VehicleState
 
 
@@ -38,7 +37,7 @@ def located(control: ControlStore) -> bool:
     return (
         vehicle.lat is not None
         and vehicle.position_fresh(control.autopilot.now)
-        and not home_altitude_inconsistent(control.state, vehicle)
+        and not control.home_altitude_inconsistent
     )
 
 

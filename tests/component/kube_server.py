@@ -1,4 +1,4 @@
-"""An API server of the tests' own: HTTP on a loopback port, answering with the bytes it is told to."""
+"""Fake API server: HTTP on a loopback port with scripted responses."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ CHUNKED = HEAD + b"Transfer-Encoding: chunked\r\n\r\n"
 
 @dataclass(frozen=True)
 class Request:
-    """What a client sent."""
+    """Received HTTP request."""
 
     head: str
     body: bytes
@@ -33,36 +33,36 @@ class Request:
         return self.line.split(" ")[0]
 
     def header(self, name: str) -> str:
-        found = [value for key, _, value in (h.partition(": ") for h in self.head.splitlines()) if key.lower() == name]
-        assert len(found) <= 1, found
-        return found[0] if found else ""
+        values = [value for key, _, value in (h.partition(": ") for h in self.head.splitlines()) if key.lower() == name]
+        assert len(values) <= 1, values
+        return values[0] if values else ""
 
 
-def answer(body: Any, status: int = 200) -> bytes:
-    """A whole answer with a JSON body."""
+def response(body: Any, status: int = 200) -> bytes:
+    """Return a complete response with a JSON body."""
     data = body if isinstance(body, bytes) else json.dumps(body).encode()
     return b"HTTP/1.1 %d X\r\nContent-Type: application/json\r\nContent-Length: %d\r\n\r\n" % (status, len(data)) + data
 
 
 def chunk(data: bytes) -> bytes:
-    """A part of a chunked answer."""
+    """Return one chunk of a chunked response."""
     return b"%x\r\n%s\r\n" % (len(data), data)
 
 
 class Server:
-    """Answers each request, and then keeps the connection or closes it."""
+    """Connection handler that sends a response to each request and keeps or closes the connection."""
 
     def __init__(
-        self, answers: bytes | Callable[[Request], bytes], *, closes: bool = False, delay_s: float = 0.0
+        self, responses: bytes | Callable[[Request], bytes], *, closes: bool = False, delay_s: float = 0.0
     ) -> None:
-        self._answers = answers
+        self._responses = responses
         self._closes = closes
         self._delay_s = delay_s
         self.requests: list[Request] = []
         self.connections = 0
         self.url = ""
-        self.heard = asyncio.Event()
-        self.gone = asyncio.Event()
+        self.request_received = asyncio.Event()
+        self.connection_ended = asyncio.Event()
 
     async def __call__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self.connections += 1
@@ -72,18 +72,18 @@ class Server:
                 length = Request(head, b"").header("content-length")
                 request = Request(head, await reader.readexactly(int(length or 0)))
                 self.requests.append(request)
-                self.heard.set()
+                self.request_received.set()
                 await asyncio.sleep(self._delay_s)
-                writer.write(self._answers if isinstance(self._answers, bytes) else self._answers(request))
+                writer.write(self._responses if isinstance(self._responses, bytes) else self._responses(request))
                 if self._closes:
                     break
-        self.gone.set()
+        self.connection_ended.set()
         writer.close()
 
 
 @contextlib.asynccontextmanager
 async def listening(server: Server, context: ssl.SSLContext | None = None) -> AsyncIterator[Access]:
-    """The server on a port, and the way to it."""
+    """Run the server on a free port. Yield the Access for clients."""
     listener = await asyncio.start_server(server, "127.0.0.1", 0, ssl=context)
     scheme = "https" if context else "http"
     server.url = f"{scheme}://127.0.0.1:{listener.sockets[0].getsockname()[1]}"
@@ -96,13 +96,13 @@ async def listening(server: Server, context: ssl.SSLContext | None = None) -> As
 
 @contextlib.asynccontextmanager
 async def client_of(server: Server, **options: Any) -> AsyncIterator[Client]:
-    """A client of the server; its options are those of Client."""
+    """Run the server and yield a client of it with the given options of Client."""
     async with listening(server) as access, contextlib.aclosing(Client(access, "tests", **options)) as client:
         yield client
 
 
 def kubeconfig_for(directory: Path, server: str, user: dict[str, Any], **cluster: Any) -> Path:
-    """A kubeconfig of one cluster and one user."""
+    """Write a kubeconfig with one cluster and one user, and return its path."""
     config = {
         "apiVersion": "v1", "kind": "Config", "current-context": "c",
         "clusters": [{"name": "c", "cluster": {"server": server, **cluster}}],

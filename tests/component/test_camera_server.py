@@ -1,4 +1,4 @@
-"""The camera service as a whole: what it keeps when its node is described otherwise."""
+"""The complete camera service keeps its image store when the node description changes."""
 
 from __future__ import annotations
 
@@ -14,26 +14,26 @@ from fractus_services.camera.settings import CameraSettings
 from scraping import get, values
 
 
-class Counted(server.ImageStore):
-    """Counts how many are made."""
+class CountedImageStore(server.ImageStore):
+    """ImageStore that counts its instances."""
 
-    made = 0
+    instances = 0
 
     def __init__(self, *args: Any, **more: Any) -> None:
         super().__init__(*args, **more)
-        type(self).made += 1
+        type(self).instances += 1
 
 
-async def told(caplog: pytest.LogCaptureFixture, text: str) -> None:
-    while text not in caplog.text:  # noqa: ASYNC110 - a log wakes no one
+async def logged(caplog: pytest.LogCaptureFixture, text: str) -> None:
+    while text not in caplog.text:  # noqa: ASYNC110 (a log cannot be awaited)
         await asyncio.sleep(0.01)
 
 
-async def test_a_node_that_is_described_otherwise_keeps_its_album(
+async def test_image_store_is_kept_when_the_node_description_changes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """A second album would tidy away the picture that is still being written through the first."""
-    monkeypatch.setattr(server, "ImageStore", Counted)
+    """A second image store would delete a picture that the first one is still writing."""
+    monkeypatch.setattr(server, "ImageStore", CountedImageStore)
     monkeypatch.setattr(node_description, "POLL_INTERVAL_S", 0.01)
     node = tmp_path / "node.json"
     port = free_port()
@@ -44,16 +44,16 @@ async def test_a_node_that_is_described_otherwise_keeps_its_album(
     )  # fmt: skip
     stop = asyncio.Event()
     serving = asyncio.ensure_future(server.run(options, stop))
-    place = '{"apiVersion": "fractus.dev/v1alpha1", "kind": "EdgeNode", "metadata": {"name": "n"}, "spec": {"location": %s}}'
+    manifest = '{"apiVersion": "fractus.dev/v1alpha1", "kind": "EdgeNode", "metadata": {"name": "n"}, "spec": {"location": %s}}'
     async with asyncio.timeout(30):
         for lat in (50.0, 51.0):
-            await told(caplog, "field of view not described")
+            await logged(caplog, "field of view not described")
             caplog.clear()
-            node.write_text(place % f'{{"lat": {lat}, "lon": 8.0}}')
-        await told(caplog, "described=True")
+            node.write_text(manifest % f'{{"lat": {lat}, "lon": 8.0}}')
+        await logged(caplog, "described=True")
         first, body = await get(port)
         assert "200" in first
         assert values(body)["fractus_audit_failing",] == 0
         stop.set()
         await serving
-    assert Counted.made == 1
+    assert CountedImageStore.instances == 1

@@ -1,4 +1,4 @@
-"""The library by which chaos steps the clock of one service, in processes that load it."""
+"""Chaos runs step the clock of one service by a library that the service preloads."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ for _ in sys.stdin:
 """
 
 
-class Clocked:
-    """A process that loads the library and says the time, and how long it waited when it was to wait 10 ms."""
+class ClockProcess:
+    """Process that loads the library. For each line of input it prints the time and the duration of a 10 ms wait."""
 
     def __init__(self, environment: dict[str, str]) -> None:
-        self.process = subprocess.Popen(
+        self.popen = subprocess.Popen(
             [sys.executable, "-c", PROGRAM],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
@@ -43,29 +43,29 @@ class Clocked:
         )
 
     def is_ahead(self, offset_s: float) -> bool:
-        """Whether it is ahead of this process by so much, in each way to ask for the time."""
-        assert self.process.stdin is not None
-        assert self.process.stdout is not None
+        """Return True if all clock functions of the process are ahead of this process by the offset."""
+        assert self.popen.stdin is not None
+        assert self.popen.stdout is not None
         began_s = time.time()
-        self.process.stdin.write("\n")
-        self.process.stdin.flush()
-        *times, waited_s = map(float, self.process.stdout.readline().split())
+        self.popen.stdin.write("\n")
+        self.popen.stdin.flush()
+        *times, waited_s = map(float, self.popen.stdout.readline().split())
         assert 0.01 <= waited_s < 5
         return all(began_s <= time_s - offset_s <= time.time() for time_s in times)
 
 
 @pytest.fixture
-def clocked(tmp_path: Path) -> Iterator[dict[str, Clocked]]:
-    """A process for each of two services, with their state in a directory."""
+def clocked(tmp_path: Path) -> Iterator[dict[str, ClockProcess]]:
+    """Processes of two services, with their state in one directory."""
     furnish([tmp_path])
-    running = {service: Clocked(loaded(tmp_path / "chaos", service)) for service in ("agent", "mobility")}
+    running = {service: ClockProcess(loaded(tmp_path / "chaos", service)) for service in ("agent", "mobility")}
     yield running
-    for each in running.values():
-        each.process.kill()
-        each.process.communicate()
+    for process in running.values():
+        process.popen.kill()
+        process.popen.communicate()
 
 
-def test_a_service_is_stepped_and_no_other(clocked: dict[str, Clocked], tmp_path: Path) -> None:
+def test_step_affects_only_the_named_services(clocked: dict[str, ClockProcess], tmp_path: Path) -> None:
     agent = clocked["agent"]
     mobility = clocked["mobility"]
     assert agent.is_ahead(0)
@@ -79,32 +79,32 @@ def test_a_service_is_stepped_and_no_other(clocked: dict[str, Clocked], tmp_path
     assert mobility.is_ahead(30)
 
 
-def test_a_process_that_starts_meanwhile_has_the_same_clock(clocked: dict[str, Clocked], tmp_path: Path) -> None:
+def test_process_started_after_a_step_has_the_stepped_clock(clocked: dict[str, ClockProcess], tmp_path: Path) -> None:
     step(tmp_path, ("mobility",), DAY_S)
-    clocked["later"] = Clocked(loaded(tmp_path / "chaos", "mobility"))
+    clocked["later"] = ClockProcess(loaded(tmp_path / "chaos", "mobility"))
     assert clocked["later"].is_ahead(DAY_S)
 
 
-def test_a_run_begins_with_clocks_that_go_right(clocked: dict[str, Clocked], tmp_path: Path) -> None:
+def test_furnish_resets_stepped_clocks(clocked: dict[str, ClockProcess], tmp_path: Path) -> None:
     step(tmp_path, ("mobility",), DAY_S)
     furnish([tmp_path])
     assert clocked["mobility"].is_ahead(0)
     assert can_step(tmp_path)
 
 
-def test_the_fault_steps_a_clock_and_sets_it_right_again(clocked: dict[str, Clocked], tmp_path: Path) -> None:
+def test_clock_fault_steps_clocks_and_resets_them(clocked: dict[str, ClockProcess], tmp_path: Path) -> None:
     stage = cast("Stage", SimpleNamespace(state=tmp_path, drone="drone-1"))
     stepped = set()
     for seed in range(20):
-        with broken(FAULTS["clock-jump"], stage, Random(seed)) as said:
-            ahead = tuple(name for name, each in clocked.items() if not each.is_ahead(0))
+        with broken(FAULTS["clock-jump"], stage, Random(seed)) as description:
+            ahead = tuple(name for name, process in clocked.items() if not process.is_ahead(0))
             stepped.add(ahead)
-            assert all(name in said for name in ahead)
-        assert all(each.is_ahead(0) for each in clocked.values())
+            assert all(name in description for name in ahead)
+        assert all(process.is_ahead(0) for process in clocked.values())
     assert stepped == {(), ("agent",), ("mobility",), ("agent", "mobility")}
 
 
-def test_clocks_that_services_do_not_load_are_left_alone(tmp_path: Path) -> None:
+def test_clock_fault_is_refused_if_no_service_loads_the_library(tmp_path: Path) -> None:
     stage = cast("Stage", SimpleNamespace(state=tmp_path, drone="drone-1"))
     with pytest.raises(DemoError, match="cannot be stepped"), broken(FAULTS["clock-jump"], stage, Random(1)):
         pass

@@ -1,4 +1,4 @@
-"""A chaos run that is interrupted, as a process."""
+"""Interruption of a chaos run by Ctrl-C, in a process."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ run.fly(None, None, run.Task(1, 1800.0, ["etcd-restart"]), print)
 """
 
 
-def test_it_does_not_wait_for_faults_to_come() -> None:
+def test_interrupted_chaos_run_ends_before_its_next_fault() -> None:
     done = subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode
     assert done.stderr.endswith("KeyboardInterrupt\n")

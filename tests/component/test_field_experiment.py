@@ -1,4 +1,4 @@
-"""Expected results of the field experiment do not depend on the time at which pictures are taken."""
+"""The field experiment takes a picture above the stripe in every run, and its map labels the runs."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from fractus_sim.scenarios.field.flight import PERIOD_S, RUNS, STAY_S, Run, _env
 from fractus_sim.scenarios.field.place import ABOVE_STRIPE, EXAMPLE, VIEWER, Field
 
 FIELD = Field.read(EXAMPLE)
-STRAY_M = 3.0
-"""How far a hovering drone strays at most."""
+DEVIATION_M = 3.0
+"""Maximum horizontal deviation of a hovering drone, in metres."""
 
 
-def test_every_run_hovers_above_the_stripe_for_longer_than_between_two_pictures() -> None:
+def test_field_run_hovers_above_the_stripe_longer_than_the_picture_period() -> None:
     lat, lon, _ = FIELD.places[ABOVE_STRIPE]
-    assert FIELD.zone("no-photo").contains(shapely.Point(FIELD.frame.xy(lat, lon)).buffer(STRAY_M))
+    assert FIELD.zone("no-photo").contains(shapely.Point(FIELD.frame.xy(lat, lon)).buffer(DEVIATION_M))
     for run in RUNS:
         detours = dict(part.split(":") for part in _environment(run, FIELD, STAY_S)["DETOURS"].split(";"))
         at_lat, at_lon, _alt, stay_s = map(float, {k.strip(): v for k, v in detours.items()}["6"].split(","))
@@ -25,7 +25,7 @@ def test_every_run_hovers_above_the_stripe_for_longer_than_between_two_pictures(
         assert stay_s >= 1.5 * PERIOD_S
 
 
-def test_the_map_says_which_run_took_which_picture() -> None:
+def test_field_map_legend_names_run_of_each_picture() -> None:
     runs = [_flown(run, east=10.0 * number) for number, run in enumerate(RUNS)]
     figure = draw_ground(FIELD, [], runs)
     (legend,) = figure.legends or [figure.axes[0].get_legend()]
@@ -34,7 +34,7 @@ def test_the_map_says_which_run_took_which_picture() -> None:
         assert f"picture taken, {run.title}" in words
         assert f"picture refused, {run.title}" in words
     arrows = [text for text in figure.axes[0].texts if text.arrow_patch is not None]
-    assert len(arrows) >= len(runs), "each way says in which direction it was flown"
+    assert len(arrows) >= len(runs), "each route has an arrow in the direction of flight"
 
 
 def _flown(run: Run, east: float) -> Evidence:

@@ -1,4 +1,4 @@
-"""What the services say when they cannot serve as they are told to."""
+"""Start errors of the services: invalid descriptions, directories and addresses."""
 
 import socket
 from pathlib import Path
@@ -28,7 +28,7 @@ def serve(service: click.Group, tmp_path: Path, *more: str) -> Result:
 
 @SERVICES
 @pytest.mark.parametrize(
-    ("text", "says"),
+    ("text", "message"),
     [
         (b"kind: [", "invalid YAML"),
         (b"\xff\xfe\x00", "cannot be read"),
@@ -37,18 +37,18 @@ def serve(service: click.Group, tmp_path: Path, *more: str) -> Result:
         (b"{apiVersion: fractus.dev/v1alpha1, kind: Drone, metadata: {name: d}, spec: 5}", "spec"),
     ],
 )
-def test_a_broken_description_is_named(tmp_path: Path, service: click.Group, text: bytes, says: str) -> None:
+def test_service_names_invalid_description(tmp_path: Path, service: click.Group, text: bytes, message: str) -> None:
     path = tmp_path / "node.yaml"
     path.write_bytes(text)
     result = serve(service, tmp_path, "--description", str(path))
     assert result.exit_code == 1
     assert f"Error: --description {path}: " in result.output
-    assert says in result.output
+    assert message in result.output
 
 
 @SERVICES
 @pytest.mark.parametrize("option", ["--grants", "--tls", "--state"])
-def test_a_file_is_no_directory(tmp_path: Path, service: click.Group, option: str) -> None:
+def test_service_refuses_file_in_place_of_directory(tmp_path: Path, service: click.Group, option: str) -> None:
     file = tmp_path / "file"
     file.touch()
     result = serve(service, tmp_path, option, str(file))
@@ -61,27 +61,27 @@ def test_a_file_is_no_directory(tmp_path: Path, service: click.Group, option: st
 @pytest.mark.parametrize(
     "listen", ["nonsense", "127.0.0.1", ":50051", "127.0.0.1:-1", "127.0.0.1:99999", "h:5x", "unix-box:99999"]
 )
-def test_an_address_that_is_none(tmp_path: Path, service: click.Group, listen: str) -> None:
+def test_service_refuses_invalid_address(tmp_path: Path, service: click.Group, listen: str) -> None:
     result = serve(service, tmp_path, "--listen", listen)
     assert result.exit_code == 2
     assert "is not HOST:PORT with a port of at most 65535" in result.output
 
 
 @SERVICES
-def test_an_address_of_another_machine(tmp_path: Path, service: click.Group, tls: Path) -> None:
-    result = serve(service, tmp_path, "--tls", str(tls), "--listen", "192.0.2.1:50051", *quiet(service))
+def test_service_refuses_address_of_another_machine(tmp_path: Path, service: click.Group, tls: Path) -> None:
+    result = serve(service, tmp_path, "--tls", str(tls), "--listen", "192.0.2.1:50051", *local_autopilot(service))
     assert result.exit_code == 1
     assert "Error: --listen 192.0.2.1:50051: cannot listen there; specify HOST:PORT" in result.output
 
 
 @SERVICES
-def test_a_port_that_is_taken(tmp_path: Path, service: click.Group, tls: Path) -> None:
+def test_service_reports_port_in_use(tmp_path: Path, service: click.Group, tls: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         listen = f"127.0.0.1:{taken.getsockname()[1]}"
-        result = serve(service, tmp_path, "--tls", str(tls), "--listen", listen, *quiet(service))
+        result = serve(service, tmp_path, "--tls", str(tls), "--listen", listen, *local_autopilot(service))
     assert f"Error: --listen {listen}" in result.output
 
 
-def quiet(service: click.Group) -> tuple[str, ...]:
-    """Nothing outside the test is called."""
+def local_autopilot(service: click.Group) -> tuple[str, ...]:
+    """Return options with an autopilot address on which nothing responds."""
     return ("--autopilot", "udpin:127.0.0.1:0") if service is mobility else ()

@@ -1,4 +1,4 @@
-"""What programs import: commands that answer at once, and images without libraries that they do not need."""
+"""Imports of programs: commands start quickly, and images need only the libraries that they contain."""
 
 from __future__ import annotations
 
@@ -9,53 +9,53 @@ import pytest
 from fractus_cli.main import COMMANDS
 
 
-def after(program: str) -> tuple[str, set[str]]:
-    """What a program says, and the packages that it has imported when it ends."""
+def run_program(program: str) -> tuple[str, set[str]]:
+    """Run a program. Return its output and the packages that it imported."""
     argv = [sys.executable, "-c", f"import sys; {program}; print(*sys.modules, file=sys.stderr)"]
-    done = subprocess.run(argv, capture_output=True, text=True, check=True, timeout=120)
-    return done.stdout, {module.partition(".")[0] for module in done.stderr.split()}
+    result = subprocess.run(argv, capture_output=True, text=True, check=True, timeout=120)
+    return result.stdout, {module.partition(".")[0] for module in result.stderr.split()}
 
 
 def test_help_imports_no_command() -> None:
-    said, imported = after("from fractus_cli.main import run; run(['--help'])")
+    output, imported = run_program("from fractus_cli.main import run; run(['--help'])")
     for name in COMMANDS:
-        assert f"\n  {name} " in said
+        assert f"\n  {name} " in output
     assert {package for package in imported if package.startswith("fractus")} == {"fractus_cli"}
     assert not imported & {"grpc", "numpy", "shapely", "pydantic", "yaml"}
 
 
 def test_help_and_verification_of_audit_logs_import_no_geometry() -> None:
-    _, imported = after("import fractus_cli.audit")
+    _, imported = run_program("import fractus_cli.audit")
     assert "fractus_cli" in imported
     assert not imported & {"mcap", "shapely", "numpy", "pydantic"}
 
 
-def test_what_flies_needs_no_library_of_pictures() -> None:
-    """The mobility image has none: importing the service with all that it may use later must not ask for one."""
-    _, imported = after(
+def test_mobility_service_imports_no_image_libraries() -> None:
+    """The mobility image does not contain these libraries."""
+    _, imported = run_program(
         "import fractus_services.commands, fractus_services.mobility.rpc.server, fractus_services.recording.recorder"
     )
     assert "fractus_services" in imported
     assert not imported & {"cv2", "PIL", "scipy", "matplotlib", "kubernetes", "aiohttp"}
 
 
-def test_the_first_heartbeats_of_a_start_wait_for_no_large_import() -> None:
-    """A drone in flight waits for them: what takes a small computer seconds to import comes afterwards."""
-    _, imported = after("import fractus_services.commands, fractus_services.mobility.mavlink.startup_heartbeat")
+def test_startup_heartbeat_imports_no_large_library() -> None:
+    """A drone in flight needs the first heartbeats soon, and a small computer imports these libraries for seconds."""
+    _, imported = run_program("import fractus_services.commands, fractus_services.mobility.mavlink.startup_heartbeat")
     assert "pymavlink" in imported
     assert not imported & {"grpc", "google", "numpy", "shapely", "pydantic", "yaml", "cryptography", "fractus_core"}
 
 
 def test_environment_cannot_turn_off_the_checksums_of_mavlink(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MAV_IGNORE_CRC", "1")
-    printed, _ = after(
+    printed, _ = run_program(
         "from fractus_runtime.mavlink_codec import Endpoint, Parser; "
         "frame = bytearray(Endpoint(1, 1).encode('HEARTBEAT', {})); frame[-1] ^= 1; print(len(Parser().feed(bytes(frame))))"
     )
     assert printed.strip() == "0"
 
 
-def test_an_agent_reads_outcomes_without_what_decides_them() -> None:
-    said, _ = after("import fractus_agent.__main__; print(*sys.modules)")
-    assert "fractus_core.control.state" in said.split()
-    assert "fractus_core.control.machine" not in said.split()
+def test_agent_does_not_import_the_control_machine() -> None:
+    output, _ = run_program("import fractus_agent.__main__; print(*sys.modules)")
+    assert "fractus_core.control.state" in output.split()
+    assert "fractus_core.control.machine" not in output.split()

@@ -1,4 +1,4 @@
-"""The Kubernetes client on the wire: what arrives, what is refused, what is torn, what never answers, who asks."""
+"""HTTP behaviour of the Kubernetes client: requests, errors, broken connections, timeouts and authentication."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from fractus_runtime.kubernetes import (
     kubeconfig,
     with_certificate,
 )
-from kube_server import CHUNKED, HEAD, Request, Server, answer, chunk, client_of, kubeconfig_for, listening
+from kube_server import CHUNKED, HEAD, Request, Server, chunk, client_of, kubeconfig_for, listening, response
 
 ZONE = Kind("fractus.dev/v1alpha1", "Zone", "zones", namespaced=False)
 SECRET = Kind("v1", "Secret", "secrets", namespaced=True)
@@ -48,11 +48,11 @@ async def events(client: Client, silence_s: float = 20.0) -> AsyncIterator[tuple
         yield event
 
 
-# -- what arrives --
+# -- requests and responses --
 
 
-async def test_a_request_arrives_as_it_is_and_connections_are_kept() -> None:
-    server = Server(answer({"a": [1]}))
+async def test_request_is_sent_unchanged_and_connection_is_reused() -> None:
+    server = Server(response({"a": [1]}))
     async with client_of(server) as client:
         for _ in range(3):
             params = {"labelSelector": "a=b/c,d", "fieldManager": "x"}
@@ -66,22 +66,22 @@ async def test_a_request_arrives_as_it_is_and_connections_are_kept() -> None:
     assert json.loads(request.body) == {"b": 2}
 
 
-async def test_a_connection_whose_other_side_is_gone_is_found_dead(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A watch sends nothing: only keepalives of TCP notice that a cable was pulled."""
-    made = list[socket.socket]()
-    real = connection._socket
-    monkeypatch.setattr(connection, "_socket", lambda address: made.append(real(address)) or made[-1])
-    async with client_of(Server(answer({}))) as client:
+async def test_dead_connection_is_detected_by_keepalives(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A watch sends no data, so only TCP keepalives detect a broken network."""
+    created = list[socket.socket]()
+    create_socket = connection._socket
+    monkeypatch.setattr(connection, "_socket", lambda address: created.append(create_socket(address)) or created[-1])
+    async with client_of(Server(response({}))) as client:
         await client.request("GET", "/apis/one")
-        (used,) = made
-        assert used.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE) == 1
+        (connected,) = created
+        assert connected.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE) == 1
         times = [getattr(socket, f"TCP_KEEP{name}") for name in ("IDLE", "INTVL", "CNT")]
-        idle_s, interval_s, count = (used.getsockopt(socket.IPPROTO_TCP, option) for option in times)
+        idle_s, interval_s, count = (connected.getsockopt(socket.IPPROTO_TCP, option) for option in times)
         assert idle_s + interval_s * count <= 30
 
 
-async def test_writes_say_who_they_are_from_and_how_they_are_meant() -> None:
-    server = Server(answer(OBJECT))
+async def test_writes_have_field_manager_and_content_type() -> None:
+    server = Server(response(OBJECT))
     body = ZONE.header("a")
     async with client_of(server) as client:
         await client.apply(ZONE, body, subresource="status")
@@ -106,37 +106,37 @@ async def test_writes_say_who_they_are_from_and_how_they_are_meant() -> None:
     }
 
 
-async def test_what_is_compressed_is_read() -> None:
+async def test_compressed_response_is_read() -> None:
     data = gzip.compress(b'{"metadata": {}, "items": []}')
     head = HEAD + b"Content-Encoding: gzip\r\nContent-Length: %d\r\n\r\n" % len(data)
     async with client_of(Server(head + data)) as client:
         assert await client.list(ZONE) == []
 
 
-async def test_a_list_is_read_page_by_page() -> None:
+async def test_list_is_read_page_by_page() -> None:
     def pages(request: Request) -> bytes:
         if "continue=next" in request.line:
-            return answer({"metadata": {"resourceVersion": "9"}, "items": [{"n": 2}]})
-        return answer({"metadata": {"resourceVersion": "9", "continue": "next"}, "items": [{"n": 1}]})
+            return response({"metadata": {"resourceVersion": "9"}, "items": [{"n": 2}]})
+        return response({"metadata": {"resourceVersion": "9", "continue": "next"}, "items": [{"n": 1}]})
 
     server = Server(pages)
     async with client_of(server) as client:
-        whole = await client.list_whole(ZONE, selectors={"fieldSelector": "spec.node=a"})
-    assert (whole.items, whole.resource_version) == ([{"n": 1}, {"n": 2}], "9")
+        result = await client.list_whole(ZONE, selectors={"fieldSelector": "spec.node=a"})
+    assert (result.items, result.resource_version) == ([{"n": 1}, {"n": 2}], "9")
     assert all("limit=250" in r.line and "fieldSelector=spec.node%3Da" in r.line for r in server.requests)
 
 
-async def test_a_watch_gives_events_as_they_are_sent_and_ends_with_its_reader() -> None:
+async def test_watch_yields_events_at_once_and_closes_its_connection() -> None:
     server = Server(CHUNKED + chunk(EVENT + EVENT[:9]) + chunk(EVENT[9:]))
     async with client_of(server) as client:
         watched = events(client)
         assert [await anext(watched) for _ in range(2)] == [("ADDED", OBJECT)] * 2
         await watched.aclose()
-        await server.gone.wait()
+        await server.connection_ended.wait()
     assert "allowWatchBookmarks=true&resourceVersion=7&timeoutSeconds=300" in server.requests[0].line
 
 
-# -- what is refused --
+# -- errors --
 
 
 @pytest.mark.parametrize(
@@ -144,9 +144,9 @@ async def test_a_watch_gives_events_as_they_are_sent_and_ends_with_its_reader() 
     [(400, Invalid), (403, KubeError), (404, NotFound), (409, Conflict), (410, Expired), (422, Invalid), (429, KubeError),
      (500, KubeError), (503, KubeError)],
 )  # fmt: skip
-async def test_a_refusal_is_told_by_what_to_do_about_it(status: int, error: type[KubeError]) -> None:
+async def test_error_type_follows_the_response_status(status: int, error: type[KubeError]) -> None:
     refusal = {"kind": "Status", "code": status, "reason": "Because", "message": "it says why"}
-    async with client_of(Server(answer(refusal, status))) as client:
+    async with client_of(Server(response(refusal, status))) as client:
         with pytest.raises(KubeError, match=r"^it says why$") as raised:
             await client.get(ZONE, "a")
         with pytest.raises(error):
@@ -155,46 +155,46 @@ async def test_a_refusal_is_told_by_what_to_do_about_it(status: int, error: type
     assert (raised.value.status, raised.value.reason) == (status, "Because")
 
 
-async def test_nothing_is_sent_where_a_redirect_points() -> None:
+async def test_redirect_is_not_followed() -> None:
     head = b"HTTP/1.1 307 Temporary Redirect\r\nLocation: http://127.0.0.1:1/stolen\r\nContent-Length: 0\r\n\r\n"
     async with client_of(Server(head)) as client:
         with pytest.raises(KubeError, match="refused a redirect to http"):
             await client.request("POST", "/api/v1/secrets", {"data": {"tls.key": "c2VjcmV0"}})
 
 
-async def test_a_refusal_of_a_proxy_on_the_way_is_one_too() -> None:
-    async with client_of(Server(answer(b"<html>Bad Gateway</html>", 502))) as client:
+async def test_error_of_a_proxy_is_raised() -> None:
+    async with client_of(Server(response(b"<html>Bad Gateway</html>", 502))) as client:
         with pytest.raises(KubeError, match="Bad Gateway") as raised:
             await client.get(ZONE, "a")
     assert raised.value.status == 502
 
 
-async def test_an_error_in_a_watch_is_told_like_a_refusal() -> None:
+async def test_error_event_of_a_watch_is_raised() -> None:
     event = {"type": "ERROR", "object": {"code": 410, "reason": "Expired", "message": "too old"}}
     async with client_of(Server(CHUNKED + chunk(json.dumps(event).encode() + b"\n"))) as client:
         with pytest.raises(Expired, match="too old"):
             await anext(events(client))
 
 
-# -- what is torn, and what never answers --
+# -- broken connections and timeouts --
 
 
-async def test_a_watch_that_is_cut_is_an_error() -> None:
+async def test_interrupted_watch_raises() -> None:
     async with client_of(Server(CHUNKED + chunk(EVENT)[:-4], closes=True)) as client:
         with pytest.raises(KubeError) as raised:
             [event async for event in events(client)]
     assert (raised.value.status, raised.value.reason) == (0, "Unreachable")
 
 
-async def test_a_connection_that_is_closed_without_an_answer_is_an_error() -> None:
+async def test_connection_closed_without_response_raises() -> None:
     async with client_of(Server(b"", closes=True)) as client:
         with pytest.raises(KubeError, match="POST /x: ServerDisconnected"):
             await client.request("POST", "/x", {})
 
 
 @pytest.mark.parametrize("used", [False, True])
-async def test_requests_after_the_end_are_errors_like_others(used: bool) -> None:
-    async with client_of(Server(answer({"a": 1}))) as client:
+async def test_request_after_close_raises(used: bool) -> None:
+    async with client_of(Server(response({"a": 1}))) as client:
         if used:
             await client.request("GET", "/x")
         await client.aclose()
@@ -205,19 +205,19 @@ async def test_requests_after_the_end_are_errors_like_others(used: bool) -> None
         assert not await client.ready()
 
 
-async def test_an_answer_that_is_no_json_is_an_error() -> None:
-    async with client_of(Server(answer(b"<html>"))) as client:
+async def test_response_without_json_raises() -> None:
+    async with client_of(Server(response(b"<html>"))) as client:
         with pytest.raises(KubeError, match="JSONDecodeError"):
             await client.get(ZONE, "a")
 
 
 @pytest.mark.parametrize(
-    "silent",
+    "data",
     [b"", CHUNKED + chunk(EVENT), CHUNKED + chunk(EVENT) + b"HTTP/1.1 502 Bad Gateway\r\n\r\n"],
-    ids=["no answer", "silent stream", "no chunk"],
+    ids=["no response", "silent stream", "no chunk"],
 )
-async def test_silence_is_a_time_out(silent: bytes) -> None:
-    async with client_of(Server(silent)) as client:
+async def test_silent_server_times_out(data: bytes) -> None:
+    async with client_of(Server(data)) as client:
         with pytest.raises(KubeError) as raised:
             [event async for event in events(client, silence_s=0.2)]
         assert raised.value.status == 0
@@ -225,25 +225,25 @@ async def test_silence_is_a_time_out(silent: bytes) -> None:
             await client.request("GET", "/", timeout_s=0.2)
 
 
-async def test_a_connection_that_is_refused_is_one_sentence() -> None:
+async def test_refused_connection_raises_one_sentence() -> None:
     async with contextlib.aclosing(Client(with_certificate("http://127.0.0.1:1"), "tests")) as client:
         with pytest.raises(KubeError, match=r"^GET /x: ClientConnectorError: [^\n]*127.0.0.1:1[^\n]*$"):
             await client.request("GET", "/x")
         assert not await client.ready()
 
 
-async def test_a_request_that_is_given_up_leaves_no_connection() -> None:
+async def test_cancelled_request_closes_its_connection() -> None:
     server = Server(b"")
     async with client_of(server) as client:
         request = asyncio.create_task(client.get(ZONE, "a"))
-        await server.heard.wait()
+        await server.request_received.wait()
         request.cancel()
         with pytest.raises(asyncio.CancelledError):
             await request
-        await server.gone.wait()
+        await server.connection_ended.wait()
 
 
-async def test_a_list_that_makes_progress_has_more_time_than_an_object() -> None:
+async def test_slow_list_with_progress_does_not_time_out() -> None:
     page = json.dumps({"metadata": {"resourceVersion": "7"}, "items": []}).encode()
     slow = Server(CHUNKED + b"".join(chunk(page[i : i + 1]) for i in range(len(page))) + chunk(b""), delay_s=0.15)
     async with client_of(slow) as client:
@@ -252,14 +252,14 @@ async def test_a_list_that_makes_progress_has_more_time_than_an_object() -> None
             await client.request("GET", "/x", timeout_s=0.1)
 
 
-async def test_a_list_that_makes_no_progress_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_list_without_progress_times_out(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("fractus_runtime.kubernetes.connection.REQUEST_TIMEOUT_S", 0.2)
     async with client_of(Server(CHUNKED + chunk(b'{"items"'))) as client, asyncio.timeout(5.0):
         with pytest.raises(KubeError, match="no response"):
             await client.list(ZONE)
 
 
-async def test_a_write_to_an_api_server_that_stalls_ends_before_another_may_act() -> None:
+async def test_write_times_out_before_the_lease_ends() -> None:
     left_s = 0.02
     server = Server(b"")
     async with client_of(server, may_write_s=lambda: left_s) as client:
@@ -272,11 +272,11 @@ async def test_a_write_to_an_api_server_that_stalls_ends_before_another_may_act(
     assert len(server.requests) == before
 
 
-# -- who asks --
+# -- authentication --
 
 
 class Guarded(Server):
-    """Answers who has the token, and 401 all others."""
+    """Server that responds with 401 to requests without the token."""
 
     def __init__(self, token: str) -> None:
         self.token = token
@@ -284,8 +284,8 @@ class Guarded(Server):
 
     def _judge(self, request: Request) -> bytes:
         if request.header("authorization").lower() == f"bearer {self.token}":
-            return answer(OBJECT)
-        return answer({"code": 401, "reason": "Unauthorized", "message": "Unauthorized"}, 401)
+            return response(OBJECT)
+        return response({"code": 401, "reason": "Unauthorized", "message": "Unauthorized"}, 401)
 
 
 @contextlib.asynccontextmanager
@@ -297,7 +297,7 @@ async def guarded(tmp_path: Path, user: dict[str, Any], token: str) -> AsyncIter
             yield server, client
 
 
-async def test_a_token_that_is_refused_is_read_again_once(tmp_path: Path) -> None:
+async def test_token_file_is_read_again_once_after_401(tmp_path: Path) -> None:
     (tmp_path / "token").write_text("one\n")
     async with guarded(tmp_path, {"tokenFile": str(tmp_path / "token")}, "one") as (server, client):
         assert await client.get(ZONE, "a") == OBJECT
@@ -309,7 +309,7 @@ async def test_a_token_that_is_refused_is_read_again_once(tmp_path: Path) -> Non
         assert await client.get(ZONE, "a") == OBJECT
 
 
-async def test_a_service_account_is_used_and_its_token_rotates(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_service_account_token_is_rotated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     credential = Authority(tmp_path).issue("server", common_name="s", alternative_names=("localhost",))
     context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
     context.load_cert_chain(credential.certificate, credential.key)
@@ -328,7 +328,7 @@ async def test_a_service_account_is_used_and_its_token_rotates(tmp_path: Path, m
             await in_cluster(tmp_path / "none")
 
 
-async def test_a_credential_plugin_is_asked_again_when_its_token_is_refused(tmp_path: Path) -> None:
+async def test_credential_plugin_runs_again_after_401(tmp_path: Path) -> None:
     plugin = tmp_path / "plugin.py"
     plugin.write_text(
         "import json, pathlib\n"
@@ -373,23 +373,23 @@ async def test_server_certificate_without_authority_key_identifier_is_accepted(
         return strict
 
     monkeypatch.setattr(ssl, "create_default_context", strict_context)
-    server = Server(answer(OBJECT))
+    server = Server(response(OBJECT))
     async with listening(server, context):
         access = with_certificate(server.url.replace("127.0.0.1", "localhost"), tmp_path / "ca.crt")
         async with contextlib.aclosing(Client(access, "tests")) as client:
             assert await client.get(ZONE, "a") == OBJECT
 
 
-async def test_a_certificate_of_an_unknown_authority_is_one_sentence(tmp_path: Path) -> None:
-    for name in ("theirs", "ours"):
+async def test_certificate_of_unknown_authority_raises_one_sentence(tmp_path: Path) -> None:
+    for name in ("server_ca", "client_ca"):
         (tmp_path / name).mkdir()
-    credential = Authority(tmp_path / "theirs").issue("server", common_name="s", alternative_names=("localhost",))
+    credential = Authority(tmp_path / "server_ca").issue("server", common_name="s", alternative_names=("localhost",))
     context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
     context.load_cert_chain(credential.certificate, credential.key)
-    ours = Authority(tmp_path / "ours").credential.certificate
-    server = Server(answer({}))
+    trusted = Authority(tmp_path / "client_ca").credential.certificate
+    server = Server(response({}))
     async with listening(server, context) as access:
-        access.configuration.ssl_ca_cert = str(ours)
+        access.configuration.ssl_ca_cert = str(trusted)
         client = Client(access, "tests")
         async with contextlib.aclosing(client):
             with pytest.raises(KubeError, match=r"^GET /x: [^\n]*certificate verify failed[^\n]*$"):
@@ -397,7 +397,7 @@ async def test_a_certificate_of_an_unknown_authority_is_one_sentence(tmp_path: P
 
 
 @pytest.mark.parametrize("text", ["", "][", "[1]", "clusters: []\ncontexts: []\nusers: []\n", "current-context: c\n"])
-async def test_a_kubeconfig_that_is_of_no_use_is_one_sentence(
+async def test_invalid_kubeconfig_raises_one_sentence(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str
 ) -> None:
     (tmp_path / "config").write_text(text)
@@ -409,7 +409,7 @@ async def test_a_kubeconfig_that_is_of_no_use_is_one_sentence(
         await from_environment()
 
 
-async def test_certificates_that_cannot_be_read_are_one_sentence(tmp_path: Path) -> None:
+async def test_unreadable_certificates_raise_one_sentence(tmp_path: Path) -> None:
     (tmp_path / "ca.crt").write_text("no certificate")
     for ca in ("ca.crt", "none"):
         with pytest.raises(Unconfigured, match=r"^the certificates of the cluster cannot be used"):
@@ -417,29 +417,29 @@ async def test_certificates_that_cannot_be_read_are_one_sentence(tmp_path: Path)
 
 
 @pytest.mark.parametrize("trust_env", [True, False])
-async def test_a_proxy_of_the_environment_is_used_where_it_is_trusted(
+async def test_proxy_of_the_environment_is_used_only_with_trust_env(
     monkeypatch: pytest.MonkeyPatch, trust_env: bool
 ) -> None:
     for name in ("http_proxy", "https_proxy", "all_proxy", "no_proxy"):
         monkeypatch.delenv(name, raising=False)
         monkeypatch.delenv(name.upper(), raising=False)
-    proxy = Server(answer({"from": "proxy"}))
-    server = Server(answer({"from": "server"}))
+    proxy = Server(response({"from": "proxy"}))
+    server = Server(response({"from": "server"}))
     async with listening(proxy), client_of(server, trust_env=trust_env) as client:
         monkeypatch.setenv("http_proxy", proxy.url)
         assert await client.request("GET", "/x") == {"from": "proxy" if trust_env else "server"}
 
 
-# -- without an event loop --
+# -- blocking client --
 
 
-async def test_the_blocking_client_serves_many_threads() -> None:
+async def test_blocking_client_works_in_several_threads() -> None:
     server = Server(
-        lambda request: answer({} if "/a" in request.line else {"code": 404}, 200 if "/a" in request.line else 404)
+        lambda request: response({} if "/a" in request.line else {"code": 404}, 200 if "/a" in request.line else 404)
     )
     async with listening(server) as access:
 
-        def use() -> None:
+        def send_requests() -> None:
             with BlockingClient(access, "tests") as client:
                 assert client.ready() is False
                 assert client.get("/a") == {}
@@ -447,5 +447,5 @@ async def test_the_blocking_client_serves_many_threads() -> None:
                 client.delete("/b")
                 client.apply("/a", {"b": 1}, manager="kubectl")
 
-        await asyncio.gather(*(asyncio.to_thread(use) for _ in range(3)))
+        await asyncio.gather(*(asyncio.to_thread(send_requests) for _ in range(3)))
     assert sum("fieldManager=kubectl&force=true" in r.line for r in server.requests) == 3

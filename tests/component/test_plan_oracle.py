@@ -1,4 +1,4 @@
-"""Plans of random scenes, with policies and shared drones, against an oracle that looks at everything."""
+"""Plans of random scenes with policies and shared drones, compared with an exhaustive oracle."""
 
 import pytest
 from depth import examples
@@ -6,7 +6,7 @@ from plan_oracle import Undecided, deviation
 
 
 @pytest.mark.parametrize("batch", range(4))
-def test_plans_are_those_of_the_oracle(batch):
+def test_plans_equal_plans_of_the_oracle(batch):
     count = examples(1500, 30)
     undecided = 0
     for seed in range(batch * count, (batch + 1) * count):
@@ -18,5 +18,5 @@ def test_plans_are_those_of_the_oracle(batch):
 
 
 @pytest.mark.parametrize("seed", [980, 1442, 2326, 4215])
-def test_drones_with_a_way_around_or_a_home_inside_the_operation_area_are_planned(seed):
+def test_drone_with_detour_or_home_inside_operation_area_is_planned(seed):
     assert deviation(seed) is None

@@ -1,4 +1,4 @@
-"""Ports for programs that are told where to listen: no one else gets them, not even between two starts."""
+"""Reservation of ports for programs that are started with a port number. No other process gets a reserved port."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from contextlib import ExitStack
 import pytest
 from fractus_cluster import ports
 
-ALL_OF_TEN = """
+RESERVE_ALL = """
 from fractus_cluster import ports
 ports._FIRST, ports._LAST = {first}, {last}
 while True:
@@ -24,20 +24,20 @@ while True:
 
 
 @pytest.fixture
-def ten(monkeypatch: pytest.MonkeyPatch) -> Iterator[range]:
-    """The only ten ports there are: no one has one, and no other run of these tests has them meanwhile."""
-    own: deque[socket.socket] = deque()
+def port_range(monkeypatch: pytest.MonkeyPatch) -> Iterator[range]:
+    """Restrict the reservations to ten free ports that no other run of these tests uses."""
+    reservations: deque[socket.socket] = deque()
     with ExitStack() as claims:
-        first = next(first for first in range(19_000, 20_000, 10) if claimed(claims, first))
+        first = next(first for first in range(19_000, 20_000, 10) if claim_ports(claims, first))
         monkeypatch.setattr(ports, "_FIRST", first)
         monkeypatch.setattr(ports, "_LAST", first + 9)
-        monkeypatch.setattr(ports, "_reservations", own)
+        monkeypatch.setattr(ports, "_reservations", reservations)
         yield range(first, first + 10)
-        for reservation in own:
+        for reservation in reservations:
             reservation.close()
 
 
-def claimed(claims: ExitStack, first: int) -> bool:
+def claim_ports(claims: ExitStack, first: int) -> bool:
     claim = claims.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM))
     try:
         claim.bind(f"\0fractus/test/{first}")
@@ -46,41 +46,41 @@ def claimed(claims: ExitStack, first: int) -> bool:
     return all(ports._is_free(port) for port in range(first, first + 10))
 
 
-def given_to_another_process(among: range) -> set[int]:
-    script = ALL_OF_TEN.format(first=among[0], last=among[-1])
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True, timeout=60)
-    return {int(line) for line in done.stdout.split()}
+def ports_of_another_process(port_range: range) -> set[int]:
+    script = RESERVE_ALL.format(first=port_range[0], last=port_range[-1])
+    result = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True, timeout=60)
+    return {int(line) for line in result.stdout.split()}
 
 
-def test_no_other_process_gets_our_ports_and_theirs_are_free_when_they_end(ten: range) -> None:
-    ours = {ports.free_port() for _ in range(3)}
-    assert len(ours) == 3
-    theirs = given_to_another_process(ten)
-    assert theirs
-    assert not theirs & ours
-    assert given_to_another_process(ten) == theirs
+def test_reserved_ports_are_exclusive_until_their_process_ends(port_range: range) -> None:
+    own_ports = {ports.free_port() for _ in range(3)}
+    assert len(own_ports) == 3
+    other_ports = ports_of_another_process(port_range)
+    assert other_ports
+    assert not other_ports & own_ports
+    assert ports_of_another_process(port_range) == other_ports
 
 
-def test_a_port_where_another_listens_is_not_given(ten: range) -> None:
-    free = given_to_another_process(ten)
+def test_port_in_use_is_not_reserved(port_range: range) -> None:
+    free = ports_of_another_process(port_range)
     with socket.socket() as taken, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as bound:
         taken.bind(("0.0.0.0", min(free)))
         taken.listen()
         bound.bind(("127.0.0.1", max(free)))
-        assert given_to_another_process(ten) == free - {min(free), max(free)}
+        assert ports_of_another_process(port_range) == free - {min(free), max(free)}
 
 
-def test_without_a_free_port_it_says_which_were_tried(ten: range) -> None:
-    assert {ports.free_port() for _ in ten} == set(ten)
-    with pytest.raises(OSError, match=f"no free port from {ten[0]} to {ten[-1]} .*; end programs"):
+def test_error_without_free_port_names_the_range(port_range: range) -> None:
+    assert {ports.free_port() for _ in port_range} == set(port_range)
+    with pytest.raises(OSError, match=f"no free port from {port_range[0]} to {port_range[-1]} .*; end programs"):
         ports.free_port()
 
 
-def test_the_oldest_reservations_end_first(ten: range, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_oldest_reservations_are_released_first(port_range: range, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ports, "_KEPT", 2)
-    given = [ports.free_port() for _ in range(4)]
-    assert given_to_another_process(ten) == set(ten) - set(given[-2:])
+    reserved = [ports.free_port() for _ in range(4)]
+    assert ports_of_another_process(port_range) == set(port_range) - set(reserved[-2:])
 
 
-def test_ports_lie_below_what_linux_and_kubernetes_give_to_anyone_and_above_what_is_usual_for_mavlink() -> None:
+def test_reserved_ports_lie_between_mavlink_and_ephemeral_ports() -> None:
     assert all(18_570 < ports.free_port() < 30_000 for _ in range(50))

@@ -14,8 +14,8 @@ import numpy as np
 import policy_flights
 import pytest
 from depth import cells, examples
-from fractus_core.policy import free_space, goto_rules, return_route, velocity_rules
-from fractus_core.policy.decision_types import Call, GotoArgs, TakeoffArgs
+from fractus_core.policy import free_space, goto_rules
+from fractus_core.policy.decision_types import Call, GotoArgs, Situation, TakeoffArgs
 from fractus_core.policy.engine import MIN_TAKEOFF_ALTITUDE_M
 from fractus_core.policy.limits import MIN_LEG_ALTITUDE_M
 from fractus_core.policy.monitoring import monitor
@@ -241,8 +241,7 @@ def test_oracle_no_permitted_request_breaks_a_policy() -> None:
 
 
 def test_oracle_detects_too_small_margins(monkeypatch: pytest.MonkeyPatch) -> None:
-    for module in (goto_rules, velocity_rules):
-        monkeypatch.setattr(module, "margin_m", lambda _now: 0.5)
+    monkeypatch.setattr(Situation, "margin_m", property(lambda _now: 0.5))
     assert flights(seed=3, count=200).wrong
 
 
@@ -255,7 +254,7 @@ def test_oracle_return_flights_break_no_policy() -> None:
 
 
 def test_oracle_detects_return_flights_through_zones(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(return_route, "check_straight_return", lambda *_, **__: None)
+    monkeypatch.setattr(free_space, "check_straight_return", lambda *_, **__: None)
     monkeypatch.setattr(goto_rules, "check_return", lambda *_: None)
     monkeypatch.setattr(free_space.FreeSpace, "blockers", lambda *_: [])
     wrong = flights(seed=11, count=160, requests=2, returns=WaysHome(11, 2)).wrong

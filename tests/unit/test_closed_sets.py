@@ -9,8 +9,7 @@ from fractus_core.api.geometry import Reference
 from fractus_core.api.methods import METHODS_OF
 from fractus_core.api.policies import FilterAction, GeofenceAction, LimitAction, PolicySpec
 from fractus_core.exhaustive import exhaustive
-from fractus_core.policy.altitude import altitude_above_home_m
-from fractus_core.policy.compiled_grant import Rule
+from fractus_core.policy.compiled_grant import Rule, altitude_above_home_m
 from fractus_core.policy.decision_types import Filter
 from fractus_core.policy.picture_rules import combine_filters, rule_filter
 from fractus_proto.v1 import mobility_pb2

@@ -14,8 +14,7 @@ from fractus_core.planning.grant_compiler import flight_grant
 from fractus_core.planning.inventory import Inventory, Settings
 from fractus_core.planning.mission import Estimate, MissionEstimator, MissionLeg, home_of, mission_legs, stay_minutes
 from fractus_core.planning.operation_area import OperationArea, operation_area
-from fractus_core.policy.altitude import altitude_above_home_m
-from fractus_core.policy.compiled_grant import CompiledGrant, compile_grant
+from fractus_core.policy.compiled_grant import CompiledGrant, altitude_above_home_m, compile_grant
 from fractus_core.policy.decision_types import (
     Airframe,
     Call,

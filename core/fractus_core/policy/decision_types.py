@@ -262,6 +262,20 @@ class Situation:
     exposure: tuple[Situation, ...] = ()
 
     @property
+    def margin_m(self) -> float:
+        """Horizontal distance that a leg keeps from fences: position error plus tracking error.
+
+        The stopping distance is not part of the margin. It counts along the direction of motion: a leg sweeps the
+        triangle of present position, turning point and target.
+        """
+        return self.position_error_m + self.airframe.tracking_m
+
+    @property
+    def height_margin_m(self) -> float:
+        """Vertical distance that a leg keeps from floors and ceilings of zones: altitude error plus tracking error."""
+        return self.altitude_error_m + self.airframe.tracking_m
+
+    @property
     def is_plausible(self) -> bool:
         """True if every number is finite and of a physically possible size."""
         figures = (*_FIGURES(self), *_MOTION(self.airframe))

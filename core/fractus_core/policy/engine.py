@@ -62,16 +62,13 @@ def judge(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
         now = _with_unknown_motion(now)
     verdict = _judge_once(call, now, grant)
     if verdict.action == "correct" and call.method in _ARGUMENT_TYPES:
-        verdict = _settle(call, verdict, now, grant)
-    return replace(verdict, brake_first=True) if _must_brake(call, verdict, now, grant) else verdict
-
-
-def _settle(call: Call, correction: Verdict, now: Situation, grant: CompiledGrant) -> Verdict:
-    """Return a correction that passes the whole judgement.
-
-    Separate from `judge`, where a closure would be allocated for every call.
-    """
-    return settle_correction(call, correction, lambda again: _judge_once(again, now, grant))
+        verdict = settle_correction(call, verdict, lambda again: _judge_once(again, now, grant))
+    if verdict.brake_first or not is_moving(now):
+        return verdict
+    # A moving drone stops first if it is taken over, or if it is on its way into a fence.
+    changes_course = verdict.permits and call.method in _COURSE_METHODS
+    must_brake = verdict.action == "takeover" or (changes_course and must_stop_first(now, grant))
+    return replace(verdict, brake_first=True) if must_brake else verdict
 
 
 def _judge_once(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
@@ -82,15 +79,6 @@ def _judge_once(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
     if call.method not in _RULES:
         return deny("MethodUnknown", f"the policy engine has no rule for {call.method}")
     return _RULES[call.method](call, now, grant)
-
-
-def _must_brake(call: Call, verdict: Verdict, now: Situation, grant: CompiledGrant) -> bool:
-    """Return True if a moving drone must stop first, because it is taken over or on its way into a fence."""
-    if verdict.brake_first or not is_moving(now):
-        return verdict.brake_first
-    if verdict.permits:
-        return call.method in _COURSE_METHODS and must_stop_first(now, grant)
-    return verdict.action == "takeover"
 
 
 def _with_unknown_motion(now: Situation) -> Situation:
@@ -204,45 +192,40 @@ def _check_arguments(call: Call) -> Verdict | None:
     expected = _ARGUMENT_TYPES.get(call.method)
     if expected is not None and not isinstance(call.args, expected):
         return deny("InvalidArgument", f"{call.method} needs its arguments")
-    for name, value, lower, upper, unit in _numbers(call):
+    for field, name, lower, upper, unit in _ARGUMENT_BOUNDS.get(type(call.args), ()):
+        value = getattr(call.args, field)
         if value is not None and not (math.isfinite(value) and lower <= value <= upper):
             return deny("InvalidArgument", f"{name} must be {lower:g} to {upper:g} {unit}, not {value:g}")
     return None
 
 
-_Number = tuple[str, float | None, float, float, str]
-
-
-def _numbers(call: Call) -> tuple[_Number, ...]:  # noqa: PLR0911 - one line a method
-    """Return the numbers among the arguments, each with name, bounds and unit."""
-    match call.args:
-        case TakeoffArgs(altitude_m):
-            return (("altitude", altitude_m, MIN_TAKEOFF_ALTITUDE_M, MAX_ALTITUDE_M, "m above home"),)
-        case SetSpeedArgs(speed_mps):
-            return (("speed", speed_mps, MIN_SPEED_MPS, MAX_SPEED_MPS, "m/s"),)
-        case GotoArgs(lat, lon, alt, _, yaw_deg, speed_mps):
-            return (
-                ("latitude", lat, -90, 90, "degrees"),
-                ("longitude", lon, -180, 180, "degrees"),
-                ("altitude", alt, -1000, MAX_ALTITUDE_M, "m"),
-                ("yaw", yaw_deg, -360, 360, "degrees"),
-                ("speed", speed_mps, MIN_SPEED_MPS, MAX_SPEED_MPS, "m/s"),
-            )
-        case VelocityArgs(north_mps, east_mps, down_mps, yaw_deg, hold_s):
-            return (
-                ("north", north_mps, -MAX_SPEED_MPS, MAX_SPEED_MPS, "m/s"),
-                ("east", east_mps, -MAX_SPEED_MPS, MAX_SPEED_MPS, "m/s"),
-                ("down", down_mps, -MAX_CLIMB_MPS, MAX_CLIMB_MPS, "m/s"),
-                ("yaw", yaw_deg, -360, 360, "degrees"),
-                ("hold", hold_s, *HOLD_S, "s"),
-            )
-        case PointGimbalArgs(pitch_deg, yaw_deg):
-            return (("pitch", pitch_deg, -90, 90, "degrees"), ("yaw", yaw_deg, -180, 180, "degrees"))
-        case CaptureArgs(width, height):
-            return (("width", width, 0, MAX_PIXELS, "pixels"), ("height", height, 0, MAX_PIXELS, "pixels"))
-        case _:
-            return ()
-
+_ARGUMENT_BOUNDS: dict[type, tuple[tuple[str, str, float, float, str], ...]] = {
+    TakeoffArgs: (("altitude_m", "altitude", MIN_TAKEOFF_ALTITUDE_M, MAX_ALTITUDE_M, "m above home"),),
+    SetSpeedArgs: (("speed_mps", "speed", MIN_SPEED_MPS, MAX_SPEED_MPS, "m/s"),),
+    GotoArgs: (
+        ("lat", "latitude", -90, 90, "degrees"),
+        ("lon", "longitude", -180, 180, "degrees"),
+        ("alt", "altitude", -1000, MAX_ALTITUDE_M, "m"),
+        ("yaw_deg", "yaw", -360, 360, "degrees"),
+        ("speed_mps", "speed", MIN_SPEED_MPS, MAX_SPEED_MPS, "m/s"),
+    ),
+    VelocityArgs: (
+        ("north_mps", "north", -MAX_SPEED_MPS, MAX_SPEED_MPS, "m/s"),
+        ("east_mps", "east", -MAX_SPEED_MPS, MAX_SPEED_MPS, "m/s"),
+        ("down_mps", "down", -MAX_CLIMB_MPS, MAX_CLIMB_MPS, "m/s"),
+        ("yaw_deg", "yaw", -360, 360, "degrees"),
+        ("hold_s", "hold", *HOLD_S, "s"),
+    ),
+    PointGimbalArgs: (
+        ("pitch_deg", "pitch", -90, 90, "degrees"),
+        ("yaw_deg", "yaw", -180, 180, "degrees"),
+    ),
+    CaptureArgs: (
+        ("width", "width", 0, MAX_PIXELS, "pixels"),
+        ("height", "height", 0, MAX_PIXELS, "pixels"),
+    ),
+}
+"""Numbers among the arguments of each method: field, name in messages, lowest and highest value, and unit."""
 
 _COURSE_METHODS = frozenset({"Goto", "SetVelocity"})
 """Methods that change the course of a flying drone."""

@@ -12,10 +12,9 @@ from shapely.geometry.base import BaseGeometry
 
 from fractus_core.policy.compiled_grant import AirVolume, CompiledGrant, PolicyZone
 from fractus_core.policy.decision_types import Situation
-from fractus_core.policy.geofences import find_breaches
-from fractus_core.policy.kinematics import XY, Leg, height_margin_m, margin_m
+from fractus_core.policy.geofences import check_straight_return, find_breaches
+from fractus_core.policy.kinematics import XY, Leg
 from fractus_core.policy.limits import limit_forbids_altitudes
-from fractus_core.policy.return_route import check_straight_return
 
 Floats = NDArray[np.float64]
 
@@ -46,7 +45,7 @@ class FreeSpace:
     def between(cls, now: Situation, grant: CompiledGrant, lower_m: float, upper_m: float, room_m: float) -> FreeSpace:
         """Return the space that a grant permits between two altitudes, with a clearance beyond the engine's margin."""
         moving = replace(grant, operation_area=grant.flight_area, operation_area_border=grant.flight_area_border)
-        slack = height_margin_m(now)
+        slack = now.height_margin_m
         required_areas = [
             fence.at(lower_m - slack, upper_m + slack, now, grant.flat_terrain)
             for fence in grant.inclusions
@@ -54,7 +53,7 @@ class FreeSpace:
         ]
         if grant.flight_area is not None and grant.flight_area_border is not None:
             required_areas.append((grant.flight_area, grant.flight_area_border))
-        return cls(now, moving, lower_m, upper_m, margin_m(now) + room_m, slack, tuple(required_areas))
+        return cls(now, moving, lower_m, upper_m, now.margin_m + room_m, slack, tuple(required_areas))
 
     def blockers(self, line: BaseGeometry) -> list[PolicyZone | int]:
         """Return the obstacles of a line: zones to keep out of, and indexes of areas to stay in."""

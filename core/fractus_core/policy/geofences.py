@@ -1,4 +1,4 @@
-"""Geofences: checks which fences a leg breaks, and how far the leg is legal."""
+"""Geofences: the fences that a leg breaks, the legal part of a leg, and the legality of a straight return."""
 
 from __future__ import annotations
 
@@ -11,10 +11,17 @@ from shapely.geometry.base import BaseGeometry
 
 from fractus_core.api.policies import GeofenceAction
 from fractus_core.exhaustive import exhaustive
-from fractus_core.policy.altitude import band_gap_m, band_may_overlap
-from fractus_core.policy.compiled_grant import OPERATION_AREA, AirVolume, CompiledGrant, Inclusion, PolicyZone
+from fractus_core.policy.compiled_grant import (
+    OPERATION_AREA,
+    AirVolume,
+    CompiledGrant,
+    Inclusion,
+    PolicyZone,
+    band_gap_m,
+    band_may_overlap,
+)
 from fractus_core.policy.decision_types import Situation, Takeover, Verdict, deny, distinct, format_distance
-from fractus_core.policy.kinematics import Leg, altitude_range_to_stop_m, shortest_stop_point
+from fractus_core.policy.kinematics import XY, Leg, altitude_range_to_stop_m, vertical_leg
 
 SEVERITY: dict[GeofenceAction, int] = exhaustive(
     GeofenceAction, {"adjust": 0, "ignore": 1, "hover": 2, "returnToLaunch": 3, "land": 4, "revoke": 5}
@@ -35,6 +42,10 @@ EXTRA_MARGIN_M = 0.25
 
 ALTITUDE_TOLERANCE_M = 0.5
 """Altitudes closer than this count as equal. Neither a barometer nor a controller is more accurate."""
+
+RTL_CONE_SLOPE = 3.0
+"""Slope of the autopilot's return cone: it climbs at most to this multiple of its distance from home, or higher if its
+owner configures that (ArduPilot parameter RTL_CONE_SLOPE)."""
 
 BISECTION_STEPS = 24
 """Steps of the search for the point where a leg is far enough from a fence. The result is accurate to a millimetre."""
@@ -168,7 +179,7 @@ def _check_exclusions(leg: Leg, now: Situation, grant: CompiledGrant, air: AirVo
     if not grant.exclusions.zones:
         return
     margin_m = air.margin_m
-    certain = _certain_way(leg, now)
+    certain = _certain_path(leg, now)
     for zone in grant.exclusions.near(air, now, grant.flat_terrain):
         shape = zone.shape
         clearance_m = _clearance_outside(shape, leg.braking_path)
@@ -189,12 +200,13 @@ def _check_exclusions(leg: Leg, now: Situation, grant: CompiledGrant, air: AirVo
         yield _exclusion_breach(zone, leg, margin_m, enters)
 
 
-def _certain_way(leg: Leg, now: Situation) -> BaseGeometry:
+def _certain_path(leg: Leg, now: Situation) -> BaseGeometry:
     """Return the part of a leg that the drone certainly flies, even if it is already braking as hard as it can.
 
     `Leg.braking_path` overestimates the way to rest. An overestimate must not permit legs past a fence.
     """
-    end = shortest_stop_point(now, leg.start)
+    braking_s = math.hypot(now.north_mps, now.east_mps) / (2 * now.airframe.accel_mps2)
+    end = leg.start[0] + now.east_mps * braking_s, leg.start[1] + now.north_mps * braking_s
     return shapely.points(leg.start) if end == leg.start else shapely.linestrings((leg.start, end))
 
 
@@ -333,7 +345,7 @@ def _stays_inside(shape: BaseGeometry, border: BaseGeometry, leg: Leg, now: Situ
     ground = leg.ground
     if shape.covers(ground) and not border.dwithin(ground, margin_m):
         return True
-    certain_path = _certain_way(leg, now)
+    certain_path = _certain_path(leg, now)
     if shape.covers(certain_path) and not border.dwithin(certain_path, margin_m):
         return False
     if shape.covers(leg.braking_path) and not shape.covers(ground):
@@ -405,3 +417,54 @@ def signed_depth_m(shape: BaseGeometry, border: BaseGeometry, point: BaseGeometr
     """Return the distance to the border: positive inside the shape, negative outside."""
     distance = float(border.distance(point)) if not border.is_empty else math.inf
     return distance if shape.covers(point) else -distance
+
+
+def check_straight_return(
+    target: XY, altitude_m: float, now: Situation, grant: CompiledGrant, *, margin: float, slack: float
+) -> Verdict | None:
+    """Return the denial of a target from which the autopilot's straight return is not legal, or None.
+
+    The autopilot climbs to its return altitude, or to a lower one near home (`RTL_CONE_SLOPE`), flies straight, and
+    descends at home.
+
+    Args:
+        target: Start of the return, in metres of the grant's frame.
+        altitude_m: Altitude of the target above home.
+        now: Home, airframe and time.
+        grant: Permissions and restrictions that apply.
+        margin: Distance to keep from zones in metres.
+        slack: Distance to keep from floors and ceilings of zones in metres.
+    """
+    if now.home is None:
+        return deny("HomeUnknown", "home is unknown, so the return cannot be checked; wait for the home position")
+    if not grant.exclusions.zones and not grant.inclusions:
+        return None
+    home = grant.frame.xy(now.home.lat, now.home.lon)
+    return_m = max(altitude_m, now.airframe.return_altitude_m)
+    least_m = max(altitude_m, min(return_m, RTL_CONE_SLOPE * math.dist(target, home)))
+    lane = shapely.linestrings((target, home)) if target != home else shapely.points(home)
+    blocking_zones = grant.exclusions.near(AirVolume(lane, margin, -slack, return_m + slack), now, grant.flat_terrain)
+    if not grant.inclusions and next(blocking_zones, None) is None:
+        return None
+    parts = (
+        Leg(target, target, target, home, least_m, return_m),
+        vertical_leg(target, altitude_m, return_m),
+        vertical_leg(home, 0.0, return_m),
+    )
+    description = f"at {return_m:.1f} m" if least_m == return_m else f"at {least_m:.1f} to {return_m:.1f} m"
+    for part in parts:
+        air = AirVolume(part.ground, margin, part.lower_m - slack, part.upper_m + slack)
+        for zone in grant.exclusions.near(air, now, grant.flat_terrain):
+            return _deny_return(
+                f"{description}, is blocked by zone {zone.name} of policy {zone.rule.name}", zone.rule.name
+            )
+    for fence in grant.inclusions:
+        if fence.rule.in_force(now.time_s):
+            shape, _ = fence.at(least_m, return_m, now, grant.flat_terrain)
+            if not shape.covers(lane):
+                return _deny_return(f"{description}, leaves the zones of policy {fence.rule.name}", fence.rule.name)
+    return None
+
+
+def _deny_return(description: str, policy: str) -> Verdict:
+    return deny("WayHomeBlocked", f"the straight return from the target, {description}", (policy,))

@@ -7,22 +7,18 @@ from dataclasses import dataclass, replace
 
 import shapely
 
-from fractus_core.policy.altitude import altitude_above_home_m
-from fractus_core.policy.compiled_grant import AirVolume, CompiledGrant
+from fractus_core.policy.compiled_grant import AirVolume, CompiledGrant, altitude_above_home_m
 from fractus_core.policy.decision_types import DENY_POSITION_UNKNOWN, Call, GotoArgs, Situation, Verdict, deny, distinct
-from fractus_core.policy.geofences import BISECTION_STEPS, Breach, breach_verdict, find_breaches
+from fractus_core.policy.geofences import BISECTION_STEPS, Breach, breach_verdict, check_straight_return, find_breaches
 from fractus_core.policy.kinematics import (
     XY,
     Leg,
-    height_margin_m,
+    goto_leg,
     is_moving,
-    margin_m,
     pending_outcomes,
     situation_at_rest,
     stop_altitude_m,
     stop_point,
-    turn_point,
-    turning_stops,
     vertical_leg,
 )
 from fractus_core.policy.limits import (
@@ -38,7 +34,6 @@ from fractus_core.policy.limits import (
     deny_unknown_datum,
     speed_bounds,
 )
-from fractus_core.policy.return_route import check_straight_return
 from fractus_core.policy.route_search import route_exists
 
 MAX_RANGE_M = 100_000.0
@@ -96,20 +91,21 @@ def _judge_after_stop(request: _Request, target: XY) -> Verdict | None:
         altitudes += (outcome.altitude_m, stop_altitude_m(outcome))
     braking = Leg(position, stop, stop, stop, min(altitudes), max(altitudes), tuple(corners))
     transit_grant = replace(grant, operation_area=grant.flight_area, operation_area_border=grant.flight_area_border)
-    if find_breaches(braking, now, transit_grant, margin_m(now), height_margin_m(now)):
+    if find_breaches(braking, now, transit_grant, now.margin_m, now.height_margin_m):
         return None
     # The leg begins at the point of rest, so a zone entered while braking would count as already entered.
     bounds, unknown = altitude_bounds(
-        grant, now, AirVolume(braking.ground, margin_m(now), braking.lower_m, braking.upper_m)
+        grant, now, AirVolume(braking.ground, now.margin_m, braking.lower_m, braking.upper_m)
     )
     reach = braking.lower_m, braking.upper_m
-    if unknown or check_altitude_on_entry(shapely.points(position), reach, bounds, height_margin_m(now)) is not None:
+    if unknown or check_altitude_on_entry(shapely.points(position), reach, bounds, now.height_margin_m) is not None:
         return None
     verdict = _judge_from(replace(request, now=situation_at_rest(now, grant.frame, position), position=stop), target)
     return replace(verdict, brake_first=True)
 
 
 def _judge_from(request: _Request, target: XY) -> Verdict:
+    """Judge the leg from the position of a request to a target."""
     args = request.args
     now = request.now
     grant = request.grant
@@ -126,8 +122,16 @@ def _judge_from(request: _Request, target: XY) -> Verdict:
     if args.alt is not None and args.reference == "terrain":
         reason = "no terrain model is loaded; the ground is taken as level with home"
         notes.append(Correction(altitude, "TerrainAssumedFlat", reason))
-    result = _permitted_leg(request, _Aim(target, altitude), notes, adjusting=True)
-    return result if isinstance(result, Verdict) else _goto_verdict(args, result, notes, grant)
+    permitted = _permitted_leg(request, _Aim(target, altitude), notes, adjusting=True)
+    if isinstance(permitted, Verdict):
+        return permitted
+    corrected = replace(args, alt=permitted.altitude_m, reference="home", speed_mps=permitted.speed_mps)
+    if any(note.code == "LegShortened" for note in notes):
+        lat, lon = grant.frame.latlon(*permitted.target)
+        corrected = replace(corrected, lat=lat, lon=lon)
+    verdict = correction_verdict(corrected, sorted(notes, key=lambda note: note.code == "TerrainAssumedFlat"))
+    # Flat terrain is mentioned in the reason, but it changes none of the requested arguments.
+    return replace(verdict, action="allow") if verdict.code == "TerrainAssumedFlat" else verdict
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,12 +167,12 @@ def _permitted_leg(request: _Request, aim: _Aim, notes: list[Correction], adjust
     """Return the permitted part of a leg, or the verdict that forbids it."""
     now = request.now
     grant = request.grant
-    leg = _build_leg(request.position, aim.target, now, aim.altitude_m)
+    leg = goto_leg(now, request.position, aim.target, aim.altitude_m)
     limited = _within_limits(request, leg, aim, notes)
     if isinstance(limited, Verdict):
         return limited
-    leg = _build_leg(request.position, aim.target, now, limited.altitude_m)
-    breaches = find_breaches(leg, now, grant, margin_m(now), height_margin_m(now))
+    leg = goto_leg(now, request.position, aim.target, limited.altitude_m)
+    breaches = find_breaches(leg, now, grant, now.margin_m, now.height_margin_m)
     adjustable = adjusting and bool(breaches) and all(b.action == "adjust" for b in breaches)
     shorter = _last_legal_point(leg, breaches) if adjustable else None
     if shorter is None:
@@ -185,8 +189,8 @@ def _objection(request: _Request, aim: _Aim) -> Verdict | None:
     """Return the objection of fences and the return route to a leg, without its limits."""
     now = request.now
     grant = request.grant
-    leg = _build_leg(request.position, aim.target, now, aim.altitude_m)
-    breaches = find_breaches(leg, now, grant, margin_m(now), height_margin_m(now))
+    leg = goto_leg(now, request.position, aim.target, aim.altitude_m)
+    breaches = find_breaches(leg, now, grant, now.margin_m, now.height_margin_m)
     return breach_verdict(breaches) if breaches else check_return(aim.target, aim.altitude_m, now, grant)
 
 
@@ -194,7 +198,7 @@ def _within_limits(request: _Request, leg: Leg, aim: _Aim, notes: list[Correctio
     """Return the aim corrected to the limits of altitude and speed, or the verdict that forbids it."""
     now = request.now
     grant = request.grant
-    air = AirVolume(leg.ground, margin_m(now), leg.lower_m, leg.upper_m)
+    air = AirVolume(leg.ground, now.margin_m, leg.lower_m, leg.upper_m)
     bounds, unknown = altitude_bounds(grant, now, air)
     if unknown:
         return deny_unknown_datum(unknown[0])
@@ -214,7 +218,7 @@ def _within_limits(request: _Request, leg: Leg, aim: _Aim, notes: list[Correctio
         speed_bounds(grant, now, air),
     )
     altitudes = (now.altitude_m, stop_altitude_m(now))
-    problem = check_altitude_on_entry(shapely.points(request.position), altitudes, bounds, height_margin_m(now))
+    problem = check_altitude_on_entry(shapely.points(request.position), altitudes, bounds, now.height_margin_m)
     if problem is not None:
         return problem
     if isinstance(speed, Verdict):
@@ -223,31 +227,17 @@ def _within_limits(request: _Request, leg: Leg, aim: _Aim, notes: list[Correctio
     return _Aim(aim.target, height.value, speed.value if speed.code or requested_mps is not None else None)
 
 
-def _build_leg(position: XY, target: XY, now: Situation, altitude_m: float) -> Leg:
-    altitudes = [now.altitude_m, stop_altitude_m(now), altitude_m]
-    turn = turn_point(now, position, target)
-    stops = turning_stops(now, position, target)
-    for outcome_position, outcome in pending_outcomes(now, position):
-        stops += (
-            outcome_position,
-            turn_point(outcome, outcome_position, target),
-            *turning_stops(outcome, outcome_position, target),
-        )
-        altitudes += (outcome.altitude_m, stop_altitude_m(outcome))
-    return Leg(position, stop_point(now, position), turn, target, min(altitudes), max(altitudes), stops)
-
-
 def check_return(target: XY, altitude_m: float, now: Situation, grant: CompiledGrant) -> Verdict | None:
     """Return the denial of a target from which the return is not legal, or None.
 
     A drone on the wrong side of a fence may leave it regardless of the position of its home.
     """
-    problem = check_straight_return(target, altitude_m, now, grant, margin=margin_m(now), slack=height_margin_m(now))
+    problem = check_straight_return(target, altitude_m, now, grant, margin=now.margin_m, slack=now.height_margin_m)
     position = grant.locate(now)
     if problem is None or now.home is None or position is None:
         return problem
     stationary_leg = vertical_leg(position, now.altitude_m, now.altitude_m)
-    if find_breaches(stationary_leg, now, grant, margin_m(now), height_margin_m(now)):
+    if find_breaches(stationary_leg, now, grant, now.margin_m, now.height_margin_m):
         return None
     if not now.airframe.retraces:
         return problem
@@ -274,12 +264,3 @@ def _last_legal_point(leg: Leg, breaches: list[Breach]) -> XY | None:
         part = shapely.linestrings((leg.stop, along(share)))
         low, high = (share, high) if all(breach.permits(part) for breach in breaches) else (low, share)
     return along(low - 0.01 / length_m) if low * length_m >= MIN_LEG_M else None
-
-
-def _goto_verdict(args: GotoArgs, result: _Aim, notes: list[Correction], grant: CompiledGrant) -> Verdict:
-    moved = any(note.code == "LegShortened" for note in notes)
-    lat, lon = grant.frame.latlon(*result.target) if moved else (args.lat, args.lon)
-    new = replace(args, lat=lat, lon=lon, alt=result.altitude_m, reference="home", speed_mps=result.speed_mps)
-    verdict = correction_verdict(new, sorted(notes, key=lambda note: note.code == "TerrainAssumedFlat"))
-    # Flat terrain is mentioned in the reason, but it changes none of the requested arguments.
-    return replace(verdict, action="allow") if verdict.code == "TerrainAssumedFlat" else verdict

@@ -38,20 +38,6 @@ def reaction_s(situation: Situation, accel_mps2: float) -> float:
     return situation.latency_s + accel_mps2 / (2 * situation.airframe.jerk_mps3)
 
 
-def margin_m(now: Situation) -> float:
-    """Return the horizontal distance that a leg keeps from fences: position error plus tracking error.
-
-    The stopping distance is not part of the margin. It counts along the direction of motion: a leg sweeps the triangle
-    of present position, turning point and target.
-    """
-    return now.position_error_m + now.airframe.tracking_m
-
-
-def height_margin_m(now: Situation) -> float:
-    """Return the vertical distance that a leg keeps from floors and ceilings of zones."""
-    return now.altitude_error_m + now.airframe.tracking_m
-
-
 def is_moving(now: Situation) -> bool:
     """Return True if the drone is too fast to turn on the spot, or may be when a command takes effect."""
     if _exceeds_stationary_speed(now.north_mps, now.east_mps, now.down_mps):
@@ -176,76 +162,61 @@ def stop_point(situation: Situation, position: XY) -> XY:
     return position[0] + situation.east_mps / speed * run, position[1] + situation.north_mps / speed * run
 
 
-def shortest_stop_point(situation: Situation, position: XY) -> XY:
-    """Return the point of rest in frame metres of a drone that is already braking as hard as it can."""
-    run = math.hypot(situation.north_mps, situation.east_mps) / (2 * situation.airframe.accel_mps2)
-    return position[0] + situation.east_mps * run, position[1] + situation.north_mps * run
-
-
-def turn_point(situation: Situation, position: XY, target: XY) -> XY:
-    """Return the corner of the triangle in which a drone turns from its present velocity toward a target.
+def _turn(situation: Situation, position: XY, stop: XY, target: XY) -> tuple[XY, tuple[XY, ...]]:
+    """Return the area that a drone may touch while it turns from its present velocity toward a target.
 
     While the velocity changes from v to w with an acceleration of size a, the drone flies a parabola: a Bezier curve of
     second degree whose middle control point lies v * T / 2 ahead, with T = |w - v| / a. The curve never leaves the
     triangle of its control points.
+
+    A drone that is stopped during the turn comes to rest along its velocity at that moment, possibly outside the
+    triangle.
+
+    Args:
+        situation: State of the drone.
+        position: Its position in frame metres.
+        stop: Its `stop_point`.
+        target: Point to fly to.
+
+    Returns:
+        The middle corner of the triangle, and points of rest of a drone that is stopped during the turn.
     """
     speed = math.hypot(situation.north_mps, situation.east_mps)
-    airframe = situation.airframe
-    stop = stop_point(situation, position)
     if speed < STATIONARY_MPS:
-        return stop
+        return stop, ()
+    airframe = situation.airframe
+    accel = airframe.accel_mps2
     reaction = motion_before_reaction(situation)
-    east = situation.east_mps / speed * reaction.speed_mps
-    north = situation.north_mps / speed * reaction.speed_mps
+    ahead = (situation.east_mps / speed, situation.north_mps / speed)
+    present = (ahead[0] * reaction.speed_mps, ahead[1] * reaction.speed_mps)
+    toward = (0.0, 0.0)
     change = reaction.speed_mps
     for origin in (position, stop):
         dx = target[0] - origin[0]
         dy = target[1] - origin[1]
         distance = math.hypot(dx, dy)
-        cruise = (
-            min(situation.speed_setpoint_mps, math.sqrt(2 * airframe.accel_mps2 * distance)) if distance > 0 else 0.0
-        )
-        to_east, to_north = (dx / distance * cruise, dy / distance * cruise) if distance > 0 else (0.0, 0.0)
-        change = max(change, math.hypot(to_east - east, to_north - north))
-    slack = airframe.accel_mps2 / (2 * airframe.position_gain**2)
-    run = reaction.run_m + slack + reaction.speed_mps * change / (2 * airframe.accel_mps2)
+        toward = (0.0, 0.0)
+        if distance > 0:
+            cruise = min(situation.speed_setpoint_mps, math.sqrt(2 * accel * distance))
+            toward = (dx / distance * cruise, dy / distance * cruise)
+        change = max(change, math.hypot(toward[0] - present[0], toward[1] - present[1]))
+    slack = accel / (2 * airframe.position_gain**2)
+    run = reaction.run_m + slack + reaction.speed_mps * change / (2 * accel)
     run = max(run, math.hypot(stop[0] - position[0], stop[1] - position[1]))
-    return position[0] + situation.east_mps / speed * run, position[1] + situation.north_mps / speed * run
-
-
-def turning_stops(situation: Situation, position: XY, target: XY) -> tuple[XY, ...]:
-    """Return the points of rest of a drone that is stopped while it turns toward a target.
-
-    It stops along its velocity at that moment, possibly outside the triangle of the turn.
-    """
-    speed = math.hypot(situation.north_mps, situation.east_mps)
-    if speed < STATIONARY_MPS:
-        return ()
-    airframe = situation.airframe
-    reaction = motion_before_reaction(situation)
-    stop = stop_point(situation, position)
-    ahead = (situation.east_mps / speed, situation.north_mps / speed)
-    distance = math.dist(stop, target)
-    cruise = min(situation.speed_setpoint_mps, math.sqrt(2 * airframe.accel_mps2 * distance))
-    toward = (
-        ((target[0] - stop[0]) / distance * cruise, (target[1] - stop[1]) / distance * cruise)
-        if distance > 0
-        else (0.0, 0.0)
-    )
-    present = (ahead[0] * reaction.speed_mps, ahead[1] * reaction.speed_mps)
-    change_s = math.dist(present, toward) / airframe.accel_mps2
-    points = []
+    corner = position[0] + ahead[0] * run, position[1] + ahead[1] * run
+    # `toward` is now the velocity from the point of rest to the target.
+    change_s = math.dist(present, toward) / accel
+    stops = []
     for share in _TURNING:
         vx, vy = (p + (t - p) * share for p, t in zip(present, toward, strict=True))
         fast = math.hypot(vx, vy)
         if fast > 0:
-            half = change_s * share / 2
-            on = reaction_s(situation, airframe.accel_mps2)
-            on += stopping_distance_m(fast, airframe.accel_mps2, airframe.position_gain) / fast
-            x = position[0] + ahead[0] * reaction.run_m + (present[0] + vx) * half + vx * on
-            y = position[1] + ahead[1] * reaction.run_m + (present[1] + vy) * half + vy * on
-            points.append((x, y))
-    return tuple(points)
+            half_s = change_s * share / 2
+            rest_s = reaction_s(situation, accel) + stopping_distance_m(fast, accel, airframe.position_gain) / fast
+            x = position[0] + ahead[0] * reaction.run_m + (present[0] + vx) * half_s + vx * rest_s
+            y = position[1] + ahead[1] * reaction.run_m + (present[1] + vy) * half_s + vy * rest_s
+            stops.append((x, y))
+    return corner, tuple(stops)
 
 
 def stop_altitude_m(situation: Situation) -> float:
@@ -274,7 +245,7 @@ class Leg:
     Attributes:
         start: Position of the drone.
         stop: Point of rest if the drone brakes now, on the way to `turn`.
-        turn: See `turn_point`.
+        turn: Middle corner of the triangle in which the drone turns, or `stop` if it turns on the spot.
         target: End of the leg.
         lower_m: Lowest altitude above home on the leg.
         upper_m: Highest altitude above home on the leg.
@@ -335,6 +306,22 @@ class Leg:
 def vertical_leg(position: XY, lower_m: float, upper_m: float) -> Leg:
     """Return the leg of a drone that stays above one point."""
     return Leg(position, position, position, position, lower_m, upper_m)
+
+
+def goto_leg(now: Situation, position: XY, target: XY, altitude_m: float) -> Leg:
+    """Return the leg of a drone that turns toward a target and flies to it, at an altitude above home.
+
+    Before it turns, the drone may take up any pending velocity setpoint.
+    """
+    altitudes = [now.altitude_m, stop_altitude_m(now), altitude_m]
+    stop = stop_point(now, position)
+    turn, corners = _turn(now, position, stop, target)
+    for outcome_position, outcome in pending_outcomes(now, position):
+        outcome_stop = stop_point(outcome, outcome_position)
+        outcome_turn, stops = _turn(outcome, outcome_position, outcome_stop, target)
+        corners += (outcome_position, outcome_turn, *stops)
+        altitudes += (outcome.altitude_m, stop_altitude_m(outcome))
+    return Leg(position, stop, turn, target, min(altitudes), max(altitudes), corners)
 
 
 def velocity_leg(now: Situation, position: XY, args: VelocityArgs) -> Leg:

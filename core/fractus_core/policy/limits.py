@@ -14,8 +14,14 @@ from shapely.geometry.base import BaseGeometry
 
 from fractus_core.api.policies import LimitAction
 from fractus_core.exhaustive import exhaustive
-from fractus_core.policy.altitude import altitude_above_home_m
-from fractus_core.policy.compiled_grant import AirVolume, CompiledGrant, PolicyIndex, PolicyZone, Rule
+from fractus_core.policy.compiled_grant import (
+    AirVolume,
+    CompiledGrant,
+    PolicyIndex,
+    PolicyZone,
+    Rule,
+    altitude_above_home_m,
+)
 from fractus_core.policy.decision_types import Args, Call, Situation, Verdict, deny, distinct
 
 ROUNDING_SLACK = 1e-6

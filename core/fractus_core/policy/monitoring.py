@@ -9,14 +9,21 @@ import shapely
 from shapely.geometry.base import BaseGeometry
 
 from fractus_core.api.policies import GeofenceAction
-from fractus_core.policy.altitude import altitude_above_home_m, band_depth_m, band_may_overlap
-from fractus_core.policy.compiled_grant import OPERATION_AREA, AirVolume, CompiledGrant, Inclusion, PolicyZone
+from fractus_core.policy.compiled_grant import (
+    OPERATION_AREA,
+    AirVolume,
+    CompiledGrant,
+    Inclusion,
+    PolicyZone,
+    altitude_above_home_m,
+    band_depth_m,
+    band_may_overlap,
+)
 from fractus_core.policy.decision_types import GotoArgs, SetSpeedArgs, Situation, Verdict
 from fractus_core.policy.geofences import SEVERITY, TAKEOVERS, find_breaches, signed_depth_m
 from fractus_core.policy.kinematics import (
     XY,
     is_moving,
-    margin_m,
     pending_outcomes,
     reaction_s,
     stop_altitude_m,
@@ -203,7 +210,7 @@ def must_stop_first(now: Situation, grant: CompiledGrant) -> bool:
         _fence_reactions(
             then,
             grant,
-            _stopping_path(then, begin, stop_point(then, begin), margin_m(then), stop_altitude_m(then)),
+            _stopping_path(then, begin, stop_point(then, begin), then.margin_m, stop_altitude_m(then)),
             system_flies=True,
         )
         for begin, then in outlooks

@@ -9,8 +9,7 @@ import shapely
 
 from fractus_core.api.policies import FaceMethod, Fallback, FilterAction
 from fractus_core.exhaustive import exhaustive
-from fractus_core.policy.altitude import band_limits_m
-from fractus_core.policy.compiled_grant import AirVolume, CompiledGrant, PolicyIndex, Rule
+from fractus_core.policy.compiled_grant import AirVolume, CompiledGrant, PolicyIndex, Rule, band_limits_m
 from fractus_core.policy.decision_types import Filter, Situation, Verdict, deny
 from fractus_core.policy.footprint import exposure_footprint
 

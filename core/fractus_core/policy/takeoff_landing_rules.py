@@ -16,7 +16,7 @@ from fractus_core.policy.decision_types import (
 )
 from fractus_core.policy.geofences import find_breaches
 from fractus_core.policy.goto_rules import check_return
-from fractus_core.policy.kinematics import XY, height_margin_m, margin_m, stop_point, vertical_leg
+from fractus_core.policy.kinematics import XY, stop_point, vertical_leg
 from fractus_core.policy.limits import altitude_bounds, choose_objection, clamp, correction_verdict, deny_unknown_datum
 
 
@@ -27,7 +27,7 @@ def judge_takeoff(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
     if position is None or not isinstance(args, TakeoffArgs):
         return DENY_POSITION_UNKNOWN if position is None else deny("InvalidArgument", "Takeoff needs its arguments")
     lower, upper = sorted((now.altitude_m, args.altitude_m))
-    bounds, unknown = altitude_bounds(grant, now, AirVolume(shapely.points(position), margin_m(now), lower, upper))
+    bounds, unknown = altitude_bounds(grant, now, AirVolume(shapely.points(position), now.margin_m, lower, upper))
     if unknown:
         return deny_unknown_datum(unknown[0])
     clamped = clamp("Altitude", "m above home", args.altitude_m, bounds)
@@ -69,7 +69,7 @@ def _vertical_problem(
 ) -> Verdict | None:
     """Return the denial of a vertical motion, or of standing, by fences. It is never a takeover."""
     leg = vertical_leg(position, min(lower_m, upper_m), max(lower_m, upper_m))
-    breaches = find_breaches(leg, now, grant, margin_m(now), height_margin_m(now))
+    breaches = find_breaches(leg, now, grant, now.margin_m, now.height_margin_m)
     if not breaches:
         return None
     return deny(breaches[0].code, breaches[0].reason, distinct(b.policy for b in breaches))

@@ -20,7 +20,7 @@ from fractus_core.policy.decision_types import (
 )
 from fractus_core.policy.geofences import Breach, breach_verdict, find_breaches
 from fractus_core.policy.goto_rules import check_return
-from fractus_core.policy.kinematics import XY, Leg, height_margin_m, margin_m, stop_altitude_m, velocity_leg
+from fractus_core.policy.kinematics import XY, Leg, stop_altitude_m, velocity_leg
 from fractus_core.policy.limits import (
     MIN_LEG_ALTITUDE_M,
     ROUNDING_SLACK,
@@ -56,9 +56,7 @@ def judge_speed(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
         return deny("InvalidArgument", "SetSpeed needs its arguments")
     if position is None:
         return DENY_POSITION_UNKNOWN
-    bounds = speed_bounds(
-        grant, now, AirVolume(shapely.points(position), margin_m(now), now.altitude_m, now.altitude_m)
-    )
+    bounds = speed_bounds(grant, now, AirVolume(shapely.points(position), now.margin_m, now.altitude_m, now.altitude_m))
     clamped = clamp("Speed", "m/s", args.speed_mps, bounds)
     return clamped if isinstance(clamped, Verdict) else correction_verdict(SetSpeedArgs(clamped.value), [clamped])
 
@@ -151,7 +149,7 @@ def _correct_altitude(setpoint: _Setpoint) -> Verdict | None:
     if unknown:
         return deny_unknown_datum(unknown[0])
     problem = check_contradiction("Altitude", "m", bounds) or check_altitude_on_entry(
-        shapely.points(setpoint.position), (now.altitude_m, stop_altitude_m(now)), bounds, height_margin_m(now)
+        shapely.points(setpoint.position), (now.altitude_m, stop_altitude_m(now)), bounds, now.height_margin_m
     )
     if problem is not None:
         return problem
@@ -272,7 +270,7 @@ def _scaled(args: VelocityArgs, share: float) -> VelocityArgs:
 
 def _setpoint_breaches(setpoint: _Setpoint, args: VelocityArgs) -> list[Breach]:
     now = setpoint.now
-    slack = height_margin_m(now) + now.airframe.tracking_m
+    slack = now.height_margin_m + now.airframe.tracking_m
     return find_breaches(setpoint.sweep(args), now, setpoint.grant, _margin_m(now), slack)
 
 
@@ -281,4 +279,4 @@ def _margin_m(now: Situation) -> float:
 
     A velocity starts at a position displaced by wind and leads to no fixed point, so the tracking error counts twice.
     """
-    return margin_m(now) + now.airframe.tracking_m
+    return now.margin_m + now.airframe.tracking_m

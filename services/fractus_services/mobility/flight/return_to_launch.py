@@ -10,10 +10,8 @@ from dataclasses import replace
 
 from fractus_core.control.state import FlightMode, ModeKind, TaskKind
 from fractus_core.policy.compiled_grant import CompiledGrant
-from fractus_core.policy.kinematics import height_margin_m, margin_m
+from fractus_core.policy.geofences import RTL_CONE_SLOPE, check_straight_return
 from fractus_core.policy.return_route import (
-    RTL_CONE_SLOPE,
-    check_straight_return,
     descent_enters_fence,
     may_change_altitude,
     return_altitudes_m,
@@ -217,7 +215,7 @@ class ReturnFlight:
         now = self._gate.situation()
         if now.lat is None or now.lon is None or now.home is None:
             return True
-        room = {"margin": margin_m(now), "slack": height_margin_m(now)}
+        room = {"margin": now.margin_m, "slack": now.height_margin_m}
         return check_straight_return(grant.frame.xy(now.lat, now.lon), now.altitude_m, now, grant, **room) is None
 
     def _home_distance_m(self) -> float:

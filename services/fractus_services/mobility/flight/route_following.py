@@ -10,10 +10,8 @@ from dataclasses import dataclass, replace
 
 import shapely
 from fractus_core.api.geometry import Position, Reference
-from fractus_core.policy.altitude import altitude_above_home_m
-from fractus_core.policy.compiled_grant import AirVolume, CompiledGrant
+from fractus_core.policy.compiled_grant import AirVolume, CompiledGrant, altitude_above_home_m
 from fractus_core.policy.decision_types import Call, GotoArgs, Home, Situation
-from fractus_core.policy.kinematics import margin_m
 from fractus_core.policy.limits import speed_bounds
 from fractus_core.policy.route_search import route_steps
 
@@ -183,7 +181,7 @@ def limited_mps(speed_mps: float, leg: GotoArgs, now: Situation, grant: Compiled
     target = grant.frame.xy(leg.lat, leg.lon)
     heights = (now.altitude_m, now.altitude_m if leg.alt is None else leg.alt)
     ground = shapely.points(at) if at == target else shapely.linestrings((at, target))
-    air = AirVolume(ground, margin_m(now), min(heights), max(heights))
+    air = AirVolume(ground, now.margin_m, min(heights), max(heights))
     return min([speed_mps, *(bound.upper for bound in speed_bounds(grant, now, air) if bound.upper is not None)])
 
 

@@ -7,7 +7,8 @@ from collections.abc import Mapping
 
 from fractus_core.control.state import FlightMode, ModeKind
 from fractus_core.policy.decision_types import Airframe
-from fractus_core.policy.return_route import RTL_CONE_SLOPE, ReturnBounds
+from fractus_core.policy.geofences import RTL_CONE_SLOPE
+from fractus_core.policy.return_route import ReturnBounds
 from fractus_runtime.mavlink_codec import enum_names
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 

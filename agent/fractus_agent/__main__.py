@@ -16,7 +16,7 @@ from fractus_agent.agent import Agent
 from fractus_agent.settings import BadSetting, MissingSetting, Settings
 from fractus_agent.store import Store, Unconfigured, connect
 
-LOG = logging.getLogger("fractus_agent")
+log = logging.getLogger("fractus_agent")
 
 
 async def serve(settings: Settings) -> None:
@@ -49,11 +49,11 @@ def main(environment: Mapping[str, str] = os.environ) -> int:
     except ValueError as error:
         print(f"FRACTUS_LOG_LEVEL, FRACTUS_LOG_FORMAT: {error}", file=sys.stderr)
         return 2
-    LOG.info("agent: started (node=%s)", settings.node)
+    log.info("agent: started (node=%s)", settings.node)
     try:
         asyncio.run(serve(settings))
     except Unconfigured as error:
-        LOG.error("agent: %s", error)  # noqa: TRY400 (one line is enough)
+        log.error("agent: %s", error)  # noqa: TRY400 (one line is enough)
         return 1
     return 0
 

@@ -20,7 +20,7 @@ from fractus_runtime.files import remove_file, write_file
 from fractus_agent.store import GrantList, Object, Store
 from fractus_agent.supervisor import repeat
 
-LOG = logging.getLogger(__name__)
+log = logging.getLogger(__name__)
 
 _OUTCOMES: dict[OutcomeKind, GrantPhase] = {
     OutcomeKind.COMPLETE: "Complete",
@@ -283,7 +283,7 @@ class GrantSynchronizer:
             return
         for report in reports.values():
             if self._reported.get(report.uid) != report:
-                LOG.info("grants: reported (grant=%s phase=%s): %s", report.name, report.phase, report.message or "-")
+                log.info("grants: reported (grant=%s phase=%s): %s", report.name, report.phase, report.message or "-")
         self._reported_generation = self._generation
         self._reported = reports
 
@@ -293,7 +293,7 @@ class GrantSynchronizer:
             grant = Grant.from_body(body)
         except InvalidObject as error:
             # Fail closed: its limits are unknown, so it is not stored. Without a Grant the services fly the drone home.
-            LOG.error("grants: invalid Grant, not stored (grant=%s error=%s)", name, error)  # noqa: TRY400
+            log.error("grants: invalid Grant, not stored (grant=%s error=%s)", name, error)  # noqa: TRY400
             self._remove(name)
             self._report_unusable(body, "Failed", f"The agent of {self._node} cannot parse the Grant: {error}")
             return
@@ -308,7 +308,7 @@ class GrantSynchronizer:
                 self._defer(body, str(error))
                 return
         except BadSignature as error:
-            LOG.error("grants: bad signature, not stored (grant=%s error=%s)", name, error)  # noqa: TRY400
+            log.error("grants: bad signature, not stored (grant=%s error=%s)", name, error)  # noqa: TRY400
             self._remove(name)
             self._report_unusable(body, "Pending", self._waiting_message(error))
             return
@@ -335,7 +335,7 @@ class GrantSynchronizer:
         """Keep the stored Grant for a while, because a new authority may be about to arrive."""
         name = body["metadata"]["name"]
         if name not in self._unverified:
-            LOG.warning("grants: unknown authority, not stored yet (grant=%s error=%s)", name, reason)
+            log.warning("grants: unknown authority, not stored yet (grant=%s error=%s)", name, reason)
             since_s = self._monotonic()
         else:
             since_s = self._unverified[name][1]
@@ -348,7 +348,7 @@ class GrantSynchronizer:
         """Remove stored Grants whose replacement could not be verified in time."""
         for name, (body, since_s) in tuple(self._unverified.items()):
             if name in self._directory.names() and self._monotonic() - since_s > UNVERIFIED_TIMEOUT_S:
-                LOG.error("grants: removed, replacement has an unknown authority (grant=%s)", name)
+                log.error("grants: removed, replacement has an unknown authority (grant=%s)", name)
                 self._remove(name)
                 self._defer(body, "its authority is unknown on this node")
 
@@ -367,12 +367,12 @@ class GrantSynchronizer:
                     raise
                 stored = self._directory.write(grant)  # the removal may have freed space
             if stored:
-                LOG.info("grants: stored (grant=%s identity=%s)", grant.name, grant.spec.identity)
+                log.info("grants: stored (grant=%s identity=%s)", grant.name, grant.spec.identity)
             self._written[grant.name] = grant.spec.unsigned
             self._unstored.pop(grant.name, None)
         except OSError as error:
             if grant.name not in self._unstored:
-                LOG.exception("grants: cannot write to disk, retrying (grant=%s)", grant.name)
+                log.exception("grants: cannot write to disk, retrying (grant=%s)", grant.name)
             self._unstored[grant.name] = f"The node cannot store the Grant: {error.strerror or error}."
 
     def _remove_outdated(self, grant: Grant) -> bool:
@@ -388,14 +388,14 @@ class GrantSynchronizer:
             return False
         except OSError as error:
             # Possibly out of file descriptors. The services still use the stored version.
-            LOG.warning("grants: stored Grant not readable (grant=%s error=%s)", grant.name, error)
+            log.warning("grants: stored Grant not readable (grant=%s error=%s)", grant.name, error)
             stored = self._written.get(grant.name)
         except (ValueError, RecursionError, InvalidObject) as error:
-            LOG.warning("grants: stored Grant invalid (grant=%s error=%s)", grant.name, error)
+            log.warning("grants: stored Grant invalid (grant=%s error=%s)", grant.name, error)
         if stored == grant.spec.unsigned:
             return False
         removed = self._directory.remove(grant.name)
-        LOG.error("grants: removed, its new version cannot be stored (grant=%s)", grant.name)
+        log.error("grants: removed, its new version cannot be stored (grant=%s)", grant.name)
         return removed
 
     def retry_disk(self) -> None:
@@ -411,9 +411,9 @@ class GrantSynchronizer:
             record.pop(name, None)
         try:
             if self._directory.remove(name):
-                LOG.info("grants: removed (grant=%s)", name)
+                log.info("grants: removed (grant=%s)", name)
             self._unremoved.discard(name)
         except OSError:
             if name not in self._unremoved:
-                LOG.exception("grants: cannot remove from disk, retrying (grant=%s)", name)
+                log.exception("grants: cannot remove from disk, retrying (grant=%s)", name)
             self._unremoved.add(name)

@@ -14,6 +14,7 @@ from collections.abc import Callable
 from datetime import datetime
 from pathlib import Path
 
+from fractus_core.api.conditions import ConditionUpdate
 from fractus_runtime.files import read_set, write_set
 
 from fractus_agent.certificates import (
@@ -23,10 +24,9 @@ from fractus_agent.certificates import (
     create_request,
     inspect_certificate,
 )
-from fractus_agent.conditions import Condition
 from fractus_agent.store import Backoff, KubeError, Store
 
-LOG = logging.getLogger(__name__)
+log = logging.getLogger(__name__)
 
 LIFETIME_S = 30 * 86400
 CHECK_INTERVAL_S = 10.0
@@ -95,7 +95,7 @@ class NodeIdentity:
         self._authority_outdated = False
         self.ready = asyncio.Event()
         self.serial = 0
-        self.condition = Condition("Certified", "False", "Requested", "The node has no certificate yet.")
+        self.condition = ConditionUpdate("Certified", "False", "Requested", "The node has no certificate yet.")
 
     @property
     def expires_s(self) -> float | None:
@@ -130,7 +130,7 @@ class NodeIdentity:
                     self._set_condition("False", "Requested", f"The node has no usable certificate yet: {error}")
                     delay_s = min(15.0, self._backoff.delay_s())
                 else:
-                    LOG.debug("identity: API server failed, certificate still valid (error=%s)", error)
+                    log.debug("identity: API server failed, certificate still valid (error=%s)", error)
                     checked_s = loop.time() - AUTHORITY_INTERVAL_S + 15.0
             await asyncio.sleep(delay_s)
 
@@ -191,7 +191,7 @@ class NodeIdentity:
                 try:
                     validity = inspect_certificate(self._directory, self._node)
                 except InvalidCertificate as problem:
-                    LOG.warning("identity: invalid certificate (directory=%s error=%s)", self._directory, problem)
+                    log.warning("identity: invalid certificate (directory=%s error=%s)", self._directory, problem)
             self._inspected = (stamp, validity)
         return self._inspected[1]
 
@@ -204,10 +204,10 @@ class NodeIdentity:
         try:
             self._inspect_copy(files)
         except InvalidCertificate as problem:
-            LOG.warning("identity: certificate not issued by the new authority, requesting another (error=%s)", problem)
+            log.warning("identity: certificate not issued by the new authority, requesting another (error=%s)", problem)
             return None
         self._install(files)
-        LOG.info("identity: changed authority stored")
+        log.info("identity: changed authority stored")
         return self._validity()
 
     async def _renew(self, authority: bytes) -> None:
@@ -215,7 +215,7 @@ class NodeIdentity:
         name = f"fractus-{self._node}-{hashlib.sha256(request).hexdigest()[:10]}"
         await self._store.delete_certificate_requests()
         await self._store.request_certificate(name, request, LIFETIME_S)
-        LOG.info("identity: certificate requested (request=%s)", name)
+        log.info("identity: certificate requested (request=%s)", name)
         certificate = await self._wait_until_signed(name)
         files = {"tls.crt": certificate, "tls.key": key, "ca.crt": authority}
         try:
@@ -286,10 +286,10 @@ class NodeIdentity:
             self._set_condition("True", "Issued", f"{until}, but not renewed: {refusal.reason}: {refusal}")
 
     def _set_condition(self, status: str, reason: str, message: str) -> None:
-        condition = Condition("Certified", "True" if status == "True" else "False", reason, message)
+        condition = ConditionUpdate("Certified", "True" if status == "True" else "False", reason, message)
         if condition == self.condition:
             return
-        level = logging.INFO if condition.is_true else logging.WARNING
-        LOG.log(level, "identity: condition changed (reason=%s): %s", reason, message)
+        level = logging.INFO if status == "True" else logging.WARNING
+        log.log(level, "identity: condition changed (reason=%s): %s", reason, message)
         self.condition = condition
         self._on_change()

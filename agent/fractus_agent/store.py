@@ -39,7 +39,7 @@ from pydantic import ValidationError
 
 __all__ = ["Backoff", "Conflict", "Expired", "Invalid", "KubeError", "Object", "Store", "Unconfigured", "connect"]
 
-LOG = logging.getLogger(__name__)
+log = logging.getLogger(__name__)
 
 Object = Body
 
@@ -139,7 +139,7 @@ def _parse_status(body: Object) -> NodeGrantsStatus:
     try:
         return NodeGrantsStatus.model_validate(body.get("status") or {})
     except ValidationError as error:
-        LOG.warning("grants: invalid status, reporting again (error=%s)", InvalidObject.from_pydantic(error))
+        log.warning("grants: invalid status, reporting again (error=%s)", InvalidObject.from_pydantic(error))
         return NodeGrantsStatus()
 
 
@@ -274,7 +274,7 @@ class Store:
         packed: str | None = None
         async for event in self._follow(target):
             if isinstance(event, Deleted) or (isinstance(event, Listed) and not event.objects):
-                LOG.warning("grants: no NodeGrants object, keeping the stored Grants (node=%s)", self._node)
+                log.warning("grants: no NodeGrants object, keeping the stored Grants (node=%s)", self._node)
                 packed = None
                 continue
             if isinstance(event, Listed):
@@ -288,7 +288,7 @@ class Store:
                 spec = node_grants.spec
                 grants = None if spec.packed == packed else await asyncio.to_thread(unpack, spec.packed, spec.count)
             except InvalidObject as error:
-                LOG.error("grants: invalid NodeGrants, keeping the stored Grants (error=%s)", error)  # noqa: TRY400
+                log.error("grants: invalid NodeGrants, keeping the stored Grants (error=%s)", error)  # noqa: TRY400
                 continue
             packed = spec.packed
             status = _parse_status(body)
@@ -327,16 +327,16 @@ class Store:
                 objects, version = await self._list(target)
                 self._last_event_s[kind.plural] = time.monotonic()
                 if backoff.attempts > 1:
-                    LOG.info("%s: API server reachable again (attempts=%d)", kind.plural, backoff.attempts)
+                    log.info("%s: API server reachable again (attempts=%d)", kind.plural, backoff.attempts)
                 yield Listed(objects)
                 async with contextlib.aclosing(self._watch(target, version)) as events:
                     async for event in events:
                         yield event
             except Expired:
-                LOG.debug("%s: watch expired, listing again", kind.plural)
+                log.debug("%s: watch expired, listing again", kind.plural)
             except KubeError as error:
                 level = logging.WARNING if backoff.attempts == 0 else logging.DEBUG
-                LOG.log(level, "%s: watch failed, keeping the stored objects (error=%s)", kind.plural, error)
+                log.log(level, "%s: watch failed, keeping the stored objects (error=%s)", kind.plural, error)
             if time.monotonic() - started_s > 30.0:
                 backoff.succeeded()
             await asyncio.sleep(backoff.delay_s())

@@ -11,7 +11,7 @@ from typing import Any
 
 from fractus_agent.store import Backoff, KubeError
 
-LOG = logging.getLogger(__name__)
+log = logging.getLogger(__name__)
 
 FIRST_RETRY_S = 0.5
 MAX_RETRY_S = 15.0
@@ -59,7 +59,7 @@ async def repeat(name: str, step: Callable[[], Awaitable[float]], changed: async
             backoff.succeeded()
         except KubeError as error:
             level = logging.DEBUG if backoff.attempts else logging.WARNING
-            LOG.log(level, "%s: API server failed, retrying (error=%s)", name, error)
+            log.log(level, "%s: API server failed, retrying (error=%s)", name, error)
             await asyncio.sleep(backoff.delay_s())
             continue
         with contextlib.suppress(TimeoutError):

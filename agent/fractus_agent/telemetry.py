@@ -23,7 +23,7 @@ from fractus_runtime.files import read_set
 from fractus_agent.certificates import CERTIFICATE_FILES
 from fractus_agent.store import Backoff
 
-LOG = logging.getLogger(__name__)
+log = logging.getLogger(__name__)
 
 INTERVAL_S = 1.0
 """Seconds between messages."""
@@ -167,7 +167,7 @@ class TelemetryFeed:
             try:
                 async for message in self._messages():
                     if self.problem is not None:
-                        LOG.info("telemetry: connected (mobility=%s)", self._address)
+                        log.info("telemetry: connected (mobility=%s)", self._address)
                     self.latest = parse_telemetry(message)
                     self.problem = None
                     self._message_s = time.monotonic()
@@ -204,7 +204,7 @@ class TelemetryFeed:
     def _lost(self, reason: str) -> None:
         problem = f"The mobility service is unreachable: {reason}."
         if self.problem is None:
-            LOG.warning("telemetry: connection lost (mobility=%s reason=%s)", self._address, reason)
+            log.warning("telemetry: connection lost (mobility=%s reason=%s)", self._address, reason)
         if problem != self.problem:
             self.problem = problem
             self._on_change()

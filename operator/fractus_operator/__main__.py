@@ -40,7 +40,7 @@ from fractus_operator.standby import health_endpoint, wait_for_kinds
 from fractus_operator.store import KubeError, LeaseThread, LostLease, Store, Unconfigured
 from fractus_operator.work_queue import WorkQueue, run_periodically
 
-logger = logging.getLogger("fractus_operator")
+log = logging.getLogger("fractus_operator")
 
 
 def _now() -> datetime:
@@ -204,7 +204,7 @@ def main() -> int:
     try:
         asyncio.run(run(settings))
     except (Unconfigured, BrokenAuthority, KubeError, LostLease) as error:
-        logger.critical("operator: stopped (error=%s)", error)
+        log.critical("operator: stopped (error=%s)", error)
         return 1
     return 0
 

@@ -43,7 +43,7 @@ from fractus_operator.status import Blocked, Phase, StatusUpdate, flight, missio
 from fractus_operator.status_reporter import StatusReporter
 from fractus_operator.store import Backoff, KubeError, Store
 
-logger = logging.getLogger(__name__)
+log = logging.getLogger(__name__)
 
 RESYNC_S = 30.0
 _FIRST_RETRY_S = 1.0
@@ -135,7 +135,7 @@ class ApplicationController:
                     backoff.succeeded()
                 except KubeError as error:
                     next_s = backoff.delay_s()
-                    logger.warning(
+                    log.warning(
                         "application controller: reconcile failed (application=%s/%s retry_s=%.1f error=%s)",
                         *key,
                         next_s,
@@ -331,7 +331,7 @@ class ApplicationController:
         if choice.plan is not observed.plan:
             self._cache.plans.decide(observed.key, observed.uid, choice.plan)
         if choice.plan is not unchecked:
-            logger.info(
+            log.info(
                 "application controller: planned (application=%s/%s reason=%s drone=%s)",
                 *observed.key,
                 choice.reason or "PoliciesChanged",

@@ -18,7 +18,7 @@ from fractus_operator.child_objects import ChildObjects
 from fractus_operator.kinds import Key
 from fractus_operator.store import Conflict, KubeError, NotFound
 
-logger = logging.getLogger(__name__)
+log = logging.getLogger(__name__)
 
 REFUSALS = frozenset({400, 403, 422})
 """HTTP statuses with which the API server refuses an object itself. The user has to change something."""
@@ -67,9 +67,7 @@ class ApplicationGrants:
         failure = next((result for result in results if result is not None), None)
         if failure is not None:
             # Either the watch reports a newer Grant, or the next reconciliation fails in the same way.
-            logger.warning(
-                "application grants: Grants not updated (application=%s/%s error=%s)", *observed.key, failure
-            )
+            log.warning("application grants: Grants not updated (application=%s/%s error=%s)", *observed.key, failure)
             refused = isinstance(failure, KubeError) and failure.status in REFUSALS
             if not refused and not isinstance(failure, Conflict | NotFound):
                 raise failure

@@ -11,7 +11,7 @@ from fractus_operator.kinds import CONFIG_MAP, SECRET, Body
 from fractus_operator.labels import MANAGED_BY, MANAGED_LABEL
 from fractus_operator.store import Conflict, NotFound, Store
 
-logger = logging.getLogger(__name__)
+log = logging.getLogger(__name__)
 
 NAME = "fractus-ca"
 """Name of the Secret with the key of the authority, and of the ConfigMap with its certificate."""
@@ -30,7 +30,7 @@ async def open_authority(store: Store, namespace: str) -> Authority:
         body = {**_managed(SECRET.header(NAME, namespace)), "type": "kubernetes.io/tls", "data": authority.to_data()}
         try:
             secret = await store.create(SECRET, body)
-            logger.info("ca secret: certificate authority created (secret=%s/%s)", namespace, NAME)
+            log.info("ca secret: certificate authority created (secret=%s/%s)", namespace, NAME)
         except Conflict:
             secret = await store.get(SECRET, NAME, namespace)
     try:

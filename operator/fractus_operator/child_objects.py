@@ -36,7 +36,7 @@ from fractus_operator.resources.grant import regranted
 from fractus_operator.resources.secret import SecretWrite
 from fractus_operator.store import Conflict, ContentType, KubeError, NotFound, Store
 
-logger = logging.getLogger(__name__)
+log = logging.getLogger(__name__)
 
 _MAX_CONCURRENT = 16
 """Limit of concurrent writes of child objects other than plans and Grants.
@@ -188,7 +188,7 @@ class ChildObjects:
         present = _parse_grant(observed)
         problem = "it cannot be parsed" if present is None else self._signer.problem(present)
         if problem is not None:
-            logger.warning("child objects: invalid Grant is signed again (grant=%s problem=%s)", key[1], problem)
+            log.warning("child objects: invalid Grant is signed again (grant=%s problem=%s)", key[1], problem)
         elif self._is_current(kind, desired, observed) or _is_equal(observed, present, body):
             return
         _check_owner(application, kind, observed)
@@ -278,7 +278,7 @@ class ChildObjects:
         """Delete a child object. Return True if it is gone."""
         if "deletionTimestamp" in body["metadata"]:
             return False
-        logger.info("child objects: deleting (kind=%s name=%s)", kind.name, body["metadata"]["name"])
+        log.info("child objects: deleting (kind=%s name=%s)", kind.name, body["metadata"]["name"])
         if kind is kinds.DEPLOYMENT:
             await self._delete_secret_of(body)
         self._normalised.pop((kind, key_of(body)), None)
@@ -295,7 +295,7 @@ class ChildObjects:
         try:
             await self._store.delete(kinds.SECRET, secret)
         except KubeError as error:
-            logger.debug("child objects: Secret not deleted yet (secret=%s/%s error=%s)", *secret, error)
+            log.debug("child objects: Secret not deleted yet (secret=%s/%s error=%s)", *secret, error)
             self._undeleted_secrets.setdefault(application_label_key(deployment), set()).add(secret)
 
     async def _delete_remaining_secrets(self, application: Key) -> None:

@@ -27,7 +27,7 @@ from fractus_operator.parsing import Submitted
 from fractus_operator.pods import FINISHED_DEADLINE_S, PodView, parse_pod
 from fractus_operator.store import ContentType, NotFound, Store
 
-logger = logging.getLogger(__name__)
+log = logging.getLogger(__name__)
 
 ORPHANED_PODS_PERIOD_S = 30.0
 """Period of the search for orphaned pods, and the minimum time that the garbage collector has for them."""
@@ -181,7 +181,7 @@ class OrphanedObjects:
             return
         owner = _application_reference(body)
         if owner is None:
-            logger.warning("cleanup: object names no Application (kind=%s name=%s)", self._kind.name, key[1])
+            log.warning("cleanup: object names no Application (kind=%s name=%s)", self._kind.name, key[1])
             return
         submitted = self._cache.applications.get((owner.namespace, owner.name))
         if submitted is not None and submitted.metadata.uid == owner.uid:
@@ -193,7 +193,7 @@ class OrphanedObjects:
                 return
         except NotFound:
             pass
-        logger.info(
+        log.info(
             "cleanup: orphaned object deleted (kind=%s name=%s application=%s/%s)",
             self._kind.name,
             key[1],
@@ -239,7 +239,7 @@ class OrphanedPods:
                 yield pod.namespace, pod.application
 
     async def _remove(self, key: Key) -> None:
-        logger.info("cleanup: orphaned pods deleted (application=%s/%s)", *key)
+        log.info("cleanup: orphaned pods deleted (application=%s/%s)", *key)
         kept: set[str] = set()
         for body in await list_objects(self._store, DEPLOYMENT, key):
             # A Deployment without an owner is a copy that a user created.

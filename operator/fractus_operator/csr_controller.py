@@ -11,12 +11,13 @@ from datetime import datetime
 from cryptography import x509
 from cryptography.hazmat.primitives.asymmetric import ec
 from fractus_core.api import node_identity, node_server_name
+from fractus_core.api.model import timestamp
 from fractus_core.identity.authority import Authority
 
 from fractus_operator.kinds import SIGNING_REQUEST, Body, Key
 from fractus_operator.store import Conflict, NotFound, Store
 
-logger = logging.getLogger(__name__)
+log = logging.getLogger(__name__)
 
 NODE_NAME_CLAIM = "authentication.kubernetes.io/node-name"
 """Key of the node name in the user info of a token that is bound to a pod. The API server adds it."""
@@ -144,7 +145,7 @@ class CsrController:
                 certificate = self._authority.sign_node(reviewed.request, reviewed.node, self._clock())
                 status = {**(body.get("status") or {}), "certificate": base64.b64encode(certificate).decode()}
                 await self._store.replace(SIGNING_REQUEST, {**body, "status": status}, subresource="status")
-                logger.info("csr controller: certificate signed (node=%s request=%s)", reviewed.node, key[1])
+                log.info("csr controller: certificate signed (node=%s request=%s)", reviewed.node, key[1])
             elif "Approved" in conditions:
                 # Another approver approved a request that this signer does not sign.
                 await self._conclude(body, "Failed", reviewed, "status")
@@ -156,8 +157,8 @@ class CsrController:
         """Add a condition of the type `verdict`."""
         level = logging.WARNING if verdict == "Failed" else logging.INFO
         name = body["metadata"]["name"]
-        logger.log(level, "csr controller: request %s (request=%s message=%s)", verdict.lower(), name, reviewed.message)
-        stamp = self._clock().strftime("%Y-%m-%dT%H:%M:%SZ")
+        log.log(level, "csr controller: request %s (request=%s message=%s)", verdict.lower(), name, reviewed.message)
+        stamp = timestamp(self._clock())
         condition = {
             "type": verdict,
             "status": "True",

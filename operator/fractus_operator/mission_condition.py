@@ -10,16 +10,16 @@ from collections.abc import Callable
 from datetime import datetime
 
 from fractus_core.api import Drone
+from fractus_core.api.conditions import ConditionUpdate
 from fractus_core.api.nodes import ON_MISSION
 
 from fractus_operator.cache import ClusterCache
-from fractus_operator.conditions import ConditionUpdate
 from fractus_operator.kinds import DRONE, GRANT, Key
 from fractus_operator.node_conditions import NodeConditionWriter
 from fractus_operator.status_reporter import create_events
 from fractus_operator.store import Store
 
-logger = logging.getLogger(__name__)
+log = logging.getLogger(__name__)
 
 _REPORTS = 2
 """Number of different reports after the deletion of the last Grant that show the state of the drone."""
@@ -102,7 +102,7 @@ class MissionConditionController:
         last_seen = drone.status.last_seen if drone.status is not None else None
         if not drone.grounded_by_hand or self._recorded.get(drone.name) == last_seen:
             return
-        logger.warning("mission condition: user declared a drone to be on the ground (drone=%s)", drone.name)
+        log.warning("mission condition: user declared a drone to be on the ground (drone=%s)", drone.name)
         message = (
             f"a user declared {drone.name} to be on the ground (annotation fractus.dev/grounded): until its next report,"
             " neither admission nor the operator protects its services"

@@ -9,14 +9,14 @@ from http import HTTPStatus
 from typing import Any
 
 from fractus_core.api import Condition, Drone, EdgeNode
+from fractus_core.api.conditions import ConditionUpdate, merge_conditions
 
 from fractus_operator.cache import ClusterCache
-from fractus_operator.conditions import ConditionUpdate, merge
 from fractus_operator.kinds import DRONE, EDGE_NODE, Body, Kind, key_of
 from fractus_operator.status_reporter import create_events
 from fractus_operator.store import Conflict, Informer, KubeError, NotFound, Store
 
-logger = logging.getLogger(__name__)
+log = logging.getLogger(__name__)
 
 
 class NodeConditionWriter:
@@ -67,7 +67,7 @@ class NodeConditionWriter:
     ) -> Sequence[ConditionUpdate]:
         """Write a condition that only the operator writes. Return the transitions."""
         before = [known] if known is not None else []
-        conditions, transitions = merge(before, [update], node.metadata.generation, now)
+        conditions, transitions = merge_conditions(before, [update], node.metadata.generation, now)
         # With the uid, so that a later object of this name is not written. Each type has its own field manager, because an
         # apply removes the conditions of its manager that it does not contain.
         body = kind.header(node.name, uid=node.metadata.uid)
@@ -80,7 +80,7 @@ class NodeConditionWriter:
             if error.status != HTTPStatus.FORBIDDEN:
                 raise
             if not self._warned:
-                logger.warning(
+                log.warning(
                     "node conditions: may not patch the status, using update; upgrade the chart fractus, because its"
                     " ClusterRole belongs to another release (error=%s)",
                     error,
@@ -99,7 +99,7 @@ class NodeConditionWriter:
             return ()
         before = [Condition.model_validate(c) for c in status.get("conditions") or () if c["type"] == update.type]
         others = [c for c in status.get("conditions") or () if c["type"] != update.type]
-        conditions, transitions = merge(before, [update], body["metadata"].get("generation"), now)
+        conditions, transitions = merge_conditions(before, [update], body["metadata"].get("generation"), now)
         status["conditions"] = [*others, *(c.to_dict() for c in conditions)]
         self._record(kind, await self._store.replace(kind, body, subresource="status"))
         return transitions

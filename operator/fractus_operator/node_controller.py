@@ -24,7 +24,7 @@ from fractus_operator.resources.grant import reported_status
 from fractus_operator.store import Conflict, ContentType, Invalid, NotFound, Store
 from fractus_operator.work_queue import WorkQueue
 
-logger = logging.getLogger(__name__)
+log = logging.getLogger(__name__)
 
 _ALPHABET = "0123456789bcdefghjkmnpqrstuvwxyz"
 GEOHASH_LENGTH = 6
@@ -178,12 +178,12 @@ class NodeGrantsController:
                 if kind in account:
                     await self._delete(kind, node)
             if known is not None:
-                logger.info("node controller: objects of a deleted node removed (node=%s)", node)
+                log.info("node controller: objects of a deleted node removed (node=%s)", node)
                 await self._delete(kinds.NODE_GRANTS, node)
             return
         for kind in ACCOUNT_KINDS:
             if account.get(kind) is False:
-                logger.warning("node controller: modified object is created again (kind=%s node=%s)", kind.name, node)
+                log.warning("node controller: modified object is created again (kind=%s node=%s)", kind.name, node)
                 await self._delete(kind, node)
             if not account.get(kind):
                 created = await self._store.create(kind, account_object(kind, node))
@@ -202,7 +202,7 @@ class NodeGrantsController:
         if known is not None and known.contains(packed, count):
             return
         if count < len(grants):
-            logger.error(
+            log.error(
                 "node controller: NodeGrants object is full, newest Grants omitted (node=%s grants=%d omitted=%d)",
                 node,
                 len(grants),
@@ -238,9 +238,7 @@ class NodeGrantsController:
                 )
             except (Conflict, Invalid, NotFound) as error:
                 # The Grant was deleted, and possibly replaced by one of the same name.
-                logger.info(
-                    "node controller: report of a deleted Grant ignored (grant=%s error=%s)", grant_key[1], error
-                )
+                log.info("node controller: report of a deleted Grant ignored (grant=%s error=%s)", grant_key[1], error)
                 continue
             self._cache.children[kinds.GRANT].record_write(grant_key, written)
 

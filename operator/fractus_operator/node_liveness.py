@@ -8,16 +8,16 @@ from datetime import datetime
 from typing import Any
 
 from fractus_core.api import Drone, EdgeNode
+from fractus_core.api.conditions import ConditionUpdate
 from fractus_core.api.nodes import DRONE_REPORT_S, EDGE_REPORT_S, FLIGHT_REPORT_S, GROUNDED, ON_MISSION
 from fractus_core.planning.candidates import readiness
 from pydantic import TypeAdapter, ValidationError
 
 from fractus_operator.cache import ClusterCache
-from fractus_operator.conditions import ConditionUpdate
 from fractus_operator.node_conditions import NodeConditionWriter
 from fractus_operator.work_queue import skip_failed_node
 
-logger = logging.getLogger(__name__)
+log = logging.getLogger(__name__)
 
 AGENT_SILENT = "AgentSilent"
 PERIOD_S = 1.0
@@ -147,7 +147,7 @@ class NodeLivenessController:
             # The cache may be outdated, so the state at the API server decides.
             if last_seen is None or _parse_time(status.get("lastSeen")) != last_seen:
                 return False
-            logger.warning("node liveness: agent stopped reporting (node=%s)", node.name)
+            log.warning("node liveness: agent stopped reporting (node=%s)", node.name)
             if isinstance(node, Drone):
                 if status.get("flightState", "unknown") != "unknown":
                     status["lastFlightState"] = status["flightState"]

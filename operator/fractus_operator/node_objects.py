@@ -18,7 +18,7 @@ from fractus_operator.labels import MANAGED_BY, MANAGED_LABEL
 from fractus_operator.owned_objects import GroupedObjects
 from fractus_operator.store import Informer, Store
 
-logger = logging.getLogger(__name__)
+log = logging.getLogger(__name__)
 
 ACCOUNT_KINDS = (SERVICE_ACCOUNT, ROLE, ROLE_BINDING)
 """Kinds of the objects of a node's account, in the order of their creation. They are deleted in reverse order."""
@@ -96,7 +96,7 @@ def parse_known(body: Body) -> KnownGrants:
     try:
         reports = NodeGrantsStatus.model_validate(body.get("status") or {}).grants
     except ValidationError as error:
-        logger.warning("node objects: invalid reports ignored (node=%s error=%s)", body["metadata"]["name"], error)
+        log.warning("node objects: invalid reports ignored (node=%s error=%s)", body["metadata"]["name"], error)
     digest = digest_of(str(spec.get("packed")))
     return KnownGrants(str(body["metadata"].get("uid", "")), int(spec.get("count", -1)), digest, reports)
 

@@ -13,7 +13,7 @@ from pydantic import ValidationError
 
 from fractus_operator.kinds import Body, Key
 
-logger = logging.getLogger(__name__)
+log = logging.getLogger(__name__)
 
 R = TypeVar("R", bound=Resource)
 T_co = TypeVar("T_co", covariant=True)
@@ -153,7 +153,7 @@ def optional_parser(model: type[R]) -> Callable[[Body], R | None]:
         try:
             return parse_object(model, body)
         except InvalidObject as error:
-            logger.warning(
+            log.warning(
                 "parsing: invalid object ignored (kind=%s name=%s error=%s)",
                 model.KIND,
                 body["metadata"]["name"],

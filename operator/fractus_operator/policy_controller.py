@@ -6,11 +6,11 @@ from collections.abc import Callable, Sequence
 from datetime import datetime
 
 from fractus_core.api import Condition, InvalidObject, Policy, Zone
+from fractus_core.api.conditions import ConditionUpdate, merge_conditions
 from fractus_core.planning.grant_compiler import check_united, sound
 from fractus_core.validation import check_policy, check_zone
 
 from fractus_operator.cache import ClusterCache
-from fractus_operator.conditions import ConditionUpdate, merge
 from fractus_operator.kinds import POLICY, ZONE, Key, Kind
 from fractus_operator.parsing import Unreadable
 from fractus_operator.status_reporter import create_events
@@ -79,7 +79,7 @@ class PolicyController:
         now = self._clock()
         generation = resource.metadata.generation
         before = _conditions(resource)
-        conditions, transitions = merge(before, [update], generation, now)
+        conditions, transitions = merge_conditions(before, [update], generation, now)
         if conditions == before:
             return
         body = kind.header(resource.name, uid=resource.metadata.uid)

@@ -31,7 +31,7 @@ from fractus_operator.resources.secret import Certificate, Certificates
 from fractus_operator.resources.service import endpoints
 from fractus_operator.store import KubeError
 
-logger = logging.getLogger(__name__)
+log = logging.getLogger(__name__)
 
 _AFTER_DEPLOYMENTS = (
     kinds.SERVICE,
@@ -190,7 +190,7 @@ class Rollout:
         except KubeError as error:
             if not error.status:
                 raise
-            logger.warning("rollout: certificates not renewed (application=%s/%s error=%s)", *key, error)
+            log.warning("rollout: certificates not renewed (application=%s/%s error=%s)", *key, error)
 
     async def update_addresses(self, key: Key, plan: DeploymentPlanSpec, pods: Sequence[PodView]) -> None:
         """Update the addresses of pods in EndpointSlices and DirectLinks, and change nothing else.

@@ -21,7 +21,7 @@ from fractus_core.planning.legality import with_legality
 from fractus_operator.kinds import Key
 from fractus_operator.metrics import ERRORS, phase
 
-logger = logging.getLogger(__name__)
+log = logging.getLogger(__name__)
 
 MAX_AGE = timedelta(minutes=1)
 """Maximum age of a check. Zones and policies also begin and end at certain times."""
@@ -112,12 +112,12 @@ class RouteCheckCache:
                     result = await asyncio.to_thread(check)
             except InvalidObject as error:
                 # Planning reports the contradiction in the Application.
-                logger.info("route checks: route not checked (application=%s/%s error=%s)", *key, error)
+                log.info("route checks: route not checked (application=%s/%s error=%s)", *key, error)
                 result = plan
             except Exception:
                 # The failure is cached as well, so that the check is repeated after MAX_AGE and not at once.
                 ERRORS.labels("routes", "Bug").inc()
-                logger.exception("route checks: check failed (application=%s/%s)", *key)
+                log.exception("route checks: check failed (application=%s/%s)", *key)
                 result = plan
         if self._checks.get(key) is not before:
             return  # another plan was decided meanwhile

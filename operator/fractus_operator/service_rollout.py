@@ -8,15 +8,16 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from http import HTTPStatus
 
+from fractus_core.api.conditions import ConditionUpdate
+
 from fractus_operator import kinds
 from fractus_operator.cache import ClusterCache
-from fractus_operator.conditions import ConditionUpdate
 from fractus_operator.node_conditions import NodeConditionWriter
 from fractus_operator.pods import PodView
 from fractus_operator.store import KubeError, Store
 from fractus_operator.work_queue import skip_failed_node
 
-logger = logging.getLogger(__name__)
+log = logging.getLogger(__name__)
 
 CURRENT = "ServicesCurrent"
 PERIOD_S = 2.0
@@ -138,7 +139,7 @@ class ServiceRollout:
             except KubeError as error:
                 if not error.status:
                     raise
-                logger.warning("service rollout: services not replaced (node=%s error=%s)", node.node, error)
+                log.warning("service rollout: services not replaced (node=%s error=%s)", node.node, error)
                 # The admission policy forbids the deletion if the drone has taken off meanwhile.
                 reason = "InTheAir" if error.status == HTTPStatus.FORBIDDEN else "Refused"
                 updates[node.node] = ConditionUpdate(CURRENT, "False", reason, str(error), progress=True)
@@ -194,7 +195,7 @@ class ServiceRollout:
 
     async def _replace(self, node: ServicesOfNode) -> None:
         for pod in node.outdated:
-            logger.info("service rollout: replacing pod (node=%s pod=%s)", node.node, pod.name)
+            log.info("service rollout: replacing pod (node=%s pod=%s)", node.node, pod.name)
             # Recorded before the deletion, because a request without a response may take effect.
             self._owed.setdefault(node.node, set()).add(str(pod.daemon_set))
             await self._store.delete(kinds.POD, (pod.namespace, pod.name))

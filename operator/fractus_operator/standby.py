@@ -12,7 +12,7 @@ from fractus_core.api import API_VERSION, KINDS
 
 from fractus_operator.store import KubeError, NotFound, Store
 
-logger = logging.getLogger(__name__)
+log = logging.getLogger(__name__)
 
 _KINDS_PERIOD_S = 2.0
 _RESPONSE = b"HTTP/1.1 200 OK\r\nContent-Length: 0\r\nConnection: close\r\n\r\n"
@@ -27,9 +27,7 @@ async def wait_for_kinds(store: Store) -> None:
     logged = False
     while missing := await _missing_kinds(store):
         if not logged:
-            logger.warning(
-                "operator: waiting for kinds, upgrade the chart fractus-crds (missing=%s)", ",".join(missing)
-            )
+            log.warning("operator: waiting for kinds, upgrade the chart fractus-crds (missing=%s)", ",".join(missing))
             logged = True
         await asyncio.sleep(_KINDS_PERIOD_S)
 

@@ -8,10 +8,10 @@ from types import MappingProxyType
 from typing import Any, Literal, assert_never
 
 from fractus_core.api import Condition, Drone, Grant
+from fractus_core.api.conditions import ConditionUpdate
 from fractus_core.api.plans import DeploymentPlanSpec
 from fractus_core.control import Outcome, OutcomeKind
 
-from fractus_operator.conditions import ConditionUpdate
 from fractus_operator.pods import PodView
 
 FlightPhase = Literal["Waiting", "TakingOff", "Flying", "Returning", "Landed", "Unknown"]

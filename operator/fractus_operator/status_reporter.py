@@ -9,16 +9,16 @@ from dataclasses import replace
 from datetime import datetime
 
 from fractus_core.api import Condition
+from fractus_core.api.conditions import ConditionUpdate, merge_conditions
 from fractus_core.api.plans import DeploymentPlanSpec
 
 from fractus_operator import kinds
-from fractus_operator.conditions import ConditionUpdate, merge
 from fractus_operator.kinds import Body, Key, key_of
 from fractus_operator.parsing import SETTLED, Submitted
 from fractus_operator.status import STAGES, StatusUpdate, apply_failed, queued_rollout
 from fractus_operator.store import Conflict, Informer, KubeError, Store
 
-logger = logging.getLogger(__name__)
+log = logging.getLogger(__name__)
 
 _BUSY_ROLLOUTS = 5
 """Number of concurrent rollouts from which a further one takes seconds, so that its Application is reported as queued."""
@@ -61,9 +61,7 @@ class StatusReporter:
             try:
                 await self.report(submitted, queued_rollout(plan, others))
             except KubeError as error:
-                logger.warning(
-                    "status reporter: status not written (application=%s/%s error=%s)", *submitted.key, error
-                )
+                log.warning("status reporter: status not written (application=%s/%s error=%s)", *submitted.key, error)
 
     async def report_failure(self, submitted: Submitted | None, attempts: int, error: KubeError) -> None:
         """Report that an Application cannot be reconciled, if this persists. A failed report is repeated the next time.
@@ -98,7 +96,7 @@ class StatusReporter:
         before = self.last(submitted)
         generation = submitted.metadata.generation if generation is None else generation
         previous = [Condition.model_validate(c) for c in before.get("conditions") or ()]
-        conditions, transitions = merge(previous, update.conditions, generation, now)
+        conditions, transitions = merge_conditions(previous, update.conditions, generation, now)
         status: Body = {
             "observedGeneration": generation,
             "phase": update.phase,
@@ -139,7 +137,7 @@ async def create_events(store: Store, regarding: Body, updates: Iterable[Conditi
                 now=now,
             )
         except KubeError as error:
-            logger.warning(
+            log.warning(
                 "status reporter: Event not created (kind=%s namespace=%s name=%s reason=%s error=%s)",
                 regarding["kind"],
                 namespace,

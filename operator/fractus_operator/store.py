@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from datetime import datetime
 from typing import Self
 
+from fractus_core.api.model import timestamp
 from fractus_runtime.kubernetes import (
     Access,
     Backoff,
@@ -152,7 +153,7 @@ class Store(Client):
             reference["namespace"] = namespace
         if len(name) > _MAX_NAME_LENGTH:
             name = hashlib.sha256(name.encode()).hexdigest()
-        stamp = now.strftime("%Y-%m-%dT%H:%M:%SZ")
+        stamp = timestamp(now)
         body = {
             **EVENT.header(name, namespace),
             "involvedObject": reference,

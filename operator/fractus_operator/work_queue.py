@@ -12,7 +12,7 @@ from fractus_operator.labels import label_key
 from fractus_operator.metrics import reconciling
 from fractus_operator.store import Backoff, KubeError
 
-logger = logging.getLogger(__name__)
+log = logging.getLogger(__name__)
 
 _FIRST_RETRY_S = 1.0
 _MAX_RETRY_S = 60.0
@@ -36,7 +36,7 @@ async def run_periodically(name: str, step: Callable[[], Awaitable[None]], perio
         except Exception as error:
             pause_s = backoff.delay_s()
             expected = isinstance(error, KubeError)
-            logger.log(
+            log.log(
                 logging.INFO if expected else logging.WARNING,
                 "%s: step failed (retry_s=%.1f error=%s)",
                 name,
@@ -63,7 +63,7 @@ def skip_failed_node(name: str, node: str) -> Iterator[None]:
     except (KubeError, ValueError) as error:
         if isinstance(error, KubeError) and not error.status:
             raise
-        logger.warning("%s: step failed for a node (node=%s error=%s)", name, node, error)
+        log.warning("%s: step failed for a node (node=%s error=%s)", name, node, error)
 
 
 class WorkQueue:
@@ -140,7 +140,7 @@ class WorkQueue:
             backoff = self.failures.setdefault(key, Backoff(_FIRST_RETRY_S, _MAX_RETRY_S))
             pause_s = backoff.delay_s()
             expected = isinstance(error, KubeError)
-            logger.log(
+            log.log(
                 logging.INFO if expected and backoff.attempts <= 2 else logging.WARNING,
                 "work queue: reconcile failed (kind=%s name=%s retry_s=%.1f error=%s)",
                 self.name,

@@ -20,11 +20,11 @@ from typing import Any
 
 import pytest
 from demo_flight import GRANT
-from fractus_agent.conditions import Condition
 from fractus_agent.registration.diagnostics import read_recording_problems
 from fractus_agent.registration.node_status import NodeObservation, node_status
 from fractus_agent.telemetry import parse_telemetry
 from fractus_core.api import Grant
+from fractus_core.api.conditions import ConditionUpdate
 from fractus_proto.v1.mobility_pb2 import Telemetry
 from fractus_runtime.audit import AuditLog
 from fractus_runtime.mavlink_codec import Endpoint, Parser
@@ -601,7 +601,7 @@ async def test_audit_entries_are_passed_to_the_recorder(tmp_path: Path) -> None:
 def test_node_status_reports_recording_problems() -> None:
     from datetime import UTC, datetime
 
-    certified = Condition("Certified", "True", "Issued", "")
+    certified = ConditionUpdate("Certified", "True", "Issued", "")
     cases = (("", (), ""), ("flights stopped", (), "flights stopped"), ("", ("camera: full",), "camera: full"))
     for flights, node_problems, problem in cases:
         telemetry = parse_telemetry(Telemetry(recording_problem=flights))

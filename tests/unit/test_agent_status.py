@@ -4,7 +4,6 @@ from datetime import UTC, datetime, timedelta
 from typing import Any
 
 import pytest
-from fractus_agent.conditions import Condition
 from fractus_agent.registration.node_status import (
     DRONE_INTERVALS,
     EDGE_INTERVALS,
@@ -18,6 +17,7 @@ from fractus_agent.registration.node_status import (
 )
 from fractus_agent.store import KubeError
 from fractus_agent.telemetry import TelemetrySnapshot, parse_telemetry
+from fractus_core.api.conditions import ConditionUpdate
 from fractus_core.api.names import CONTROL_TAKEN
 from fractus_core.api.nodes import DroneStatus, EdgeNodeStatus
 from fractus_core.control import Outcome, OutcomeKind
@@ -25,7 +25,7 @@ from fractus_proto.v1.mobility_pb2 import MissionOutcome, Telemetry
 from fractus_proto.v1.types_pb2 import AltitudeReference, Position
 
 NOW = datetime(2026, 5, 1, 12, 0, 0, tzinfo=UTC)
-ISSUED = Condition("Certified", "True", "Issued", "Valid.")
+ISSUED = ConditionUpdate("Certified", "True", "Issued", "Valid.")
 
 
 def telemetry(**changes: Any) -> TelemetrySnapshot:
@@ -102,7 +102,7 @@ def test_airborne_drone_reports_why_no_driver_has_control(
 @pytest.mark.parametrize(
     ("facts", "reason"),
     [
-        ({"certified": Condition("Certified", "False", "Denied", "no")}, "NoCertificate"),
+        ({"certified": ConditionUpdate("Certified", "False", "Denied", "no")}, "NoCertificate"),
         ({"telemetry_problem": "The mobility service is unreachable: x."}, "MobilityUnreachable"),
         ({"snapshot": None}, "MobilityUnreachable"),
         ({"snapshot": telemetry(connected=False)}, "AutopilotDisconnected"),
@@ -116,18 +116,18 @@ def test_drone_is_not_ready_if_a_requirement_is_missing(facts: dict[str, Any], r
 
 
 def test_flying_drone_is_ready_even_if_it_would_not_arm() -> None:
-    assert readiness(observed(snapshot=telemetry(ready=False, in_air=True))).is_true
+    assert readiness(observed(snapshot=telemetry(ready=False, in_air=True))).status == "True"
 
 
 def test_edge_node_without_services_is_ready_without_certificate() -> None:
     bare = observed(
         kind="EdgeNode", has_mobility=False, needs_certificate=False, snapshot=None,
-        certified=Condition("Certified", "False", "Requested", "waits"),
+        certified=ConditionUpdate("Certified", "False", "Requested", "waits"),
     )  # fmt: skip
     status = node_status(bare, {}, 1, NOW)
     EdgeNodeStatus.model_validate(status)
     assert "flightState" not in status
-    assert readiness(bare).is_true
+    assert readiness(bare).status == "True"
 
 
 @pytest.mark.parametrize(

@@ -8,13 +8,13 @@ from typing import Any, cast
 
 import pytest
 from fractus_core.api import Application, Drone, EdgeNode, Grant
+from fractus_core.api.conditions import ConditionUpdate, merge_conditions
 from fractus_core.api.plans import DeploymentPlanSpec, PlannedInstance
 from fractus_core.control import Outcome, OutcomeKind
 from fractus_core.planning.inventory import Host, Inventory, amount_of
 from fractus_operator import status
 from fractus_operator.cache import ClusterCache
 from fractus_operator.comparison import contains, is_current, stamped
-from fractus_operator.conditions import ConditionUpdate, merge
 from fractus_operator.node_controller import geohash, location_labels
 from fractus_operator.node_liveness import displayed_flight_state
 from fractus_operator.pods import PodView, parse_host, parse_pod, refusal_of
@@ -38,16 +38,18 @@ V1 = "fractus.dev/v1alpha1"
 
 
 def test_condition_transition_is_reported_and_sets_time() -> None:
-    first, transitions = merge([], [ConditionUpdate("Ready", "False", "PodsNotReady")], 1, NOW)
+    first, transitions = merge_conditions([], [ConditionUpdate("Ready", "False", "PodsNotReady")], 1, NOW)
     assert [n.reason for n in transitions] == ["PodsNotReady"]
     later = NOW + timedelta(minutes=1)
-    same, transitions = merge(first, [ConditionUpdate("Ready", "False", "PodsNotReady", "two to go")], 2, later)
+    same, transitions = merge_conditions(
+        first, [ConditionUpdate("Ready", "False", "PodsNotReady", "two to go")], 2, later
+    )
     assert transitions == ()
     assert (same[0].last_transition_time, same[0].message, same[0].observed_generation) == (NOW, "two to go", 2)
-    other, transitions = merge(same, [ConditionUpdate("Ready", "False", "NodeGone")], 2, later)
+    other, transitions = merge_conditions(same, [ConditionUpdate("Ready", "False", "NodeGone")], 2, later)
     assert [n.reason for n in transitions] == ["NodeGone"]
     assert other[0].last_transition_time == NOW
-    true, _ = merge(other, [ConditionUpdate("Ready", "True", "PodsReady")], 2, later)
+    true, _ = merge_conditions(other, [ConditionUpdate("Ready", "True", "PodsReady")], 2, later)
     assert true[0].last_transition_time == later
 
 

@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 from fractus_core.api import Drone, EdgeNode
+from fractus_core.api.conditions import ConditionUpdate
 from fractus_operator.cache import ClusterCache
-from fractus_operator.conditions import ConditionUpdate
 from fractus_operator.kinds import GRANT
 from fractus_operator.mission_condition import MissionConditionController
 from fractus_operator.node_conditions import NodeConditionWriter

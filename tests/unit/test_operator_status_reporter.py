@@ -8,9 +8,9 @@ from typing import Any, cast
 
 import pytest
 import yaml
+from fractus_core.api.conditions import ConditionUpdate
 from fractus_core.api.plans import DeploymentPlanSpec
 from fractus_operator.cache import ClusterCache
-from fractus_operator.conditions import ConditionUpdate
 from fractus_operator.kinds import Body, Kind
 from fractus_operator.parsing import Submitted, parse_application
 from fractus_operator.status import StatusUpdate

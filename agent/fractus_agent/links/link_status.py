@@ -9,10 +9,11 @@ from dataclasses import dataclass, field
 from datetime import datetime
 from typing import Any
 
+from fractus_core.api.conditions import ConditionUpdate, merge_conditions
 from fractus_core.api.direct_links import LINKED, PEER_READY, TRAFFIC_DIRECT, DirectLink
+from fractus_core.api.model import Condition, timestamp
 from fractus_core.linking import LearnedRange, LinkPhase, LinkState, PathMetrics, Peer
 
-from fractus_agent.conditions import Condition, timestamp, to_kubernetes
 from fractus_agent.links.decisions import LinkActions
 from fractus_agent.links.direct_link_store import virtual_endpoints
 from fractus_agent.links.traffic_rates import ServiceRate
@@ -56,7 +57,7 @@ class DroneLinkReport:
     rates: Mapping[Endpoint, ServiceRate] = field(default_factory=dict)
 
 
-def drone_status(report: DroneLinkReport, direct_link: DirectLink) -> tuple[dict[str, Any], list[Condition]]:
+def drone_status(report: DroneLinkReport, direct_link: DirectLink) -> tuple[dict[str, Any], list[ConditionUpdate]]:
     """Return the drone's part of the status of a DirectLink, without switch counts, and its conditions."""
     spec = direct_link.spec
     phase = report.link.phase if report.link.peer == spec.node else LinkPhase.NONE
@@ -73,8 +74,8 @@ def drone_status(report: DroneLinkReport, direct_link: DirectLink) -> tuple[dict
         status["latency"] = round(report.measured.ingress_latency_ms, 1)
     up = phase is LinkPhase.UP
     return status, [
-        Condition(LINKED, "True" if up else "False", "Up" if up else reason, "" if up else message),
-        Condition(TRAFFIC_DIRECT, "True" if direct else "False", reason, message),
+        ConditionUpdate(LINKED, "True" if up else "False", "Up" if up else reason, "" if up else message),
+        ConditionUpdate(TRAFFIC_DIRECT, "True" if direct else "False", reason, message),
     ]
 
 
@@ -96,7 +97,7 @@ def _reason(report: DroneLinkReport, direct_link: DirectLink, phase: LinkPhase) 
     return "NotChosen", f"the drone has one link at a time, which goes to {report.link.peer}"
 
 
-def edge_condition(direct_link: DirectLink, problem: tuple[str, str] | None, linked: Iterable[str]) -> Condition:
+def edge_condition(direct_link: DirectLink, problem: tuple[str, str] | None, linked: Iterable[str]) -> ConditionUpdate:
     """Return the condition PeerReady, which the edge node sets on a DirectLink.
 
     Args:
@@ -106,13 +107,13 @@ def edge_condition(direct_link: DirectLink, problem: tuple[str, str] | None, lin
     """
     spec = direct_link.spec
     if problem is not None:
-        return Condition(PEER_READY, "False", *problem)
+        return ConditionUpdate(PEER_READY, "False", *problem)
     others = sorted(set(linked) - {spec.drone})
     if others:
-        return Condition(PEER_READY, "False", "Busy", f"{spec.node} is linked to {', '.join(others)}")
+        return ConditionUpdate(PEER_READY, "False", "Busy", f"{spec.node} is linked to {', '.join(others)}")
     if not any(service.target is not None for service in spec.services):
-        return Condition(PEER_READY, "False", "NotServed", f"{spec.node} has no ready instance")
-    return Condition(
+        return ConditionUpdate(PEER_READY, "False", "NotServed", f"{spec.node} has no ready instance")
+    return ConditionUpdate(
         PEER_READY, "True", "Listening", f"{spec.node} accepts the drone's calls over its direct interface"
     )
 
@@ -128,7 +129,7 @@ class _TrackedStatus:
     traffic: str = "cloud"
     switches: int = 0
     last_switch: str = ""
-    conditions: tuple[Object, ...] = ()
+    conditions: tuple[Condition, ...] = ()
 
 
 class LinkStatusReporter:
@@ -159,11 +160,11 @@ class LinkStatusReporter:
         for link in links:
             status = {"phase": "Idle", "traffic": "cloud", "reason": reason, "message": message}
             self._set_drone_status(
-                link, status, [Condition(kind, "False", reason, message) for kind in (LINKED, TRAFFIC_DIRECT)]
+                link, status, [ConditionUpdate(kind, "False", reason, message) for kind in (LINKED, TRAFFIC_DIRECT)]
             )
         self._forget(links)
 
-    def set_conditions(self, links: Iterable[DirectLink], of: Callable[[DirectLink], Condition]) -> None:
+    def set_conditions(self, links: Iterable[DirectLink], of: Callable[[DirectLink], ConditionUpdate]) -> None:
         """Set one condition of each link."""
         links = tuple(links)
         for link in links:
@@ -191,7 +192,7 @@ class LinkStatusReporter:
                 wait_s = min(wait_s, due_s)
         return wait_s
 
-    def _set_drone_status(self, link: DirectLink, status: Object, conditions: list[Condition]) -> None:
+    def _set_drone_status(self, link: DirectLink, status: Object, conditions: list[ConditionUpdate]) -> None:
         """Set the drone's part of a status, and count switches."""
         tracked = self._tracked(link)
         if status["traffic"] != tracked.traffic:
@@ -208,13 +209,13 @@ class LinkStatusReporter:
             tracked = self._statuses[link.name] = _TrackedStatus({}, link.metadata.uid)
         return tracked
 
-    def _set(self, link: DirectLink, status: Object, conditions: list[Condition]) -> None:
+    def _set(self, link: DirectLink, status: Object, conditions: list[ConditionUpdate]) -> None:
         tracked = self._tracked(link)
-        merged = to_kubernetes(conditions, tracked.conditions, link.metadata.generation, self._wall())
-        tracked.conditions = tuple(merged)
-        if self._end == "drone" and link.metadata.generation is not None:
-            status = {**status, "observedGeneration": link.metadata.generation}
-        wanted = {**status, "conditions": merged}
+        generation = link.metadata.generation
+        tracked.conditions, _ = merge_conditions(tracked.conditions, conditions, generation, self._wall())
+        if self._end == "drone" and generation is not None:
+            status = {**status, "observedGeneration": generation}
+        wanted = {**status, "conditions": [condition.to_dict() for condition in tracked.conditions]}
         if wanted != tracked.wanted:
             tracked.wanted = wanted
             self._changed.set()

@@ -7,13 +7,12 @@ import logging
 import os
 from pathlib import Path
 
+from fractus_core.api.conditions import ConditionUpdate
 from fractus_core.api.model import InvalidObject
 from fractus_core.api.nodes import Drone, EdgeNode
 from fractus_runtime.files import remove_temporary, write_file
 
-from fractus_agent.conditions import Condition
-
-LOG = logging.getLogger(__name__)
+log = logging.getLogger(__name__)
 
 
 class NodeObjectFile:
@@ -28,7 +27,7 @@ class NodeObjectFile:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self.condition: Condition | None = None
+        self.condition: ConditionUpdate | None = None
         remove_temporary(path)
 
     def read(self) -> Drone | EdgeNode | None:
@@ -47,7 +46,7 @@ class NodeObjectFile:
             if not self._path.exists() or self._path.read_bytes() != content:
                 self._path.parent.mkdir(parents=True, exist_ok=True)
                 write_file(self._path, content)
-                LOG.info("registration: node object stored for the services (file=%s)", self._path)
+                log.info("registration: node object stored for the services (file=%s)", self._path)
         except OSError as error:
             problem = f"The node cannot store its description for its services: {error.strerror or error}."
             self.clear()
@@ -67,13 +66,13 @@ class NodeObjectFile:
             with self._path.open("wb") as file:  # in place, because a file can be truncated on a full disk
                 os.fsync(file.fileno())
         except OSError as error:
-            LOG.warning("registration: cannot empty the node object file (file=%s error=%s)", self._path, error)
+            log.warning("registration: cannot empty the node object file (file=%s error=%s)", self._path, error)
         self._set_condition(problem)
 
     def _set_condition(self, problem: str) -> None:
-        condition = Condition("CameraDescribed", "False", "ViewUnknown", problem) if problem else None
+        condition = ConditionUpdate("CameraDescribed", "False", "ViewUnknown", problem) if problem else None
         if condition is not None and condition != self.condition:
-            LOG.warning("registration: camera description incomplete (problem=%s)", problem)
+            log.warning("registration: camera description incomplete (problem=%s)", problem)
         self.condition = condition
 
     def _camera_problem(self, resource: Drone | EdgeNode) -> str:

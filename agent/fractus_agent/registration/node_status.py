@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Any, get_args
 
+from fractus_core.api.conditions import ConditionUpdate, merge_conditions
+from fractus_core.api.model import Condition, timestamp
 from fractus_core.api.names import CONTROL_TAKEN
 from fractus_core.api.nodes import (
     DRONE_REPORT_S,
@@ -19,12 +21,11 @@ from fractus_core.api.nodes import (
     is_airborne,
 )
 
-from fractus_agent.conditions import Condition, timestamp, to_kubernetes
 from fractus_agent.store import Object, Store
 from fractus_agent.supervisor import repeat
 from fractus_agent.telemetry import TelemetrySnapshot
 
-LOG = logging.getLogger(__name__)
+log = logging.getLogger(__name__)
 
 _FLIGHT_STATES = get_args(FlightState)
 _DEGREE_M = 111_320.0
@@ -74,26 +75,26 @@ class NodeObservation:
     kind: str
     has_mobility: bool
     needs_certificate: bool
-    certified: Condition
+    certified: ConditionUpdate
     snapshot: TelemetrySnapshot | None = None
     telemetry_problem: str | None = None
-    described: Condition | None = None
-    camera_described: Condition | None = None
+    described: ConditionUpdate | None = None
+    camera_described: ConditionUpdate | None = None
     audit_heads: Sequence[str] = ()
     recording_problems: Sequence[str] = ()
 
 
-def readiness(observed: NodeObservation) -> Condition:
+def readiness(observed: NodeObservation) -> ConditionUpdate:
     """Return the condition Ready: true if components can work on the node, otherwise with the first problem."""
 
-    def unready(reason: str, message: str) -> Condition:
-        return Condition("Ready", "False", reason, message)
+    def unready(reason: str, message: str) -> ConditionUpdate:
+        return ConditionUpdate("Ready", "False", reason, message)
 
     snapshot = observed.snapshot
-    if observed.needs_certificate and not observed.certified.is_true:
+    if observed.needs_certificate and observed.certified.status != "True":
         return unready("NoCertificate", observed.certified.message)
     if not observed.has_mobility:
-        return Condition("Ready", "True", "AgentRunning", "The node's agent is running.")
+        return ConditionUpdate("Ready", "True", "AgentRunning", "The node's agent is running.")
     if observed.telemetry_problem is not None or snapshot is None:
         return unready(
             "MobilityUnreachable", observed.telemetry_problem or "The mobility service has not responded yet."
@@ -102,7 +103,9 @@ def readiness(observed: NodeObservation) -> Condition:
         return unready("AutopilotDisconnected", "The mobility service has no connection to the autopilot.")
     if not (snapshot.ready or snapshot.in_air):
         return unready("AutopilotNotReady", f"The autopilot would not arm now (mode {snapshot.mode or 'unknown'}).")
-    return Condition("Ready", "True", "AutopilotReady", "The mobility service is reachable and the autopilot is ready.")
+    return ConditionUpdate(
+        "Ready", "True", "AutopilotReady", "The mobility service is reachable and the autopilot is ready."
+    )
 
 
 def node_status(observed: NodeObservation, previous: Object, generation: int | None, now: datetime) -> dict[str, Any]:
@@ -124,9 +127,11 @@ def node_status(observed: NodeObservation, previous: Object, generation: int | N
         _control_condition(observed),
     )
     conditions += [condition for condition in optional if condition is not None]
+    before = [Condition.model_validate(condition) for condition in previous.get("conditions") or ()]
+    merged, _ = merge_conditions(before, conditions, generation, now)
     status: dict[str, Any] = {
         "lastSeen": timestamp(now),
-        "conditions": to_kubernetes(conditions, previous.get("conditions") or (), generation, now),
+        "conditions": [condition.to_dict() for condition in merged],
     }
     audit_heads = list(observed.audit_heads) or previous.get("audit")
     if audit_heads:
@@ -144,20 +149,20 @@ def node_status(observed: NodeObservation, previous: Object, generation: int | N
     return status
 
 
-def _recording_condition(observed: NodeObservation) -> Condition | None:
+def _recording_condition(observed: NodeObservation) -> ConditionUpdate | None:
     """Return the condition Recording if flights or pictures are not recorded although they should be."""
     flights = observed.snapshot.recording_problem if observed.snapshot is not None else ""
     problem = "; ".join(filter(None, (flights, *observed.recording_problems)))
-    return Condition("Recording", "False", "RecordingStopped", problem) if problem else None
+    return ConditionUpdate("Recording", "False", "RecordingStopped", problem) if problem else None
 
 
-def _control_condition(observed: NodeObservation) -> Condition | None:
+def _control_condition(observed: NodeObservation) -> ConditionUpdate | None:
     """Return the condition ControlTaken if the system or a pilot has control in flight, with the reason."""
     snapshot = observed.snapshot if observed.telemetry_problem is None else None
     if snapshot is None or not (snapshot.connected and snapshot.in_air and snapshot.controller_reason):
         return None
     reason = {"pilot": "PilotInControl", "system": "SystemInControl"}.get(snapshot.controller)
-    return Condition(CONTROL_TAKEN, "True", reason, snapshot.controller_reason) if reason else None
+    return ConditionUpdate(CONTROL_TAKEN, "True", reason, snapshot.controller_reason) if reason else None
 
 
 def _last_known_flight_state(previous: Object) -> str | None:

@@ -12,16 +12,16 @@ import logging
 from collections.abc import Callable
 from pathlib import Path
 
+from fractus_core.api.conditions import ConditionUpdate
 from fractus_core.api.model import GROUP, InvalidObject
 from fractus_core.api.names import CLASS_LABEL
 from fractus_core.api.nodes import Drone, EdgeNode, InvalidDescription, parse_description
 
-from fractus_agent.conditions import Condition
 from fractus_agent.registration.node_object_file import NodeObjectFile
 from fractus_agent.store import Invalid, KubeError, Object, Store
 from fractus_agent.supervisor import repeat
 
-LOG = logging.getLogger(__name__)
+log = logging.getLogger(__name__)
 
 HASH_ANNOTATION = f"{GROUP}/description-hash"
 CHECK_INTERVAL_S = 10.0
@@ -94,7 +94,7 @@ class Registration:
         self._resync_s = 0.0
         self.body: Object | None = None
         self.resource: Drone | EdgeNode | None = None
-        self.description_problem: Condition | None = None
+        self.description_problem: ConditionUpdate | None = None
 
     async def run(self) -> None:
         """Keep the node registered until cancelled."""
@@ -114,7 +114,7 @@ class Registration:
     def on_status_written(self, body: Object | None) -> None:
         """Handle the object that a status write returned, None if it does not exist."""
         if body is None:
-            LOG.warning("registration: node object deleted")
+            log.warning("registration: node object deleted")
             self.body = None
             self._gone.set()
             return
@@ -139,7 +139,7 @@ class Registration:
             described = None
         kind = described.kind if described is not None else kind
         if kind is None:
-            LOG.debug("registration: node kind unknown (description=%s label=%s)", self._path, CLASS_LABEL)
+            log.debug("registration: node kind unknown (description=%s label=%s)", self._path, CLASS_LABEL)
             return
         body = await self._store.node_object(kind)
         if described is not None:
@@ -157,7 +157,7 @@ class Registration:
                 }
                 manifest = {key: value for key, value in described.to_dict().items() if key != "status"}
                 created = await self._store.create(manifest | {"metadata": metadata})
-                LOG.info("registration: created (kind=%s node=%s)", described.kind, self._node)
+                log.info("registration: created (kind=%s node=%s)", described.kind, self._node)
                 return created
             applied = body["metadata"].get("annotations", {}).get(HASH_ANNOTATION)
             if applied == digest:
@@ -169,7 +169,7 @@ class Registration:
                 # A changed description overrides the owner's edits, because its author has access to the hardware.
                 metadata["labels"] = metadata.get("labels", {}) | described.metadata.labels
                 changed["spec"] = described.to_dict()["spec"]
-                LOG.info("registration: description changed (kind=%s node=%s)", described.kind, self._node)
+                log.info("registration: description changed (kind=%s node=%s)", described.kind, self._node)
             return await self._store.replace(changed)
         except Invalid as error:
             self._set_invalid(f"the API server refused it: {error}")
@@ -180,7 +180,7 @@ class Registration:
         self.body = body
         if body is None:
             if self.description_problem is None:
-                LOG.debug("registration: waiting for the owner to create the object (node=%s)", self._node)
+                log.debug("registration: waiting for the owner to create the object (node=%s)", self._node)
             return
         self._parse(body)
 
@@ -188,7 +188,7 @@ class Registration:
         try:
             self.resource = _KINDS[body["kind"]].from_body({k: v for k, v in body.items() if k != "status"})
         except InvalidObject as error:
-            LOG.warning("registration: invalid node object (error=%s)", error)
+            log.warning("registration: invalid node object (error=%s)", error)
             self._object_file.clear(f"The agent cannot parse the object: {error}.")
         else:
             self._object_file.write(self.resource)
@@ -217,8 +217,8 @@ class Registration:
         return described
 
     def _set_invalid(self, problem: str) -> None:
-        condition = Condition("Described", "False", "InvalidDescription", f"{self._path}: {problem}.")
+        condition = ConditionUpdate("Described", "False", "InvalidDescription", f"{self._path}: {problem}.")
         if condition != self.description_problem:
-            LOG.error("registration: invalid description (file=%s error=%s)", self._path, problem)
+            log.error("registration: invalid description (file=%s error=%s)", self._path, problem)
             self.description_problem = condition
             self._on_change()

@@ -163,6 +163,11 @@ class Condition(OpenModel):
     )
 
 
+def timestamp(time: datetime) -> str:
+    """Return a UTC time as Kubernetes writes it, without fractions of a second."""
+    return time.strftime("%Y-%m-%dT%H:%M:%SZ")
+
+
 ObservedGeneration = Annotated[int | None, Field(description="metadata.generation that the status describes.")]
 Conditions = Annotated[tuple[Condition, ...], Field(description="Current state of the object, by condition type.")]
 

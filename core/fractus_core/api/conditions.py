@@ -1,13 +1,13 @@
-"""Conditions of an object's status: merges observations into them and reports which ones are transitions."""
+"""Conditions of an object's status: merges new observations into them and reports which ones are transitions."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from datetime import datetime
 from typing import Literal
 
-from fractus_core.api import Condition
+from fractus_core.api.model import Condition
 
 _MAX_MESSAGE_LENGTH = 32768
 
@@ -17,8 +17,9 @@ class ConditionUpdate:
     """The observed value of one condition.
 
     Attributes:
+        type: Condition type.
         reason: CamelCase.
-        message: One sentence.
+        message: Details for people.
         progress: True if a status other than True is an expected step and not a problem.
         adverse: True if status True is the problem.
     """
@@ -36,12 +37,18 @@ class ConditionUpdate:
         return (self.status == "True") == self.adverse and not self.progress
 
 
-def merge(
-    previous: Sequence[Condition], updates: Iterable[ConditionUpdate], generation: int | None, now: datetime
+def merge_conditions(
+    previous: Iterable[Condition], updates: Iterable[ConditionUpdate], generation: int | None, now: datetime
 ) -> tuple[tuple[Condition, ...], tuple[ConditionUpdate, ...]]:
     """Merge new observations into the conditions of an object.
 
     lastTransitionTime changes only with the status. Conditions without an update are removed.
+
+    Args:
+        previous: Conditions as last written.
+        updates: New observations.
+        generation: metadata.generation that the observations refer to, or None if unknown.
+        now: Current time. Fractions of a second are dropped, as Kubernetes does.
 
     Returns:
         The conditions in the order of the updates, and the updates whose status or reason is new.
@@ -51,17 +58,19 @@ def merge(
     transitions: list[ConditionUpdate] = []
     for update in updates:
         old = before.get(update.type)
-        same_status = old is not None and old.status == update.status
+        since = now.replace(microsecond=0)
+        if old is not None and old.status == update.status:
+            since = old.last_transition_time
         merged.append(
             Condition(
                 type=update.type,
                 status=update.status,
                 reason=update.reason,
                 message=update.message[:_MAX_MESSAGE_LENGTH],
-                last_transition_time=old.last_transition_time if old is not None and same_status else now,
+                last_transition_time=since,
                 observed_generation=generation,
             )
         )
-        if old is None or not same_status or old.reason != update.reason:
+        if old is None or (old.status, old.reason) != (update.status, update.reason):
             transitions.append(update)
     return tuple(merged), tuple(transitions)

@@ -209,7 +209,7 @@ def _checkpoints(since: tuple[str, ...], ca: Path | None) -> dict[str, Checkpoin
 
 
 def _judgement(name: Path, files: list[Path], checkpoint: Checkpoint | None) -> dict[str, Any]:
-    finding, problem = verify_log(name, files, checkpoint.link if checkpoint is not None else None)
+    finding, problem = verify_log(name, files, checkpoint.entry if checkpoint is not None else None)
     return {
         "log": str(name if name in files else files[0]), "files": [str(file) for file in files], "entries": finding.entries,
         "sound": not problem, "problem": problem, "removed": finding.before, "torn": finding.torn, "whole": name in files,
@@ -222,7 +222,7 @@ def _check(name: Path, files: list[Path], checkpoint: Checkpoint | None) -> str:
     Raises:
         click.ClickException: The log is not sound.
     """
-    finding, problem = verify_log(name, files, checkpoint.link if checkpoint is not None else None)
+    finding, problem = verify_log(name, files, checkpoint.entry if checkpoint is not None else None)
     if problem:
         raise click.ClickException(problem)
     partial = name not in files
@@ -234,7 +234,7 @@ def _check(name: Path, files: list[Path], checkpoint: Checkpoint | None) -> str:
         if checkpoint.node:
             unverified = "" if checkpoint.certified else "; its certificate was not verified (specify --ca)"
             signed = f" (checkpoint signed by {checkpoint.node}{unverified})"
-        details.append(f"complete since entry {checkpoint.link.sequence}{signed}")
+        details.append(f"complete since entry {checkpoint.entry.sequence}{signed}")
     if finding.before:
         details.append(f"the first {finding.before} entries were removed to free space")
     if partial:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import click
-from fractus_runtime.audit_chain import Finding, Link, logs, read_lines, verify
+from fractus_runtime.audit_chain import ChainEntry, Finding, logs, read_lines, verify
 from fractus_services.recording.messages import component_of, parse_time_ns
 
 Entry = dict[str, Any]
@@ -29,13 +29,13 @@ def find_logs(paths: Iterable[Path]) -> dict[Path, list[Path]]:
     return found
 
 
-def verify_log(name: Path, files: list[Path], since: Link | None = None) -> tuple[Finding, str]:
+def verify_log(name: Path, files: list[Path], since: ChainEntry | None = None) -> tuple[Finding, str]:
     """Verify a log. Return the finding, and the problem with its file and line (empty if the log is sound).
 
     Args:
         name: The log.
         files: Its segments to verify.
-        since: Link that the log must contain, see `verify`.
+        since: ChainEntry that the log must contain, see `verify`.
 
     Raises:
         click.ClickException: A segment is missing.

@@ -20,11 +20,11 @@ from typing import Any
 
 from fractus_runtime.audit_chain import (
     PRUNED,
-    Link,
+    ChainEntry,
     canonical,
     digest,
     first_sequence,
-    last_link,
+    last_entry,
     segment_path,
     segments,
 )
@@ -109,7 +109,7 @@ class AuditLog:
         self._tls = tls
         self._checkpoint = path.with_suffix(".checkpoint")
         self._checkpoint_due_s = 0.0
-        self._signed = Link()
+        self._signed = ChainEntry()
         remove_temporary(self._checkpoint)
         self._pruned: list[Path] = []
         self._waiting: deque[_PendingEntry] = deque()
@@ -143,7 +143,7 @@ class AuditLog:
         return self._problem
 
     @property
-    def head(self) -> Link:
+    def head(self) -> ChainEntry:
         """Sequence number and hash of the last entry on disk."""
         return self._end
 
@@ -267,14 +267,14 @@ class AuditLog:
 
     def _until_checkpoint_s(self) -> float | None:
         """Return the seconds until the next checkpoint, or None if there is nothing to sign or no key."""
-        if self._tls is None or self._end in (Link(), self._signed):
+        if self._tls is None or self._end in (ChainEntry(), self._signed):
             return None
         due_s = self._checkpoint_due_s
         return max(due_s - time.monotonic(), 0.0) if due_s else CHECKPOINT_INTERVAL_S
 
     def _write_checkpoint(self, at_once: bool) -> None:
         """Write a signed checkpoint of the last entry on disk if one is due."""
-        if self._tls is None or self._end in (Link(), self._signed):
+        if self._tls is None or self._end in (ChainEntry(), self._signed):
             return
         if not at_once and time.monotonic() < self._checkpoint_due_s:
             return
@@ -296,7 +296,7 @@ class AuditLog:
         surplus = closed[: max(len(closed) - self._keep, 0)]
         if not surplus:
             return
-        end = last_link(surplus[-1])
+        end = last_entry(surplus[-1])
         if end is None:
             return
         content = {"first": first_sequence(surplus[0]), "last": end.sequence, "last_hash": end.hash}
@@ -331,17 +331,17 @@ class AuditLog:
             os.close(file)
 
 
-def _end_of_chain(log_file: Path) -> Link:
+def _end_of_chain(log_file: Path) -> ChainEntry:
     """Return the last entry of the chain on disk."""
     for path in (log_file, *reversed(segments(log_file))):
         try:
-            end = last_link(path)
+            end = last_entry(path)
         except ValueError:
             log.critical("audit: cannot read the last entry, starting a new chain (file=%s)", path)
-            return Link()
+            return ChainEntry()
         if end is not None:
             return end
-    return Link()
+    return ChainEntry()
 
 
 def _first_entry(path: Path) -> int:
@@ -350,7 +350,7 @@ def _first_entry(path: Path) -> int:
         return int(json.loads(file.readline())["seq"])
 
 
-def _acquire(path: Path) -> tuple[int, int | None, Link]:
+def _acquire(path: Path) -> tuple[int, int | None, ChainEntry]:
     """Become the only writer of a log.
 
     Returns:
@@ -384,7 +384,7 @@ def _locked(path: Path) -> int:
     return lock
 
 
-def _chained(batch: Iterable[_PendingEntry], end: Link) -> tuple[bytes, Link]:
+def _chained(batch: Iterable[_PendingEntry], end: ChainEntry) -> tuple[bytes, ChainEntry]:
     """Return entries as lines that continue the chain, and the new last entry."""
     lines = []
     for waiting in batch:
@@ -392,7 +392,7 @@ def _chained(batch: Iterable[_PendingEntry], end: Link) -> tuple[bytes, Link]:
         known = {"time": waiting.time, "boot_s": waiting.boot_s, "kind": waiting.kind}
         entry = {"seq": sequence, **known, **waiting.content, "prev": end.hash}
         entry["hash"] = digest(entry)
-        end = Link(sequence, entry["hash"])
+        end = ChainEntry(sequence, entry["hash"])
         lines.append(canonical(entry) + b"\n")
     return b"".join(lines), end
 

@@ -32,14 +32,14 @@ def digest(entry: dict[str, Any]) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class Link:
+class ChainEntry:
     """Sequence number and hash of an entry, which the next entry continues."""
 
     sequence: int = 0
     hash: str = GENESIS
 
 
-def last_link(path: Path) -> Link | None:
+def last_entry(path: Path) -> ChainEntry | None:
     """Return the last entry of a file, or None if there is no entry. An incomplete last line is skipped.
 
     Raises:
@@ -53,7 +53,7 @@ def last_link(path: Path) -> Link | None:
         if lines:
             try:
                 entry = json.loads(lines[-1])
-                return Link(int(entry["seq"]), str(entry["hash"]))
+                return ChainEntry(int(entry["seq"]), str(entry["hash"]))
             except (KeyError, TypeError, RecursionError) as error:
                 raise ValueError(f"not an audit entry: {error}") from None
     return None
@@ -133,7 +133,7 @@ class Finding:
     before: int = 0
 
 
-def verify(lines: Iterable[bytes], part: bool = False, since: Link | None = None) -> Finding:
+def verify(lines: Iterable[bytes], part: bool = False, since: ChainEntry | None = None) -> Finding:
     """Check the chain of an audit log, line by line.
 
     Args:
@@ -142,10 +142,10 @@ def verify(lines: Iterable[bytes], part: bool = False, since: Link | None = None
         since: An entry that the log is known to have contained. It and all later entries must exist. Without it, entries at the
             beginning must not be missing, because an attacker who removes entries can also write the entry that records the removal.
     """
-    previous = Link()
+    previous = ChainEntry()
     count = 0
     torn = False
-    begin: Link | None = None
+    begin: ChainEntry | None = None
     pruned: set[tuple[object, object]] = set()
     for number, line in enumerate(lines, 1):
         if torn:
@@ -156,9 +156,9 @@ def verify(lines: Iterable[bytes], part: bool = False, since: Link | None = None
         try:
             entry = json.loads(line)
             if begin is None:
-                previous = begin = Link(int(entry["seq"]) - 1, str(entry["prev"]))
+                previous = begin = ChainEntry(int(entry["seq"]) - 1, str(entry["prev"]))
             problem = _problem(entry, previous, line)
-            previous = Link(int(entry["seq"]), str(entry["hash"]))
+            previous = ChainEntry(int(entry["seq"]), str(entry["hash"]))
             if entry.get("kind") == PRUNED:
                 pruned.add((entry["last"], entry["last_hash"]))
         except (ValueError, KeyError, TypeError, RecursionError):
@@ -170,12 +170,12 @@ def verify(lines: Iterable[bytes], part: bool = False, since: Link | None = None
         count += 1
     if part:
         return Finding(count, torn=torn)
-    begin = begin or Link()
+    begin = begin or ChainEntry()
     return Finding(count, torn=torn, before=begin.sequence, **_ends(begin, previous, max(count, 1), pruned, since))
 
 
 def _ends(
-    begin: Link, end: Link, last_line: int, pruned: set[tuple[object, object]], since: Link | None
+    begin: ChainEntry, end: ChainEntry, last_line: int, pruned: set[tuple[object, object]], since: ChainEntry | None
 ) -> dict[str, Any]:
     """Return the line and the problem if entries are missing at the beginning or at the end of a log."""
     first = begin.sequence + 1
@@ -187,7 +187,7 @@ def _ends(
             "line": 1,
             "problem": f"is number {first}: entries since the checkpoint, number {since.sequence}, are missing",
         }
-    if begin == Link():
+    if begin == ChainEntry():
         return {}
     if (begin.sequence, begin.hash) not in pruned:
         return {
@@ -203,7 +203,7 @@ def _ends(
     return {}
 
 
-def _problem(entry: dict[str, Any], previous: Link, line: bytes) -> str:
+def _problem(entry: dict[str, Any], previous: ChainEntry, line: bytes) -> str:
     if entry["prev"] != previous.hash:
         return "does not continue the previous line: entries were removed, inserted or reordered"
     if entry["seq"] != previous.sequence + 1:

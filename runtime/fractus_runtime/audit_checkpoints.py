@@ -16,7 +16,7 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from fractus_core.api.names import node_identity
 
-from fractus_runtime.audit_chain import Link, canonical
+from fractus_runtime.audit_chain import ChainEntry, canonical
 
 _CONTEXT = b"fractus.dev audit checkpoint 1\n"
 _NODES = node_identity("")
@@ -34,22 +34,22 @@ class Checkpoint:
     Attributes:
         log: Name of the log, without directory and extension.
         node: Identity of the node that signed the checkpoint. Empty if it has no signature.
-        link: The entry.
+        entry: The entry.
         certified: True if the node's certificate was verified with an authority.
     """
 
     log: str
     node: str
-    link: Link
+    entry: ChainEntry
     certified: bool
 
 
-def sign_checkpoint(log: str, link: Link, time: str, tls: Path) -> bytes:
+def sign_checkpoint(log: str, entry: ChainEntry, time: str, tls: Path) -> bytes:
     """Return a signed checkpoint as JSON, including the certificate that verifies the signature.
 
     Args:
         log: Name of the log.
-        link: Last entry of the log on disk.
+        entry: Last entry of the log on disk.
         time: Current time in ISO 8601.
         tls: Directory of the node's tls.key and tls.crt.
 
@@ -63,7 +63,7 @@ def sign_checkpoint(log: str, link: Link, time: str, tls: Path) -> bytes:
         raise TypeError(f"{tls / 'tls.key'}: not an elliptic curve key")
     certificate = x509.load_pem_x509_certificate((tls / "tls.crt").read_bytes())
     content = {
-        "log": log, "seq": link.sequence, "hash": link.hash, "time": time,
+        "log": log, "seq": entry.sequence, "hash": entry.hash, "time": time,
         "certificate": certificate.public_bytes(serialization.Encoding.PEM).decode(),
     }  # fmt: skip
     signature = key.sign(_CONTEXT + canonical(content), ec.ECDSA(hashes.SHA256()))
@@ -73,7 +73,7 @@ def sign_checkpoint(log: str, link: Link, time: str, tls: Path) -> bytes:
 def parse_status_checkpoint(text: str) -> Checkpoint | None:
     """Return a checkpoint in the form of a node's status, LOG:NUMBER:HASH, or None if the text has another form."""
     match = _STATUS_FORM.fullmatch(text)
-    return Checkpoint(match["log"], "", Link(int(match["number"]), match["hash"]), False) if match else None
+    return Checkpoint(match["log"], "", ChainEntry(int(match["number"]), match["hash"]), False) if match else None
 
 
 def read_checkpoint(data: bytes, authorities: Sequence[x509.Certificate] = ()) -> Checkpoint:
@@ -89,7 +89,7 @@ def read_checkpoint(data: bytes, authorities: Sequence[x509.Certificate] = ()) -
         names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
         nodes = [uri for uri in names.get_values_for_type(x509.UniformResourceIdentifier) if uri.startswith(_NODES)]
         log = str(content["log"])
-        link = Link(int(content["seq"]), str(content["hash"]))
+        entry = ChainEntry(int(content["seq"]), str(content["hash"]))
         moment = datetime.fromisoformat(content["time"])
         key = certificate.public_key()
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError, x509.ExtensionNotFound):
@@ -102,7 +102,7 @@ def read_checkpoint(data: bytes, authorities: Sequence[x509.Certificate] = ()) -
         raise InvalidCheckpoint("was changed after it was signed") from None
     if authorities:
         _check_issuer(certificate, moment, authorities)
-    return Checkpoint(log, nodes[0], link, bool(authorities))
+    return Checkpoint(log, nodes[0], entry, bool(authorities))
 
 
 def _check_issuer(certificate: x509.Certificate, moment: datetime, authorities: Sequence[x509.Certificate]) -> None:

@@ -22,7 +22,7 @@ from fractus_agent.links.device_addresses import link_address
 from fractus_agent.redirector.netlink import NETLINK_NETFILTER, NLM_F_ACK, Netlink, in_namespace, message
 from fractus_agent.redirector.nft_maps import Endpoint
 from fractus_core.identity.authority import Authority
-from fractus_core.linking.trajectory_estimator import FlatFrame
+from fractus_core.local_frame import LocalFrame
 from fractus_radio.medium import Medium, Station
 from fractus_radio.propagation import Propagation
 from fractus_radio.radio import Radio
@@ -36,15 +36,12 @@ RANGE_M = 80.0
 TIMEOUT_S = 40.0
 PROGRAM = Path(__file__).with_name("linked_agent.py")
 ORIGIN = (39.36, 22.94)
-_FRAME = FlatFrame(*ORIGIN)
-_PER_EAST = _FRAME.from_degrees(ORIGIN[0], ORIGIN[1] + 1, 0)[0]
-_PER_NORTH = _FRAME.from_degrees(ORIGIN[0] + 1, ORIGIN[1], 0)[1]
+_FRAME = LocalFrame(*ORIGIN)
 
 
 def place(east: float, north: float, up: float = 0.0) -> dict[str, Any]:
     """Return a position of a manifest."""
-    lat = ORIGIN[0] + north / _PER_NORTH
-    lon = ORIGIN[1] + east / _PER_EAST
+    lat, lon = _FRAME.latlon(east, north)
     return {"lat": lat, "lon": lon, "alt": up, "altitudeReference": "home"}
 
 
@@ -280,7 +277,7 @@ class Agent:
         lines = path.read_bytes().splitlines(keepends=True)
         signed = read_checkpoint(path.with_suffix(".checkpoint").read_bytes())
         assert (signed.log, signed.node.rpartition("/")[2]) == ("links", self.name)
-        assert not verify(lines, since=signed.link).problem
+        assert not verify(lines, since=signed.entry).problem
         return [entry for entry in map(json.loads, lines) if entry["kind"] == kind]
 
     def status(self, link: str) -> dict[str, Any]:

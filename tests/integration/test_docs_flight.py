@@ -19,7 +19,7 @@ from docs_shell import Shell
 from fractus_cli.standalone import StandalonePki
 from fractus_cluster.ports import free_port
 from fractus_core.api import Grant
-from fractus_runtime.audit_chain import last_link
+from fractus_runtime.audit_chain import last_entry
 from operator_world import FRACTUS, World
 
 pytestmark = pytest.mark.slow
@@ -123,7 +123,7 @@ def test_audit_log_has_the_verdicts_and_verification_finds_removed_entries(
     for name in ("mobility", "camera"):
         shutil.copy(tmp_path / "audit" / f"{name}.checkpoint", kept)
     log = tmp_path / "audit/mobility.jsonl"
-    head = last_link(log)
+    head = last_entry(log)
     assert head is not None
     reported = {"status": {"audit": [f"mobility:{head.sequence}:{head.hash}"]}}
     world.api.merge(f"{FRACTUS}/drones/drone-1/status", reported)

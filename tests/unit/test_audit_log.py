@@ -17,7 +17,7 @@ from click.testing import CliRunner
 from fractus_cli.audit import audit
 from fractus_core.identity.authority import Authority
 from fractus_runtime.audit import AuditLog
-from fractus_runtime.audit_chain import digest, last_link, verify
+from fractus_runtime.audit_chain import digest, last_entry, verify
 
 EPOCH = datetime.fromtimestamp(0, UTC)
 AUTHORITY = Authority.generate(EPOCH)
@@ -114,7 +114,7 @@ async def test_audit_verification_rejects_deeply_nested_json(tmp_path: Path) -> 
     finding = verify(read(path))
     assert (finding.line, finding.problem) == (3, "is not an audit entry")
     with pytest.raises(ValueError, match="not an audit entry"):
-        last_link(path)
+        last_entry(path)
 
 
 async def test_audit_log_removes_an_incomplete_last_line_and_records_it(tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from fractus_agent.registration.diagnostics import read_audit_heads
 from fractus_cli.audit import audit
 from fractus_core.identity.authority import Authority
 from fractus_runtime.audit import AuditLog
-from fractus_runtime.audit_chain import last_link, segments, verify
+from fractus_runtime.audit_chain import last_entry, segments, verify
 from test_audit_log import AUTHORITY, EPOCH, read, until, written
 
 
@@ -108,7 +108,7 @@ async def test_checkpoint_detects_a_forged_record_of_pruning(tmp_path: Path, tls
     kept = await checkpoint(path, 12, tls, segment_bytes=500)
     await filled(path, 6)
     gone = segments(path)[:2]
-    end = last_link(gone[-1])
+    end = last_entry(gone[-1])
     assert end is not None
     log = AuditLog(path, lambda: 0.0)
     log.append("pruned", {"first": 1, "last": end.sequence, "last_hash": end.hash})

@@ -1,15 +1,11 @@
-"""Trajectory estimates from telemetry and the announced path. Oracle: the projection of `fractus_core.geo`."""
+"""Trajectory estimates from telemetry and the announced path."""
 
 from __future__ import annotations
-
-import math
 
 import pytest
 from fractus_core.api.geometry import Position
 from fractus_core.geo import LocalFrame
-from fractus_core.linking.trajectory_estimator import FlatFrame, TelemetrySample, TrajectoryEstimator
-from hypothesis import given
-from hypothesis import strategies as st
+from fractus_core.linking.trajectory_estimator import TelemetrySample, TrajectoryEstimator, local_position
 
 HOME = (39.36, 22.94)
 FRAME = LocalFrame(*HOME)
@@ -27,27 +23,11 @@ def sample(
     return TelemetrySample(lat, lon, up, 100.0, velocity)
 
 
-@given(
-    st.floats(-80, 80), st.floats(-180, 180), st.floats(-10_000, 10_000), st.floats(-10_000, 10_000)
-)  # fmt: skip
-def test_flat_frame_agrees_with_the_projection(lat: float, lon: float, east: float, north: float) -> None:
-    at = LocalFrame(lat, lon).latlon(east, north)
-    x, y, up = FlatFrame(lat, lon).from_degrees(*at, 5.0)
-    assert math.hypot(x - east, y - north) <= 0.01 * math.hypot(east, north) + 1e-6
-    assert up == 5.0
-
-
-def test_distances_near_the_origin_are_accurate_to_a_decimetre() -> None:
-    x, y, _ = FlatFrame(*HOME).from_degrees(*FRAME.latlon(800.0, -600.0), 0.0)
-    assert (x, y) == pytest.approx((800.0, -600.0), abs=0.1)
-
-
-def test_heights_of_any_reference_are_converted_to_above_home() -> None:
-    frame = FlatFrame(*HOME)
+def test_altitudes_of_every_reference_are_converted_to_metres_above_home() -> None:
     telemetry = sample(0, 0, up=30.0)
-    assert frame.from_manifest(waypoint(0, 0, 120.0, "amsl"), telemetry)[2] == pytest.approx(20.0)
-    assert frame.from_manifest(waypoint(0, 0, 7.0, "terrain"), telemetry)[2] == 7.0
-    assert frame.from_manifest(waypoint(0, 0, None), telemetry)[2] == 30.0
+    assert local_position(FRAME, waypoint(0, 0, 120.0, "amsl"), telemetry)[2] == pytest.approx(20.0)
+    assert local_position(FRAME, waypoint(0, 0, 7.0, "terrain"), telemetry)[2] == 7.0
+    assert local_position(FRAME, waypoint(0, 0, None), telemetry)[2] == 30.0
 
 
 PATH = [waypoint(0, 0), waypoint(100, 0), waypoint(100, 100)]

@@ -27,6 +27,7 @@ from fractus_core.linking import (
     Track,
     TrajectoryEstimator,
     UnknownHeuristic,
+    local_position,
 )
 
 from fractus_agent.links.audit_records import AuditRecorder, decision_records
@@ -216,7 +217,7 @@ class DroneLinkController:
         for link in self._links:
             spec = link.spec
             offers = PathMetrics(spec.bandwidth, spec.bandwidth, DEFAULT_LATENCY_MS, DEFAULT_LATENCY_MS, direct=True)
-            peers[spec.node] = Peer(spec.node, frame.from_manifest(spec.position, sample), spec.range, offers)
+            peers[spec.node] = Peer(spec.node, local_position(frame, spec.position, sample), spec.range, offers)
         return track, peers
 
     def _traffic(self, peers: Mapping[str, Peer]) -> list[ApplicationTraffic]:

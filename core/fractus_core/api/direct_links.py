@@ -36,7 +36,7 @@ class TargetAddress(OpenModel):
     port: int = Field(ge=1, le=65535, description="Port of the pod.")
 
 
-class Caller(OpenModel):
+class CallerAddress(OpenModel):
     """An instance on the drone that may call a service over the link."""
 
     instance: str = Field(description="Name of the calling instance.")
@@ -54,7 +54,7 @@ class LinkedService(OpenModel):
     target: TargetAddress | None = Field(
         default=None, description="Address of a ready pod of the instance; unset while there is none."
     )
-    callers: tuple[Caller, ...] | None = Field(
+    callers: tuple[CallerAddress, ...] | None = Field(
         default=None,
         description="Instances on the drone that may call the service; unset if the component does not restrict its callers.",
     )

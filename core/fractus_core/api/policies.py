@@ -233,7 +233,9 @@ class PolicySpec(Validity):
     def _access(self) -> Violation:
         if self.type != "AccessControl":
             return None
-        return "kind" if self.kind not in get_args(AccessKind) else "methods" if not self.methods else None
+        if self.kind not in get_args(AccessKind):
+            return "kind"
+        return "methods" if not self.methods else None
 
     @rule(
         _for("LimitControl", f"({_among('kind', LimitKind)} && (has(self.upperLimit) || has(self.lowerLimit)))"),
@@ -242,8 +244,9 @@ class PolicySpec(Validity):
     def _limit(self) -> Violation:
         if self.type != "LimitControl":
             return None
-        unlimited = self.lower_limit is None and self.upper_limit is None
-        return "kind" if self.kind not in get_args(LimitKind) else "upperLimit" if unlimited else None
+        if self.kind not in get_args(LimitKind):
+            return "kind"
+        return "upperLimit" if self.lower_limit is None and self.upper_limit is None else None
 
     @rule(
         # An upper limit of 0 m/s would stop the drone, and one below 0 would fly it backwards. A lower limit may be 0, which
@@ -322,9 +325,9 @@ class PolicySpec(Validity):
     def _geofence(self) -> Violation:
         if self.type != "GeofenceControl":
             return None
-        return (
-            "kind" if self.kind not in get_args(GeofenceKind) else "selector.zones" if not self.selector.zones else None
-        )
+        if self.kind not in get_args(GeofenceKind):
+            return "kind"
+        return "selector.zones" if not self.selector.zones else None
 
     @rule(
         _for("GeofenceControl", f"!has(self.action) || {_among('action', GeofenceAction)}"),
@@ -340,7 +343,9 @@ class PolicySpec(Validity):
     def _privacy(self) -> Violation:
         if self.type != "PrivacyControl":
             return None
-        return "kind" if self.kind != "camera" else "action" if self.action not in get_args(PrivacyAction) else None
+        if self.kind != "camera":
+            return "kind"
+        return "action" if self.action not in get_args(PrivacyAction) else None
 
     @rule(
         "!(has(self.faces) || has(self.fallback)) || (self.type == 'PrivacyControl' && has(self.action)"
@@ -350,7 +355,9 @@ class PolicySpec(Validity):
     def _faces(self) -> Violation:
         if self.type == "PrivacyControl" and self.action == "blurFaces":
             return None
-        return "faces" if self.faces is not None else "fallback" if self.fallback is not None else None
+        if self.faces is not None:
+            return "faces"
+        return "fallback" if self.fallback is not None else None
 
     def _acts(self, actions: object) -> bool:
         return self.action is None or self.action in get_args(actions)

@@ -35,7 +35,9 @@ class Validity(Model):
     )
     def _times(self) -> Violation:
         begin_s, end_s = self.window_s
-        return "validFrom" if -math.inf < begin_s < 0 else "validUntil" if end_s < 0 else None
+        if -math.inf < begin_s < 0:
+            return "validFrom"
+        return "validUntil" if end_s < 0 else None
 
     @rule(
         "!has(self.validFrom) || !has(self.validUntil) || self.validFrom < self.validUntil",

@@ -11,6 +11,6 @@ from fractus_core.geo.areas import ground_point as ground_point
 from fractus_core.geo.areas import line_geojson as line_geojson
 from fractus_core.geo.areas import multipolygon_geojson as multipolygon_geojson
 from fractus_core.geo.areas import points_xy as points_xy
-from fractus_core.geo.local_frame import LocalFrame as LocalFrame
-from fractus_core.geo.local_frame import distance_m as distance_m
-from fractus_core.geo.local_frame import geodesic_m as geodesic_m
+from fractus_core.geo.distances import distance_m as distance_m
+from fractus_core.geo.distances import geodesic_m as geodesic_m
+from fractus_core.local_frame import LocalFrame as LocalFrame

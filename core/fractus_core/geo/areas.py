@@ -14,7 +14,8 @@ from shapely.geometry.base import BaseGeometry
 
 from fractus_core.api.geometry import Area, Circle, Point, Polygon, Position
 from fractus_core.api.model import InvalidObject
-from fractus_core.geo.local_frame import LocalFrame, distance_m
+from fractus_core.geo.distances import distance_m
+from fractus_core.local_frame import LocalFrame
 
 _SEGMENTS = (8, 32)
 """Straight pieces per quarter of a circle, minimum and maximum. The area is accurate to 0.4 %."""

@@ -13,6 +13,7 @@ from fractus_core.linking.path_choice import leaves_range as leaves_range
 from fractus_core.linking.range_model import RangeModel as RangeModel
 from fractus_core.linking.trajectory_estimator import TelemetrySample as TelemetrySample
 from fractus_core.linking.trajectory_estimator import TrajectoryEstimator as TrajectoryEstimator
+from fractus_core.linking.trajectory_estimator import local_position as local_position
 from fractus_core.linking.values import NO_LINK as NO_LINK
 from fractus_core.linking.values import LearnedRange as LearnedRange
 from fractus_core.linking.values import LinkDecision as LinkDecision

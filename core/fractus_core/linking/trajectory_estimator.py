@@ -1,8 +1,6 @@
 """Trajectory estimate of the drone from telemetry and the path that its driver announced.
 
-All positions are converted to one local frame. Its horizontal error grows to 0.01 % at 10 km, which is negligible
-compared with the uncertainty of a radio's range. The frame of `fractus_core.geo` needs numerical libraries, which the
-agent does not load.
+All positions are converted to one local frame, whose origin is the first known position of the drone.
 """
 
 from __future__ import annotations
@@ -13,9 +11,7 @@ from dataclasses import dataclass
 
 from fractus_core.api.geometry import Position
 from fractus_core.linking.values import LocalPosition, Track
-
-_SEMI_MAJOR_M = 6_378_137.0
-_E2 = 0.00669437999014
+from fractus_core.local_frame import LocalFrame
 
 ARRIVED_M = 5.0
 """Distance to a waypoint within which the drone counts as having reached it, in metres."""
@@ -46,38 +42,18 @@ class TelemetrySample:
     velocity_mps: LocalPosition
 
 
-class FlatFrame:
-    """Metres east, north and up of an origin on the ellipsoid. Up is measured from the drone's home.
+def local_position(frame: LocalFrame, position: Position, sample: TelemetrySample) -> LocalPosition:
+    """Convert a position of a manifest to metres east and north of the frame's origin, and metres above home.
 
-    Args:
-        lat: Latitude of the origin, in degrees.
-        lon: Longitude of the origin, in degrees.
+    A position without altitude gets the drone's altitude. Terrain is taken to be as high as home.
     """
-
-    def __init__(self, lat: float, lon: float) -> None:
-        self._lat = lat
-        self._lon = lon
-        root = math.sqrt(1 - _E2 * math.sin(math.radians(lat)) ** 2)
-        self._north_m = math.radians(_SEMI_MAJOR_M * (1 - _E2) / root**3)
-        self._east_m = math.radians(_SEMI_MAJOR_M / root) * math.cos(math.radians(lat))
-
-    def from_degrees(self, lat: float, lon: float, up_m: float) -> LocalPosition:
-        """Convert degrees and a height above home."""
-        east_deg = (lon - self._lon + 180.0) % 360.0 - 180.0
-        return east_deg * self._east_m, (lat - self._lat) * self._north_m, up_m
-
-    def from_manifest(self, position: Position, sample: TelemetrySample) -> LocalPosition:
-        """Convert a position of a manifest.
-
-        A position without altitude gets the drone's height. Terrain is taken to be as high as home.
-        """
-        if position.alt is None:
-            up_m = sample.above_home_m
-        elif position.altitude_reference == "amsl":
-            up_m = position.alt - sample.home_amsl_m
-        else:
-            up_m = position.alt
-        return self.from_degrees(position.lat, position.lon, up_m)
+    if position.alt is None:
+        up_m = sample.above_home_m
+    elif position.altitude_reference == "amsl":
+        up_m = position.alt - sample.home_amsl_m
+    else:
+        up_m = position.alt
+    return *frame.xy(position.lat, position.lon), up_m
 
 
 class TrajectoryEstimator:
@@ -89,15 +65,15 @@ class TrajectoryEstimator:
 
     def __init__(self, path: Sequence[Position]) -> None:
         self.path = tuple(path)
-        self._frame: FlatFrame | None = None
+        self._frame: LocalFrame | None = None
         self._next: int | None = None
 
-    def estimate(self, sample: TelemetrySample) -> tuple[FlatFrame, Track]:
+    def estimate(self, sample: TelemetrySample) -> tuple[LocalFrame, Track]:
         """Return the local frame, and the drone's track in that frame."""
         if self._frame is None:
-            self._frame = FlatFrame(sample.lat, sample.lon)
-        position = self._frame.from_degrees(sample.lat, sample.lon, sample.above_home_m)
-        points = [self._frame.from_manifest(waypoint, sample) for waypoint in self.path]
+            self._frame = LocalFrame(sample.lat, sample.lon)
+        position = (*self._frame.xy(sample.lat, sample.lon), sample.above_home_m)
+        points = [local_position(self._frame, waypoint, sample) for waypoint in self.path]
         if points:
             self._next = _next_waypoint(self._next, position, points)
         speed_mps = math.dist(sample.velocity_mps, (0.0, 0.0, 0.0))

@@ -152,7 +152,9 @@ def _drone_grant(
     mobility = drone.spec.services.mobility
     depot = inventory.depots.get(drone.spec.depot or "")
     home = drone.spec.home
-    base = ground_point(home) if home is not None else depot.spec.location if depot is not None else area.start
+    base = depot.spec.location if depot is not None else area.start
+    if home is not None:
+        base = ground_point(home)
     stand = Area(circle=Circle(center=base, radius=depot.spec.radius if depot is not None else 30.0))
     shape = _outlined(area.shape)
     way = shapely.union(shape, area_polygon(area.frame, stand)).convex_hull

@@ -17,7 +17,8 @@ from shapely.geometry.base import BaseGeometry
 from fractus_core.api.geometry import Point
 from fractus_core.api.nodes import Depot, Drone, EdgeNode
 from fractus_core.geo import LocalFrame, geodesic_m, ground_point
-from fractus_core.geo.local_frame import CHORDS_TO_M, FLATTENING, SEMI_MAJOR_AXIS_M, ecef
+from fractus_core.geo.distances import CHORDS_TO_M
+from fractus_core.local_frame import FLATTENING, SEMI_MAJOR_AXIS_M, ecef
 
 Near = tuple[str, float]
 """A name and its geodesic distance in metres."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 
 from fractus_core.api import Application
-from fractus_core.api.direct_links import Caller, DirectLinkSpec, LinkedService, TargetAddress, VirtualAddress
+from fractus_core.api.direct_links import CallerAddress, DirectLinkSpec, LinkedService, TargetAddress, VirtualAddress
 from fractus_core.api.geometry import Position
 from fractus_core.api.grants import ApplicationReference
 from fractus_core.api.names import object_name
@@ -103,8 +103,8 @@ def _services(
         )
 
 
-def _addressed(instances: Iterable[str], pods: Sequence[PodView]) -> tuple[Caller, ...]:
-    return tuple(Caller(instance=instance, address=_source(instance, pods)) for instance in instances)
+def _addressed(instances: Iterable[str], pods: Sequence[PodView]) -> tuple[CallerAddress, ...]:
+    return tuple(CallerAddress(instance=instance, address=_source(instance, pods)) for instance in instances)
 
 
 def _source(instance: str, pods: Iterable[PodView]) -> str | None:

@@ -13,7 +13,7 @@ from fractus_core.api import API_VERSION, InvalidObject, Zone
 from fractus_core.api.geometry import MAX_RING_POINTS, Area, Circle, Point, Polygon
 from fractus_core.documents import BadDocument, parse_documents
 from fractus_core.geo.areas import area_center, area_polygon, multipolygon_geojson
-from fractus_core.geo.local_frame import LocalFrame
+from fractus_core.local_frame import LocalFrame
 
 DESCRIPTION_LENGTH = 1024
 """Longest description of a zone, in characters."""

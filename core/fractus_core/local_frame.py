@@ -1,16 +1,21 @@
-"""Local metric frames on the WGS 84 ellipsoid, and geodesic distances."""
+"""Local metric frames on the WGS 84 ellipsoid.
+
+numpy is imported only by the methods for arrays, because the agent converts single points and does not install numpy.
+"""
 
 from __future__ import annotations
 
 import math
 from types import ModuleType
-from typing import TypeVar
-
-import numpy as np
-from geographiclib.geodesic import Geodesic
-from numpy.typing import NDArray
+from typing import TYPE_CHECKING, TypeVar
 
 from fractus_core.api.geometry import Point
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    Coordinates = NDArray[np.float64]
 
 SEMI_MAJOR_AXIS_M = 6_378_137.0
 FLATTENING = 1 / 298.257223563
@@ -18,44 +23,7 @@ _E2 = FLATTENING * (2 - FLATTENING)
 _PER_A2 = SEMI_MAJOR_AXIS_M**-2
 _PER_B2 = (SEMI_MAJOR_AXIS_M * (1 - FLATTENING)) ** -2
 
-CHORDS_TO_M = 200_000.0
-"""Up to this distance, geodesic distances are computed from chords, beyond it by Karney's algorithm."""
-
-Coordinates = NDArray[np.float64]
-Metres = TypeVar("Metres", float, Coordinates)
-
-
-def geodesic_m(a: Point, b: Point) -> float:
-    """Return the length in metres of the shortest line between two points on the WGS 84 ellipsoid.
-
-    Source: C. F. F. Karney, "Algorithms for geodesics", J. Geodesy 87 (2013).
-    """
-    return float(Geodesic.WGS84.Inverse(a.lat, a.lon, b.lat, b.lon, Geodesic.DISTANCE)["s12"])
-
-
-def distance_m(a: Point, b: Point) -> float:
-    """Return the geodesic distance in metres, twenty times faster than `geodesic_m`.
-
-    The error is below a micrometre up to 50 km. The distance is computed from the chord, bent by the ellipsoid's
-    curvature along it. Beyond 200 km the function calls `geodesic_m`.
-    """
-    ax, ay, az = ecef(a.lat, a.lon)
-    bx, by, bz = ecef(b.lat, b.lon)
-    across = (bx - ax) ** 2 + (by - ay) ** 2
-    up = (bz - az) ** 2
-    chord = math.sqrt(across + up)
-    if chord > CHORDS_TO_M:
-        return geodesic_m(a, b)
-    if chord < 1e-9:
-        return chord
-    equator = SEMI_MAJOR_AXIS_M**-2
-    pole = (SEMI_MAJOR_AXIS_M * (1 - FLATTENING)) ** -2
-    middle = ((ax + bx) ** 2 + (ay + by) ** 2) / 4
-    height = (az + bz) ** 2 / 4
-    depth = middle * equator + height * pole
-    slope = middle * equator**2 + height * pole**2
-    bend = (across * equator + up * pole) / chord**2 * math.sqrt(depth / slope)
-    return 2 / bend * math.asin(chord * bend / 2)
+Metres = TypeVar("Metres", float, "Coordinates")
 
 
 def ecef(lat: Metres, lon: Metres, of: ModuleType = math) -> tuple[Metres, Metres, Metres]:
@@ -118,6 +86,8 @@ class LocalFrame:
 
     def xy_array(self, lats: Coordinates, lons: Coordinates) -> Coordinates:
         """Return metres east and north, shape (n, 2), of points on the ellipsoid in degrees, shapes (n,)."""
+        import numpy as np  # noqa: PLC0415 - see above
+
         x, y, z = ecef(lats, lons, np)
         dx = x - self._origin[0]
         dy = y - self._origin[1]
@@ -149,6 +119,8 @@ class LocalFrame:
         Raises:
             ValueError: A point lies beyond the horizon of the frame.
         """
+        import numpy as np  # noqa: PLC0415 - see above
+
         x = xy[:, 0]
         y = xy[:, 1]
         u, v, w = self._up

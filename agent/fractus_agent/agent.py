@@ -15,7 +15,7 @@ from fractus_runtime.metrics import BackgroundReader, serve_metrics
 from prometheus_client import Metric
 
 from fractus_agent.agent_metrics import AgentMetrics
-from fractus_agent.grants import GrantDirectory, GrantSynchronizer, GrantVerifier
+from fractus_agent.grant_synchronizer import GrantDirectory, GrantSynchronizer, GrantVerifier
 from fractus_agent.identity import NodeIdentity
 from fractus_agent.links.link_manager import LinkManager
 from fractus_agent.registration.diagnostics import read_audit_heads, read_recording_problems
@@ -25,7 +25,7 @@ from fractus_agent.registration.registration import Registration
 from fractus_agent.settings import Settings
 from fractus_agent.store import Object, Store
 from fractus_agent.supervisor import Supervisor, run_watchdog
-from fractus_agent.telemetry import INTERVAL_S, LINK_INTERVAL_S, TelemetryFeed
+from fractus_agent.telemetry import LINK_INTERVAL_S, TELEMETRY_INTERVAL_S, TelemetryFeed
 
 
 class Agent:
@@ -140,7 +140,7 @@ class Agent:
     def _set_telemetry_interval(self) -> None:
         if self._feed is not None:
             linking = self._links is not None and self._links.active
-            self._feed.set_interval(LINK_INTERVAL_S if linking else INTERVAL_S)
+            self._feed.set_interval(LINK_INTERVAL_S if linking else TELEMETRY_INTERVAL_S)
 
     def _telemetry_sample(self) -> TelemetrySample | None:
         snapshot = self._feed.latest if self._feed is not None and self._feed.problem is None else None

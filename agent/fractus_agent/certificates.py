@@ -25,7 +25,7 @@ class InvalidCertificate(Exception):
 
 
 @dataclass(frozen=True, slots=True)
-class Validity:
+class ValidityPeriod:
     """Validity period of a certificate."""
 
     not_before: datetime
@@ -64,7 +64,7 @@ def create_request(node: str) -> tuple[bytes, bytes]:
     return key_pem, request.public_bytes(serialization.Encoding.PEM)
 
 
-def inspect_certificate(directory: Path, node: str) -> Validity:
+def inspect_certificate(directory: Path, node: str) -> ValidityPeriod:
     """Validate tls.crt, tls.key and ca.crt of a directory as a client of the node's services would.
 
     Raises:
@@ -81,7 +81,7 @@ def inspect_certificate(directory: Path, node: str) -> Validity:
         raise InvalidCertificate(f"{type(error).__name__}: {error}") from error
     if ("URI", node_identity(node)) not in certificate.get("subjectAltName", ()):
         raise InvalidCertificate(f"the certificate does not name {node_identity(node)}")
-    return Validity(_parse_date(certificate["notBefore"]), _parse_date(certificate["notAfter"]))
+    return ValidityPeriod(_parse_date(certificate["notBefore"]), _parse_date(certificate["notAfter"]))
 
 
 def _handshake(server: ssl.SSLContext, client: ssl.SSLContext, name: str) -> dict[str, Any]:

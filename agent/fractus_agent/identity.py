@@ -20,7 +20,7 @@ from fractus_runtime.files import read_set, write_set
 from fractus_agent.certificates import (
     CERTIFICATE_FILES,
     InvalidCertificate,
-    Validity,
+    ValidityPeriod,
     create_request,
     inspect_certificate,
 )
@@ -29,7 +29,7 @@ from fractus_agent.store import Backoff, KubeError, Store
 log = logging.getLogger(__name__)
 
 LIFETIME_S = 30 * 86400
-CHECK_INTERVAL_S = 10.0
+FILE_CHECK_INTERVAL_S = 10.0
 """Seconds between checks of the files and the clock."""
 AUTHORITY_INTERVAL_S = 300.0
 """Seconds between reads of the published authority."""
@@ -91,7 +91,7 @@ class NodeIdentity:
         self._create_request = create_request
         self._jitter = int(hashlib.sha256(node.encode()).hexdigest()[:4], 16) / 0xFFFF / 30
         self._backoff = Backoff(0.5, 300.0)
-        self._inspected: tuple[object, Validity | None] | None = None
+        self._inspected: tuple[object, ValidityPeriod | None] | None = None
         self._authority_outdated = False
         self.ready = asyncio.Event()
         self.serial = 0
@@ -108,7 +108,7 @@ class NodeIdentity:
         checked_s = float("-inf")
         loop = asyncio.get_running_loop()
         while True:
-            delay_s = CHECK_INTERVAL_S
+            delay_s = FILE_CHECK_INTERVAL_S
             try:
                 read_authority = (
                     self._authority_outdated
@@ -177,7 +177,7 @@ class NodeIdentity:
         validity = self._validity()
         return validity is None or self._clock() >= validity.not_after
 
-    def _validity(self) -> Validity | None:
+    def _validity(self) -> ValidityPeriod | None:
         """Return the validity of the files, None if they are invalid. They are inspected only after a change."""
         try:
             stamp: object = tuple(
@@ -195,7 +195,7 @@ class NodeIdentity:
             self._inspected = (stamp, validity)
         return self._inspected[1]
 
-    def _follow_authority(self, authority: bytes, validity: Validity) -> Validity | None:
+    def _follow_authority(self, authority: bytes, validity: ValidityPeriod) -> ValidityPeriod | None:
         """Store a changed authority. Return None if it did not issue the certificate, which must then be requested again."""
         current = read_set(self._directory, CERTIFICATE_FILES)
         if current is None or current["ca.crt"] == authority:
@@ -258,7 +258,7 @@ class NodeIdentity:
             await asyncio.sleep(backoff.delay_s())
         raise RetryLater(f"signing request {name} was not signed within {SIGNING_TIMEOUT_S:.0f} s")
 
-    def _inspect_copy(self, files: dict[str, bytes]) -> Validity:
+    def _inspect_copy(self, files: dict[str, bytes]) -> ValidityPeriod:
         trial = self._directory / f"..{uuid.uuid4().hex}"
         try:
             write_set(trial, files)
@@ -273,7 +273,7 @@ class NodeIdentity:
         self.serial += 1
         self._on_change()
 
-    def _set_usable(self, validity: Validity) -> None:
+    def _set_usable(self, validity: ValidityPeriod) -> None:
         self._set_condition("True", "Issued", f"Valid until {validity.not_after:%F %T} UTC.")
         self.ready.set()
 

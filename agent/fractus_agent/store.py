@@ -70,7 +70,7 @@ class Deleted:
     name: str
 
 
-Event = Listed | Changed | Deleted
+WatchEvent = Listed | Changed | Deleted
 
 
 @dataclass(frozen=True, slots=True)
@@ -307,12 +307,12 @@ class Store:
             return False
         return True
 
-    def direct_links(self, end: LinkEnd) -> AsyncGenerator[Event, None]:
+    def direct_links(self, end: LinkEnd) -> AsyncGenerator[WatchEvent, None]:
         """Yield list and watch events of the node's DirectLinks."""
         selectors = {"fieldSelector": f"spec.{end}={self._node}"}
         return self._follow(_WatchTarget(self._client, _KINDS["DirectLink"], selectors))
 
-    async def _follow(self, target: _WatchTarget) -> AsyncGenerator[Event, None]:
+    async def _follow(self, target: _WatchTarget) -> AsyncGenerator[WatchEvent, None]:
         """Yield a complete list, then changes, and another list after each interruption, indefinitely.
 
         An interruption never yields an empty list. After it the objects are listed again instead of resuming the watch:
@@ -362,7 +362,7 @@ class Store:
         )
         return tuple(page.items), page.resource_version
 
-    async def _watch(self, target: _WatchTarget, version: str) -> AsyncGenerator[Event, None]:
+    async def _watch(self, target: _WatchTarget, version: str) -> AsyncGenerator[WatchEvent, None]:
         until_s = time.monotonic() + self._times.relist_s
         while time.monotonic() < until_s:
             opened_s = time.monotonic()

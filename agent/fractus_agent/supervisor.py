@@ -13,8 +13,8 @@ from fractus_agent.store import Backoff, KubeError
 
 log = logging.getLogger(__name__)
 
-FIRST_RETRY_S = 0.5
-MAX_RETRY_S = 15.0
+_FIRST_RETRY_S = 0.5
+_MAX_RETRY_S = 15.0
 WATCHDOG_INTERVAL_S = 10.0
 WATCHDOG_TIMEOUT_S = 60.0
 
@@ -50,7 +50,7 @@ async def repeat(name: str, step: Callable[[], Awaitable[float]], changed: async
         step: Does what is due, and returns the seconds until it is due again.
         changed: Event that is set when something changed.
     """
-    backoff = Backoff(FIRST_RETRY_S, MAX_RETRY_S)
+    backoff = Backoff(_FIRST_RETRY_S, _MAX_RETRY_S)
     while True:
         # Clear the event before the step reads anything, so that no change is missed.
         changed.clear()

@@ -25,7 +25,7 @@ from fractus_agent.store import Backoff
 
 log = logging.getLogger(__name__)
 
-INTERVAL_S = 1.0
+TELEMETRY_INTERVAL_S = 1.0
 """Seconds between messages."""
 LINK_INTERVAL_S = 0.25
 """Seconds between messages while direct links are planned, because link decisions use them."""
@@ -146,7 +146,7 @@ class TelemetryFeed:
         self._node = node
         self._serial = serial
         self._on_change = on_change
-        self._interval_s = INTERVAL_S
+        self._interval_s = TELEMETRY_INTERVAL_S
         self._message_s = -math.inf
         self.latest: TelemetrySnapshot | None = None
         self.problem: str | None = "The mobility service has not responded yet."

@@ -19,7 +19,7 @@ from fractus_runtime import logs
 from fractus_runtime.metrics import serve_metrics
 from prometheus_client import Metric
 
-from fractus_operator import handlers, kinds, metrics, node_liveness, service_rollout
+from fractus_operator import handlers, kinds, node_liveness, operator_metrics, service_rollout
 from fractus_operator.application_controller import ApplicationController
 from fractus_operator.ca_secret import open_authority
 from fractus_operator.cache import ClusterCache
@@ -61,7 +61,7 @@ async def run(settings: Settings, stop: asyncio.Event | None = None) -> None:
     lease = LeaseThread(Store.connect, (settings.namespace, LEASE_NAME), identity, settings.lease_s, time.monotonic)
     store = await Store.connect(may_write_s=lambda: lease.left_s)
     election = asyncio.create_task(lease.run())
-    source = metrics.MetricsSource(lambda: lease.left_s)
+    source = operator_metrics.MetricsSource(lambda: lease.left_s)
 
     def collect() -> Iterator[Metric]:
         # The source is replaced when this operator becomes the leader.
@@ -91,8 +91,8 @@ async def run(settings: Settings, stop: asyncio.Event | None = None) -> None:
         background: list[Coroutine[Any, Any, None]] = [
             *(informer.run() for informer in (*cache.informers, links.informer)),
             *(queue.run() for queue in (*work_queues(store, cache, csr, conditions), links.work_queue)),
-            run_periodically("node liveness", liveness.step, node_liveness.PERIOD_S),
-            run_periodically("service rollout", services.step, service_rollout.PERIOD_S),
+            run_periodically("node liveness", liveness.step, node_liveness.LIVENESS_PERIOD_S),
+            run_periodically("service rollout", services.step, service_rollout.ROLLOUT_PERIOD_S),
             run_periodically("orphaned pods", orphaned_pods.step, ORPHANED_PODS_PERIOD_S),
             # Shielded, because the last writes of cancelled parts need the Lease.
             _await(asyncio.shield(election)),
@@ -106,9 +106,9 @@ async def run(settings: Settings, stop: asyncio.Event | None = None) -> None:
         await store.aclose()
 
 
-def _metrics_source(lease: LeaseThread, cache: ClusterCache, authority: Authority) -> metrics.MetricsSource:
+def _metrics_source(lease: LeaseThread, cache: ClusterCache, authority: Authority) -> operator_metrics.MetricsSource:
     """Return the metrics of a leader."""
-    return metrics.MetricsSource(
+    return operator_metrics.MetricsSource(
         lambda: lease.left_s,
         lambda: {i.kind.plural: (i.watching, i.age_s()) for i in cache.informers if i.synced.is_set()},
         lambda: ((a.body.get("status") or {}).get("phase", "Pending") for a in cache.applications.values()),

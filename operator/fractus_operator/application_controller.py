@@ -25,8 +25,8 @@ from fractus_operator.cleanup import FinishedPods
 from fractus_operator.drone_claims import shared_flight_outcome
 from fractus_operator.kinds import Key
 from fractus_operator.labels import FINALIZER
-from fractus_operator.metrics import phase as timed
-from fractus_operator.metrics import reconciling
+from fractus_operator.operator_metrics import phase as timed
+from fractus_operator.operator_metrics import reconciling
 from fractus_operator.parsing import SETTLED, Submitted
 from fractus_operator.pods import refusal_of
 from fractus_operator.replanning import (

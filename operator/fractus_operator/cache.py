@@ -20,7 +20,7 @@ from fractus_operator.drone_claims import DroneHolders, Fleet, offered_flights, 
 from fractus_operator.kinds import Body, Key, Kind
 from fractus_operator.labels import label_key
 from fractus_operator.node_objects import NodeObjects
-from fractus_operator.node_services import NodeServices, parse_revision
+from fractus_operator.node_services import NodeServicePods, parse_revision
 from fractus_operator.owned_objects import GroupedObjects, OwnedObjects, application_label_key
 from fractus_operator.parsing import Submitted, Unreadable, optional_parser, parse_application, tolerant_parser
 from fractus_operator.pods import (
@@ -85,7 +85,7 @@ class ClusterCache:
     """
 
     def __init__(self, store: Store, namespace: str = "fractus-system") -> None:
-        self.services = NodeServices(namespace)
+        self.services = NodeServicePods(namespace)
         self.revisions = Informer(
             store, kinds.CONTROLLER_REVISION, parse_revision, self.services.revision_changed, namespace=namespace
         )

@@ -18,9 +18,9 @@ from fractus_operator.status import controller_name
 from fractus_operator.store import Store
 from fractus_operator.work_queue import WorkQueue
 
-BURST = 20
+EVENT_BURST = 20
 """Number of Events of one drone without a pause, enough for some flights."""
-PERIOD_S = 60.0
+EVENT_PERIOD_S = 60.0
 """Seconds until one more Event is allowed after a burst. The pause summarises the changes of a drone that flaps."""
 MAX_LATE = timedelta(seconds=60)
 """A report that is older than the last one by up to this time arrived late. Beyond it, the drone's clock was set back."""
@@ -206,11 +206,11 @@ class DroneEventRecorder:
     def _wait_s(self, name: str, events: int) -> float:
         """Return the seconds until a number of Events of a drone is allowed. If it is 0, they are counted."""
         now_s = asyncio.get_running_loop().time()
-        allowed, counted_s = self._budgets.get(name, (float(BURST), now_s))
-        allowed = min(allowed + (now_s - counted_s) / PERIOD_S, BURST)
-        missing = min(events, BURST) - allowed
+        allowed, counted_s = self._budgets.get(name, (float(EVENT_BURST), now_s))
+        allowed = min(allowed + (now_s - counted_s) / EVENT_PERIOD_S, EVENT_BURST)
+        missing = min(events, EVENT_BURST) - allowed
         self._budgets[name] = (allowed if missing > 0 else allowed - events, now_s)
-        return max(missing, 0.0) * PERIOD_S
+        return max(missing, 0.0) * EVENT_PERIOD_S
 
     def _outcome(self, application: str) -> str:
         namespace, _, name = application.partition("/")

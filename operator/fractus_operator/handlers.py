@@ -56,7 +56,7 @@ def _register(registry: kopf.OperatorRegistry, applications: Controller, oldest_
     def login(**kwargs: Any) -> kopf.ConnectionInfo | None:
         """Return the credentials that the store uses. kopf calls it again when they expire."""
         info = _with_address(kopf.login_with_service_account(**kwargs)) or kopf.login_with_kubeconfig(**kwargs)
-        return Connection(**{f.name: getattr(info, f.name) for f in dataclasses.fields(info)}) if info else None
+        return KopfConnection(**{f.name: getattr(info, f.name) for f in dataclasses.fields(info)}) if info else None
 
     @kopf.on.probe(registry=registry, id="oldest_contact_s")
     async def probe_watches(**_: object) -> float:
@@ -92,7 +92,7 @@ def _register(registry: kopf.OperatorRegistry, applications: Controller, oldest_
             raise kopf.TemporaryError(str(error), delay=_RETRY_S) from error
 
 
-class Connection(kopf.ConnectionInfo):
+class KopfConnection(kopf.ConnectionInfo):
     """Credentials of kopf that accept API server certificates without an authority key identifier.
 
     Python 3.13 refuses such certificates by default. kubectl and `fractus_runtime.kubernetes` accept them.

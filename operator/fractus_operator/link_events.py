@@ -14,7 +14,7 @@ from fractus_operator.kinds import APPLICATION, DIRECT_LINK, Body, Key
 from fractus_operator.store import Informer, Store
 from fractus_operator.work_queue import WorkQueue
 
-PERIOD_S = 10.0
+LINK_EVENT_PERIOD_S = 10.0
 """Minimum time between Events of one link, in seconds. After it, only the current state and the number of changes are posted."""
 
 
@@ -110,7 +110,7 @@ class LinkEventRecorder:
         if current is None or posted is None or (current.up, current.direct) == (posted.up, posted.direct):
             return
         loop = asyncio.get_running_loop()
-        wait_s = posted_s + PERIOD_S - loop.time()
+        wait_s = posted_s + LINK_EVENT_PERIOD_S - loop.time()
         if wait_s > 0:
             loop.call_later(wait_s, self.work_queue.add, key)
             return

@@ -20,13 +20,13 @@ from fractus_operator.work_queue import skip_failed_node
 log = logging.getLogger(__name__)
 
 AGENT_SILENT = "AgentSilent"
-PERIOD_S = 1.0
+LIVENESS_PERIOD_S = 1.0
 _TIME = TypeAdapter(datetime)
 _MISSED_REPORTS = 3
 """Number of missed reports after which a node is stale."""
 _RECONNECT_S = 15.0
 """Longest pause of an agent before it reconnects after an outage of the API server."""
-_MAX_STEP_S = 3 * PERIOD_S
+_MAX_STEP_S = 3 * LIVENESS_PERIOD_S
 """Longest step that counts as observation time. A longer one was delayed, and so were the informers."""
 
 
@@ -49,7 +49,7 @@ class ObservationClock:
         self._began = False
 
     def now_s(self) -> float:
-        """Return the observed seconds. Must be called about once every PERIOD_S."""
+        """Return the observed seconds. Must be called about once every LIVENESS_PERIOD_S."""
         now_s = self._monotonic()
         if self._is_connected():
             self._began = True

@@ -33,7 +33,7 @@ def parse_revision(body: Body) -> Revision | None:
     return Revision(owner, int(body["revision"]), revision_hash(body["metadata"])) if owner in SERVICES else None
 
 
-class NodeServices:
+class NodeServicePods:
     """The pods of the services on each node.
 
     Args:

@@ -19,7 +19,7 @@ from fractus_core.planning.inventory import Inventory, Settings
 from fractus_core.planning.legality import with_legality
 
 from fractus_operator.kinds import Key
-from fractus_operator.metrics import ERRORS, phase
+from fractus_operator.operator_metrics import ERRORS, phase
 
 log = logging.getLogger(__name__)
 

@@ -19,8 +19,8 @@ from fractus_operator.work_queue import skip_failed_node
 
 log = logging.getLogger(__name__)
 
-CURRENT = "ServicesCurrent"
-PERIOD_S = 2.0
+SERVICES_CURRENT = "ServicesCurrent"
+ROLLOUT_PERIOD_S = 2.0
 _SHARE = 20
 """The services of one node in this many are replaced at the same time."""
 STUCK_S = 600.0
@@ -80,28 +80,30 @@ def next_step(
             updates[node.node] = _condition_without_outdated(node, node.node in skipped)
         elif node.obstacle is not None:
             reason, message = node.obstacle
-            updates[node.node] = ConditionUpdate(CURRENT, "False", reason, f"{names}: {message}", progress=True)
+            updates[node.node] = ConditionUpdate(
+                SERVICES_CURRENT, "False", reason, f"{names}: {message}", progress=True
+            )
         elif node.node in replaced:
             message = f"{names}: being replaced"
-            updates[node.node] = ConditionUpdate(CURRENT, "False", "Replacing", message, progress=True)
+            updates[node.node] = ConditionUpdate(SERVICES_CURRENT, "False", "Replacing", message, progress=True)
         else:
             before = (busy or [chosen[0].node])[0]
             message = f"{names}: replaced when the services of {before} are ready"
-            updates[node.node] = ConditionUpdate(CURRENT, "False", "Queued", message, progress=True)
+            updates[node.node] = ConditionUpdate(SERVICES_CURRENT, "False", "Queued", message, progress=True)
     return chosen, updates
 
 
 def _condition_without_outdated(node: ServicesOfNode, skipped: bool) -> ConditionUpdate:
     if not node.starting:
-        return ConditionUpdate(CURRENT, "True", "Current")
+        return ConditionUpdate(SERVICES_CURRENT, "True", "Current")
     names = ", ".join(sorted(node.starting.values()))
     if node.starting_s <= STUCK_S:
-        return ConditionUpdate(CURRENT, "False", "Starting", f"waiting for {names}", progress=True)
+        return ConditionUpdate(SERVICES_CURRENT, "False", "Starting", f"waiting for {names}", progress=True)
     others = "the rollout continues without it" if skipped else "other nodes wait, because too few run this release"
     message = (
         f"{names}: not ready for {STUCK_S / 60:.0f} minutes; {others}; see kubectl -n fractus-system describe pods"
     )
-    return ConditionUpdate(CURRENT, "False", "NotReady", message)
+    return ConditionUpdate(SERVICES_CURRENT, "False", "NotReady", message)
 
 
 class ServiceRollout:
@@ -142,7 +144,7 @@ class ServiceRollout:
                 log.warning("service rollout: services not replaced (node=%s error=%s)", node.node, error)
                 # The admission policy forbids the deletion if the drone has taken off meanwhile.
                 reason = "InTheAir" if error.status == HTTPStatus.FORBIDDEN else "Refused"
-                updates[node.node] = ConditionUpdate(CURRENT, "False", reason, str(error), progress=True)
+                updates[node.node] = ConditionUpdate(SERVICES_CURRENT, "False", reason, str(error), progress=True)
         await self._report(updates)
 
     def _observe(self) -> Iterable[ServicesOfNode]:
@@ -202,7 +204,7 @@ class ServiceRollout:
 
     async def _report(self, updates: Mapping[str, ConditionUpdate]) -> None:
         for name, update in updates.items():
-            known = self._conditions.condition(name, CURRENT)
+            known = self._conditions.condition(name, SERVICES_CURRENT)
             # A node without an outdated pod gets no condition.
             if update.reason not in {"Current", "Starting"} or known is not None:
                 with skip_failed_node("service rollout", name):

@@ -9,7 +9,7 @@ from contextlib import contextmanager, suppress
 
 from fractus_operator.kinds import Key
 from fractus_operator.labels import label_key
-from fractus_operator.metrics import reconciling
+from fractus_operator.operator_metrics import reconciling
 from fractus_operator.store import Backoff, KubeError
 
 log = logging.getLogger(__name__)

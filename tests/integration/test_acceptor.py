@@ -73,8 +73,8 @@ class Site:
 @pytest.fixture
 def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Site:
     port = free_port()
-    monkeypatch.setattr(pairing, "PORT", port)
-    monkeypatch.setattr(acceptor_module, "PORT", port)
+    monkeypatch.setattr(pairing, "PAIRING_PORT", port)
+    monkeypatch.setattr(acceptor_module, "PAIRING_PORT", port)
     return Site(tmp_path)
 
 
@@ -85,7 +85,7 @@ async def until(condition: Callable[[], bool]) -> None:
 
 
 async def silent_peer() -> socket.socket:
-    return await asyncio.to_thread(socket.create_connection, (str(LOOPBACK), pairing.PORT), 10.0)
+    return await asyncio.to_thread(socket.create_connection, (str(LOOPBACK), pairing.PAIRING_PORT), 10.0)
 
 
 async def test_peer_that_pairs_repeatedly_has_one_session(site: Site) -> None:

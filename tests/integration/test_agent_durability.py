@@ -112,7 +112,7 @@ def test_killed_write_set_leaves_all_old_or_all_new_files(tmp_path: Path, before
 WRITER = """
 import sys
 from pathlib import Path
-from fractus_agent.grants import GrantDirectory, GrantSynchronizer
+from fractus_agent.grant_synchronizer import GrantDirectory, GrantSynchronizer
 from fractus_agent.store import GrantList
 def grant(name, size):
     return {"apiVersion": "fractus.dev/v1alpha1", "kind": "Grant", "metadata": {"name": name, "uid": name},

@@ -20,7 +20,7 @@ from typing import Any
 import pytest
 from control_plane import ControlPlane
 from fractus_cluster.ports import free_port
-from fractus_operator import metrics
+from fractus_operator import operator_metrics
 from fractus_operator.__main__ import run
 from fractus_operator.active_plans import ActivePlans
 from fractus_operator.application_controller import ApplicationController
@@ -42,7 +42,7 @@ _on_path = contextvars.ContextVar("on_path", default=False)
 
 _CACHE_UPDATES = frozenset({Informer.record_write.__code__, ActivePlans.decide.__code__})
 """Functions that update the cache. The functions that they call are observers: indexes, wake-ups and other controllers."""
-_METRICS = metrics.__file__
+_METRICS = operator_metrics.__file__
 
 
 class PathRecorder:

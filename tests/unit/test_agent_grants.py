@@ -7,14 +7,14 @@ from types import SimpleNamespace
 from typing import Any, Self, cast
 
 import pytest
-from fractus_agent.grants import (
+from fractus_agent.grant_synchronizer import (
     UNVERIFIED_TIMEOUT_S,
     GrantDirectory,
     GrantSynchronizer,
     grant_report,
     keep_final_phase,
     mission_outcome,
-    serialize,
+    serialize_grant,
 )
 from fractus_agent.store import Backoff, GrantList, KubeError, Store
 from fractus_core.api.grants import Grant, ReportedGrant, pack
@@ -243,9 +243,9 @@ async def test_failed_disk_write_is_retried_within_seconds(
 
     directory = GrantDirectory(tmp_path)
     synchronizer = GrantSynchronizer(store, directory, "drone-1", accept, monotonic=lambda: now_s[0])
-    monkeypatch.setattr("fractus_agent.grants.repeat", repeated)
+    monkeypatch.setattr("fractus_agent.grant_synchronizer.repeat", repeated)
     with monkeypatch.context() as patch:
-        patch.setattr("fractus_agent.grants.write_file", full)
+        patch.setattr("fractus_agent.grant_synchronizer.write_file", full)
         synchronizer.apply(grant_list(manifest()))
         await synchronizer.report()
     assert max(waits_s) <= 5
@@ -269,7 +269,7 @@ def test_outdated_grant_is_removed_if_its_change_cannot_be_stored(
     annotated = manifest()
     annotated["metadata"]["annotations"] = {"note": "new"}
     with monkeypatch.context() as patch:
-        patch.setattr("fractus_agent.grants.write_file", full)
+        patch.setattr("fractus_agent.grant_synchronizer.write_file", full)
         synchronizer.apply(grant_list(annotated))
         assert (tmp_path / "g1.json").read_bytes() == stored, "its spec has not changed"
         synchronizer.apply(grant_list(narrower))
@@ -309,7 +309,7 @@ def test_outdated_grant_is_removed_to_free_disk_space(
         path.write_bytes(content)
 
     synchronizer.apply(grant_list(manifest()))
-    monkeypatch.setattr("fractus_agent.grants.write_file", tight)
+    monkeypatch.setattr("fractus_agent.grant_synchronizer.write_file", tight)
     narrower = manifest()
     narrower["spec"]["limits"] = {"maxAltitude": 10, "maxSpeed": 5}
     synchronizer.apply(grant_list(narrower))
@@ -503,8 +503,8 @@ async def test_new_agent_keeps_reported_final_phase(synchronizer: GrantSynchroni
 def test_serialized_grant_does_not_depend_on_status() -> None:
     one = Grant.from_body(manifest(version="1"))
     two = Grant.from_body(manifest(version="2", status={"phase": "Active"}))
-    assert serialize(one) == serialize(two)
-    stored = json.loads(serialize(one))
+    assert serialize_grant(one) == serialize_grant(two)
+    stored = json.loads(serialize_grant(one))
     assert stored["metadata"]["uid"] == "u1"
     assert Grant.from_body(stored).spec == one.spec
     assert "policies" not in stored["spec"], "unused fields are left out for services of an earlier release"

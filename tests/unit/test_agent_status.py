@@ -12,7 +12,7 @@ from fractus_agent.registration.node_status import (
     StatusReporter,
     due_s,
     node_status,
-    readiness,
+    ready_condition,
     report_intervals,
 )
 from fractus_agent.store import KubeError
@@ -110,13 +110,13 @@ def test_airborne_drone_reports_why_no_driver_has_control(
     ],
 )
 def test_drone_is_not_ready_if_a_requirement_is_missing(facts: dict[str, Any], reason: str) -> None:
-    ready = readiness(observed(**facts))
+    ready = ready_condition(observed(**facts))
     assert (ready.status, ready.reason) == ("False", reason)
     assert ready.message
 
 
 def test_flying_drone_is_ready_even_if_it_would_not_arm() -> None:
-    assert readiness(observed(snapshot=telemetry(ready=False, in_air=True))).status == "True"
+    assert ready_condition(observed(snapshot=telemetry(ready=False, in_air=True))).status == "True"
 
 
 def test_edge_node_without_services_is_ready_without_certificate() -> None:
@@ -127,7 +127,7 @@ def test_edge_node_without_services_is_ready_without_certificate() -> None:
     status = node_status(bare, {}, 1, NOW)
     EdgeNodeStatus.model_validate(status)
     assert "flightState" not in status
-    assert readiness(bare).status == "True"
+    assert ready_condition(bare).status == "True"
 
 
 @pytest.mark.parametrize(

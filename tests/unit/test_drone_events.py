@@ -11,7 +11,7 @@ import pytest
 from fractus_core.api import Drone
 from fractus_core.api.model import API_VERSION
 from fractus_operator import drone_events
-from fractus_operator.drone_events import BURST, DroneEventRecorder
+from fractus_operator.drone_events import EVENT_BURST, DroneEventRecorder
 from fractus_operator.store import KubeError
 
 NOW = datetime(2026, 6, 1, 12, 0, tzinfo=UTC)
@@ -177,19 +177,19 @@ async def test_failed_event_is_retried_and_others_are_not_repeated(cluster: Clus
 
 
 async def test_flapping_drone_has_few_events(cluster: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(drone_events, "PERIOD_S", 1e6)
+    monkeypatch.setattr(drone_events, "EVENT_PERIOD_S", 1e6)
     cluster.holders = []
     for flap in range(2000):
         await cluster.see(drone("inactive" if flap % 2 else "flying", at_s=flap))
-    assert len(cluster.posted) == BURST
+    assert len(cluster.posted) == EVENT_BURST
     assert cluster.sentences()[-1] == "drone-1 took off, flown by system"
-    monkeypatch.setattr(drone_events, "PERIOD_S", 1e-9)
+    monkeypatch.setattr(drone_events, "EVENT_PERIOD_S", 1e-9)
     assert await cluster.see(drone("inactive", at_s=2001)) == ["Landed"], "the current state is posted when allowed"
 
 
 async def test_delayed_events_are_posted_later(cluster: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(drone_events, "PERIOD_S", 0.2)
-    monkeypatch.setattr(drone_events, "BURST", 1)
+    monkeypatch.setattr(drone_events, "EVENT_PERIOD_S", 0.2)
+    monkeypatch.setattr(drone_events, "EVENT_BURST", 1)
     cluster.holders = []
     await cluster.see(drone("inactive", at_s=0), drone("flying", at_s=1), drone("inactive", at_s=2))
     running = asyncio.create_task(cluster.events.work_queue.run())

@@ -7,7 +7,7 @@ from ipaddress import IPv4Address
 
 import pytest
 from fractus_agent.links.audit_records import decision_records
-from fractus_agent.links.decisions import ApplicationTraffic, LinkActions, Situation, decide
+from fractus_agent.links.decisions import ApplicationTraffic, LinkActions, LinkSituation, decide
 from fractus_agent.redirector.nft_maps import Endpoint
 from fractus_core.linking import (
     NO_LINK,
@@ -35,32 +35,32 @@ UP = LinkState(LinkPhase.UP, "e1", NOW_S - 60.0)
 TRAFFIC = ApplicationTraffic("ns/app", find_heuristic("max", "ingress-bandwidth"), (NEAR,), frozenset({VIP}))
 STANDING = Track((0.0, 0.0, 0.0))
 
-LINKED = Situation(NOW_S, STANDING, (TRAFFIC,), UP, IN_CONTACT, CLOUD, WIFI, {VIP: ROUTE})
+LINKED = LinkSituation(NOW_S, STANDING, (TRAFFIC,), UP, IN_CONTACT, CLOUD, WIFI, {VIP: ROUTE})
 DIRECT = replace(LINKED, redirects={VIP: ROUTE})
 
 
-def actions(situation: Situation) -> LinkActions:
+def actions(situation: LinkSituation) -> LinkActions:
     return decide(situation, SETTINGS)
 
 
 def test_near_peer_with_beacons_is_linked() -> None:
-    found = actions(Situation(NOW_S, STANDING, (TRAFFIC,), NO_LINK, IN_CONTACT, CLOUD))
+    found = actions(LinkSituation(NOW_S, STANDING, (TRAFFIC,), NO_LINK, IN_CONTACT, CLOUD))
     assert (found.peer, found.link.changes, found.planned, found.abrupt) == ("e1", True, {}, {})
 
 
 @pytest.mark.parametrize("ago_s", [2.5, float("inf")])
 def test_peer_without_recent_beacon_is_not_linked(ago_s: float) -> None:
     ranges = {"e1": LearnedRange(last_beacon_s=NOW_S - ago_s)}
-    found = actions(Situation(NOW_S, STANDING, (TRAFFIC,), NO_LINK, ranges, CLOUD))
+    found = actions(LinkSituation(NOW_S, STANDING, (TRAFFIC,), NO_LINK, ranges, CLOUD))
     assert (found.peer, found.link.changes, found.link.code) == ("", False, "CloudOnly")
 
 
 def test_peer_with_beacons_is_linked_if_a_better_peer_is_silent() -> None:
     better = Peer("e2", (5.0, 0.0, 0.0), 80.0, replace(WIFI, ingress_mbps=20.0))
     traffic = replace(TRAFFIC, peers=(better, NEAR))
-    assert actions(Situation(NOW_S, STANDING, (traffic,), NO_LINK, IN_CONTACT, CLOUD)).peer == "e1"
+    assert actions(LinkSituation(NOW_S, STANDING, (traffic,), NO_LINK, IN_CONTACT, CLOUD)).peer == "e1"
     both = IN_CONTACT | {"e2": LearnedRange(last_beacon_s=NOW_S)}
-    assert actions(Situation(NOW_S, STANDING, (traffic,), NO_LINK, both, CLOUD)).peer == "e2"
+    assert actions(LinkSituation(NOW_S, STANDING, (traffic,), NO_LINK, both, CLOUD)).peer == "e2"
 
 
 def test_traffic_moves_once_the_link_is_measured_and_serves() -> None:
@@ -146,7 +146,7 @@ def test_traffic_leaves_an_unreachable_cloud_path(heuristic_of: tuple[str, str |
 
 def test_slow_link_is_made_and_kept_without_a_cloud_path() -> None:
     slow = replace(TRAFFIC, peers=(replace(NEAR, offers=replace(WIFI, ingress_mbps=0.5)),))
-    alone = Situation(NOW_S, STANDING, (slow,), NO_LINK, IN_CONTACT, CLOUD)
+    alone = LinkSituation(NOW_S, STANDING, (slow,), NO_LINK, IN_CONTACT, CLOUD)
     assert actions(alone).peer == ""
     assert actions(replace(alone, **SILENT)).peer == "e1"
     for east in (-69.0, -75.0):  # about to leave the declared range, and outside it
@@ -238,7 +238,7 @@ def test_failed_pairing_attempts_back_off() -> None:
 
 
 def test_audit_records_contain_the_inputs_of_a_decision() -> None:
-    joining = Situation(NOW_S, STANDING, (TRAFFIC,), NO_LINK, IN_CONTACT, CLOUD)
+    joining = LinkSituation(NOW_S, STANDING, (TRAFFIC,), NO_LINK, IN_CONTACT, CLOUD)
     ((kind, choice),) = decision_records(actions(joining), joining)
     assert kind == "choice"
     assert choice == {

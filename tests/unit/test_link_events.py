@@ -88,12 +88,12 @@ async def test_link_state_at_start_has_no_event(events: LinkEventRecorder, poste
 async def test_flapping_link_has_few_events(
     events: LinkEventRecorder, posted: Recorder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(link_events, "PERIOD_S", 1e6)
+    monkeypatch.setattr(link_events, "LINK_EVENT_PERIOD_S", 1e6)
     await see(events, report())
     for flap in range(50):
         await see(events, replace(DIRECT, switches=2 * flap + 1), report(switches=2 * flap + 2))
     assert posted.events == [("u1", "LinkUp"), ("u1", "TrafficDirect")]
-    monkeypatch.setattr(link_events, "PERIOD_S", 0.0)
+    monkeypatch.setattr(link_events, "LINK_EVENT_PERIOD_S", 0.0)
     await events.reconcile(KEY)
     assert posted.events[2:] == [("u1", "TrafficCloud"), ("u1", "LinkDown")]
 
@@ -101,7 +101,7 @@ async def test_flapping_link_has_few_events(
 async def test_delayed_link_event_is_posted_later(
     events: LinkEventRecorder, posted: Recorder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(link_events, "PERIOD_S", 0.2)
+    monkeypatch.setattr(link_events, "LINK_EVENT_PERIOD_S", 0.2)
     await see(events, report(), DIRECT, report(switches=2))
     running = asyncio.create_task(events.work_queue.run())
     async with asyncio.timeout(20.0):

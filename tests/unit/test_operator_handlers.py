@@ -9,7 +9,7 @@ from typing import Any
 
 import kopf
 import pytest
-from fractus_operator.handlers import Connection, InMemoryProgress
+from fractus_operator.handlers import InMemoryProgress, KopfConnection
 from kopf._core.actions.execution import Outcome
 from kopf._core.actions.progression import State
 
@@ -69,6 +69,6 @@ def test_kopf_accepts_api_servers_without_authority_key_identifier(monkeypatch: 
         return context
 
     monkeypatch.setattr(ssl, "create_default_context", strict_context)
-    context = Connection(server="https://127.0.0.1:6443").as_ssl_context()
+    context = KopfConnection(server="https://127.0.0.1:6443").as_ssl_context()
     assert not context.verify_flags & ssl.VERIFY_X509_STRICT
     assert context.verify_mode is ssl.CERT_REQUIRED

@@ -7,11 +7,11 @@ from types import SimpleNamespace
 from typing import cast
 
 import pytest
-from fractus_operator import metrics
+from fractus_operator import operator_metrics
 from fractus_operator.application_controller import ApplicationController, BeingDeleted
 from fractus_operator.cache import ClusterCache
 from fractus_operator.kinds import Key
-from fractus_operator.metrics import MetricsSource
+from fractus_operator.operator_metrics import MetricsSource
 from fractus_operator.store import KubeError
 from fractus_operator.work_queue import Subscriptions, WorkQueue
 from fractus_runtime.metrics import metrics_text
@@ -30,7 +30,7 @@ def failures(kind: str, reason: str) -> float:
 
 
 def test_every_metric_is_documented() -> None:
-    with metrics.reconciling("application"), metrics.phase("plan"):
+    with operator_metrics.reconciling("application"), operator_metrics.phase("plan"):
         pass
     text = metrics_text(source().collect()).decode()
     assert_documented(text, "Operator")

@@ -13,7 +13,7 @@ from fractus_core.api import Application
 from fractus_core.api.plans import DeploymentPlanSpec
 from fractus_core.planning.inventory import Inventory, Settings
 from fractus_operator import route_check_cache
-from fractus_operator.metrics import ERRORS
+from fractus_operator.operator_metrics import ERRORS
 from fractus_operator.route_check_cache import RouteCheckCache
 
 KEY = ("ns", "a")

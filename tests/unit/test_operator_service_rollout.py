@@ -15,7 +15,7 @@ from fractus_operator.kinds import GRANT
 from fractus_operator.mission_condition import MissionConditionController
 from fractus_operator.node_conditions import NodeConditionWriter
 from fractus_operator.node_liveness import NodeLivenessController, ObservationClock, StaleNodeDetector
-from fractus_operator.node_services import NodeServices, Revision, parse_revision
+from fractus_operator.node_services import NodeServicePods, Revision, parse_revision
 from fractus_operator.pods import PodView, parse_pod
 from fractus_operator.service_rollout import ServiceRollout, ServicesOfNode, next_step
 from fractus_operator.store import KubeError, Store
@@ -104,7 +104,7 @@ def test_one_of_twenty_nodes_is_replaced_at_a_time_in_large_fleet() -> None:
 
 
 def test_latest_revision_has_highest_number() -> None:
-    services = NodeServices("fractus-system")
+    services = NodeServicePods("fractus-system")
     old = pod(revision="old")
     new = pod(revision="new")
     for one in (old, new):
@@ -125,7 +125,7 @@ def test_latest_revision_has_highest_number() -> None:
 
 
 def test_only_changed_nodes_are_returned() -> None:
-    services = NodeServices("fractus-system")
+    services = NodeServicePods("fractus-system")
     for one in (pod("d1"), pod("d2")):
         services.pod_changed((one.namespace, one.name), None, one)
     assert services.take_changed() == {"d1", "d2"}
@@ -140,7 +140,7 @@ def test_only_changed_nodes_are_returned() -> None:
 
 
 def test_other_pods_and_revisions_are_ignored() -> None:
-    services = NodeServices("fractus-system")
+    services = NodeServicePods("fractus-system")
     for other in (pod(ownerReferences=[]), pod(namespace="default")):
         services.pod_changed((other.namespace, other.name), None, other)
     assert not len(services)

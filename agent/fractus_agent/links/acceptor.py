@@ -15,7 +15,7 @@ from pathlib import Path
 from fractus_agent.links.pairing import (
     HANDSHAKE_TIMEOUT_S,
     MAX_LINE_BYTES,
-    PORT,
+    PAIRING_PORT,
     LinkLost,
     PairingFailed,
     Session,
@@ -28,7 +28,7 @@ log = logging.getLogger(__name__)
 MAX_PENDING = 8
 """Limit of concurrent handshakes: each costs a signature, and anyone in range can start one."""
 
-ACCEPT_RETRY_S = 0.2
+_ACCEPT_RETRY_S = 0.2
 
 
 class Acceptor:
@@ -73,7 +73,7 @@ class Acceptor:
         """
         server_context(self._directory)
         loop = asyncio.get_running_loop()
-        with socket.create_server((str(address), PORT), backlog=MAX_PENDING) as listener:
+        with socket.create_server((str(address), PAIRING_PORT), backlog=MAX_PENDING) as listener:
             listener.setblocking(False)
             try:
                 while True:
@@ -81,7 +81,7 @@ class Acceptor:
                         connection, _ = await loop.sock_accept(listener)
                     except OSError as error:  # too many open files, or the peer has closed the connection
                         log.warning("links: connection not accepted (error=%s)", error)
-                        await asyncio.sleep(ACCEPT_RETRY_S)
+                        await asyncio.sleep(_ACCEPT_RETRY_S)
                         continue
                     self._start(connection)
             finally:

@@ -7,13 +7,13 @@ from typing import Any
 
 from fractus_core.linking import PathMetrics
 
-from fractus_agent.links.decisions import LinkActions, Situation
+from fractus_agent.links.decisions import LinkActions, LinkSituation
 
 AuditRecorder = Callable[[str, dict[str, Any]], None]
 """Writes an audit record: kind and content."""
 
 
-def decision_records(actions: LinkActions, situation: Situation) -> Iterator[tuple[str, dict[str, Any]]]:
+def decision_records(actions: LinkActions, situation: LinkSituation) -> Iterator[tuple[str, dict[str, Any]]]:
     """Yield the records of a decision: a change of peer (`choice`), and each change of an application's path (`traffic`).
 
     Args:

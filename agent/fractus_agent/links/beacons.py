@@ -15,9 +15,9 @@ from fractus_core.api.names import is_subdomain
 
 log = logging.getLogger(__name__)
 
-PORT = 46810
-INTERVAL_S = 0.5
-MAX_BYTES = 512
+BEACON_PORT = 46810
+BEACON_INTERVAL_S = 0.5
+MAX_BEACON_BYTES = 512
 SO_BINDTODEVICE = 25
 
 
@@ -32,7 +32,7 @@ def beacon_socket(device: str) -> socket.socket:
         beacons.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         beacons.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
         beacons.setsockopt(socket.SOL_SOCKET, SO_BINDTODEVICE, device.encode() + b"\0")
-        beacons.bind(("", PORT))
+        beacons.bind(("", BEACON_PORT))
     except OSError:
         beacons.close()
         raise
@@ -69,7 +69,7 @@ class Beacons(asyncio.DatagramProtocol):
 
     def datagram_received(self, data: bytes, _addr: object) -> None:
         """Handle a received beacon."""
-        node = decode(data[:MAX_BYTES])
+        node = decode(data[:MAX_BEACON_BYTES])
         if node is not None and node != self._node:
             self._on_beacon(node)
 
@@ -86,12 +86,12 @@ class Beacons(asyncio.DatagramProtocol):
                 transport, _ = await loop.create_datagram_endpoint(lambda: self, sock=beacon_socket(device))
             except OSError as error:
                 log.debug("links: beacons not started (device=%s error=%s)", device, error)
-                await asyncio.sleep(INTERVAL_S)
+                await asyncio.sleep(BEACON_INTERVAL_S)
                 continue
             self._broken.clear()
             try:
                 while not self._broken.is_set():
-                    transport.sendto(encode(self._node), ("255.255.255.255", PORT))
-                    await asyncio.sleep(INTERVAL_S)
+                    transport.sendto(encode(self._node), ("255.255.255.255", BEACON_PORT))
+                    await asyncio.sleep(BEACON_INTERVAL_S)
             finally:
                 transport.close()

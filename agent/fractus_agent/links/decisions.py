@@ -47,7 +47,7 @@ class ApplicationTraffic:
 
 
 @dataclass(frozen=True, slots=True)
-class Situation:
+class LinkSituation:
     """All inputs of a decision.
 
     Attributes:
@@ -93,7 +93,7 @@ class LinkActions:
     targets: Mapping[str, PathDecision]
 
 
-def decide(situation: Situation, settings: LinkSettings) -> LinkActions:
+def decide(situation: LinkSituation, settings: LinkSettings) -> LinkActions:
     """Decide on the peer of the link and on the paths of all traffic. The same situation gives the same actions.
 
     The drone has one link, so the traffic of the first application by name decides on its peer. Other applications
@@ -123,7 +123,7 @@ def decide(situation: Situation, settings: LinkSettings) -> LinkActions:
     return LinkActions(abrupt, planned, link.peer, link, targets)
 
 
-def _decide_peer(situation: Situation, settings: LinkSettings) -> LinkDecision:
+def _decide_peer(situation: LinkSituation, settings: LinkSettings) -> LinkDecision:
     link = situation.link
     present = link.peer if link.phase is not LinkPhase.NONE else ""
     deciding = next((traffic for traffic in situation.traffic if traffic.peers), None)
@@ -147,7 +147,7 @@ def _decide_peer(situation: Situation, settings: LinkSettings) -> LinkDecision:
     return decision
 
 
-def _is_candidate(peer: Peer, track: Track, situation: Situation) -> bool:
+def _is_candidate(peer: Peer, track: Track, situation: LinkSituation) -> bool:
     """Return True if a peer is linked, has sent a recent beacon, or is too far away for beacons."""
     if peer.name == situation.link.peer and situation.link.phase is not LinkPhase.NONE:
         return True
@@ -156,14 +156,14 @@ def _is_candidate(peer: Peer, track: Track, situation: Situation) -> bool:
     return not silent or math.dist(track.position, peer.position) > peer.range_m * learned.range_factor
 
 
-def _current_path_works(service: Endpoint, situation: Situation) -> bool:
+def _current_path_works(service: Endpoint, situation: LinkSituation) -> bool:
     target = situation.redirects.get(service)
     if target is None:
         return situation.cloud is not None
     return target in situation.routes.values()
 
 
-def _leaves_range(situation: Situation, settings: LinkSettings) -> bool:
+def _leaves_range(situation: LinkSituation, settings: LinkSettings) -> bool:
     peers = {peer.name: peer for traffic in situation.traffic for peer in traffic.peers}
     peer = peers.get(situation.link.peer)
     if situation.track is None or peer is None:
@@ -173,7 +173,7 @@ def _leaves_range(situation: Situation, settings: LinkSettings) -> bool:
 
 
 def _decide_path(
-    traffic: ApplicationTraffic, situation: Situation, leaving: bool, settings: LinkSettings
+    traffic: ApplicationTraffic, situation: LinkSituation, leaving: bool, settings: LinkSettings
 ) -> PathDecision:
     is_direct = any(service in situation.redirects for service in traffic.services)
     served = not traffic.services.isdisjoint(situation.routes)

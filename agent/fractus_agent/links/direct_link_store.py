@@ -14,7 +14,7 @@ from fractus_core.api.model import InvalidObject
 from fractus_runtime.files import remove_file, write_file
 
 from fractus_agent.redirector.nft_maps import Endpoint
-from fractus_agent.store import Changed, Deleted, Event, LinkEnd, Listed, Object, Store
+from fractus_agent.store import Changed, Deleted, LinkEnd, Listed, Object, Store, WatchEvent
 
 log = logging.getLogger(__name__)
 
@@ -67,7 +67,7 @@ class DirectLinkStore:
             log.info("links: restored from disk (links=%d)", len(self._links))
             self._on_change()
 
-    def apply(self, event: Event) -> None:
+    def apply(self, event: WatchEvent) -> None:
         """Apply one watch event."""
         match event:
             case Listed(bodies):

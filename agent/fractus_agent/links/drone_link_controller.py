@@ -33,7 +33,7 @@ from fractus_core.linking import (
 from fractus_agent.links.audit_records import AuditRecorder, decision_records
 from fractus_agent.links.connection_drain import ConnectionDrain
 from fractus_agent.links.connector import Connector
-from fractus_agent.links.decisions import ApplicationTraffic, LinkActions, Situation, decide
+from fractus_agent.links.decisions import ApplicationTraffic, LinkActions, LinkSituation, decide
 from fractus_agent.links.device_addresses import link_address
 from fractus_agent.links.direct_link_store import allowed_callers, route_key, virtual_endpoints
 from fractus_agent.links.link_status import DroneLinkReport
@@ -180,12 +180,12 @@ class DroneLinkController:
         finally:
             self._closing = False
 
-    def _situation(self) -> Situation:
+    def _situation(self) -> LinkSituation:
         now_s = time.monotonic()
         track, peers = self._track_and_peers()
         self._range_model.position = track.position if track is not None else None
         self._range_model.peers = peers
-        return Situation(
+        return LinkSituation(
             now_s=now_s,
             track=track,
             traffic=tuple(self._traffic(peers)),
@@ -304,7 +304,7 @@ class DroneLinkController:
                 self._range_model.on_pairing_failed(previous.peer, now_s)
         self._wake.set()
 
-    def _log_decision(self, actions: LinkActions, situation: Situation) -> None:
+    def _log_decision(self, actions: LinkActions, situation: LinkSituation) -> None:
         """Write one log line and one audit record for each decision that changes something."""
         changes = {"link": f"{actions.link.code}: {actions.link.reason}"} if actions.link.changes else {}
         for application, decision in actions.targets.items():
@@ -315,7 +315,7 @@ class DroneLinkController:
         for kind, content in decision_records(actions, situation):
             self._record(kind, content)
 
-    def _send_report(self, actions: LinkActions, situation: Situation) -> None:
+    def _send_report(self, actions: LinkActions, situation: LinkSituation) -> None:
         self._report(
             DroneLinkReport(
                 links=self._links,

@@ -44,9 +44,9 @@ SUPPLICANT = Path("/run/wpa_supplicant")
 DEVICES = Path("/sys/class/net")
 AUDIT_LOG = "links.jsonl"
 """File name of the audit log of direct links."""
-CHECK_INTERVAL_S = 2.0
+INTERFACE_CHECK_INTERVAL_S = 2.0
 """Seconds between checks of the interface, because its device may disappear and come back without its address."""
-RETRY_S = 5.0
+_RETRY_S = 5.0
 
 
 class LinkManager:
@@ -143,21 +143,23 @@ class LinkManager:
             if interface is None or not self._direct_links.links:
                 clean = clean or await _clean_up(interface, self._node)
                 with suppress(TimeoutError):
-                    await asyncio.wait_for(self._changed.wait(), RETRY_S)
+                    await asyncio.wait_for(self._changed.wait(), _RETRY_S)
                 continue
             using = asyncio.create_task(self._use(interface))
             try:
                 while not using.done() and self._is_needed() and self._interface() == interface:
                     self._changed.clear()
                     changed = asyncio.create_task(self._changed.wait())
-                    await asyncio.wait({using, changed}, timeout=CHECK_INTERVAL_S, return_when=asyncio.FIRST_COMPLETED)
+                    await asyncio.wait(
+                        {using, changed}, timeout=INTERFACE_CHECK_INTERVAL_S, return_when=asyncio.FIRST_COMPLETED
+                    )
                     changed.cancel()
             finally:
                 using.cancel()
                 await asyncio.gather(using, return_exceptions=True)
             if not using.cancelled() and (error := using.exception()) is not None:
                 self._set_problem("Failed", f"direct links failed, retrying: {_first_error(error)}")
-                await asyncio.sleep(RETRY_S)
+                await asyncio.sleep(_RETRY_S)
 
     def _is_needed(self) -> bool:
         """Return True if links are planned, or if a linked drone has not moved its traffic back yet."""
@@ -182,7 +184,7 @@ class LinkManager:
     async def _run_interface(self, interface: Interface, record: AuditRecorder) -> None:
         """Create the table, bring the interface up and run the link controller. Remove everything at the end."""
         assert interface.device is not None
-        ports = ruleset.Ports(udp=beacons.PORT, tcp=pairing.PORT)
+        ports = ruleset.Ports(udp=beacons.BEACON_PORT, tcp=pairing.PAIRING_PORT)
         is_drone = self._end == "drone"
         controller = _interface_controller(interface, self._node)
         # The packet filter closes the device before it gets an address. If the device is not usable, it is left alone,
@@ -206,7 +208,7 @@ class LinkManager:
         async def keep_interface_up() -> None:
             nonlocal controller, device
             while device == ruleset.NO_DEVICE:
-                await asyncio.sleep(CHECK_INTERVAL_S)
+                await asyncio.sleep(INTERFACE_CHECK_INTERVAL_S)
                 # The device must exist to find out if it is a radio.
                 controller = _interface_controller(interface, self._node)
                 if await self._check_usable(controller):
@@ -295,7 +297,7 @@ class LinkManager:
                 self._set_problem(problem.reason, str(problem))
             else:
                 self._set_problem("", "")
-            await asyncio.sleep(CHECK_INTERVAL_S)
+            await asyncio.sleep(INTERFACE_CHECK_INTERVAL_S)
 
     def _set_problem(self, reason: str, message: str) -> None:
         problem = (reason, message) if reason else None

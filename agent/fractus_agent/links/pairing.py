@@ -18,7 +18,7 @@ from typing import Any
 
 from fractus_core.api.names import node_identity, node_server_name
 
-PORT = 46811
+PAIRING_PORT = 46811
 HANDSHAKE_TIMEOUT_S = 3.0
 HEARTBEAT_S = 0.1
 LOSS_TIMEOUT_S = 0.6
@@ -29,7 +29,7 @@ MAX_LINE_BYTES = 64 * 1024
 PROBE_BYTES = (6_000, 12_000, 24_000, 48_000)
 """Sizes of the bursts of a probe. The next size is used only if the previous burst was so fast that the larger one cannot
 delay heartbeats. Otherwise the same size is repeated, because one burst may have competed with a picture."""
-PROBE_TIMEOUT_S = 2.0
+ACKNOWLEDGEMENT_TIMEOUT_S = 2.0
 BURST_LIMIT_S = 0.15
 SMOOTHING = 0.2
 
@@ -186,7 +186,7 @@ class Session:
             begin_s = time.monotonic()
             await self.send({"probe": "x" * size})
             try:
-                async with asyncio.timeout(PROBE_TIMEOUT_S):
+                async with asyncio.timeout(ACKNOWLEDGEMENT_TIMEOUT_S):
                     await self._probe_acknowledged
             except TimeoutError as error:
                 raise LinkLost(f"{self.peer} does not acknowledge probes") from error
@@ -232,7 +232,7 @@ async def pair(node: str, peer: str, address: IPv4Address, directory: Path, link
     try:
         async with asyncio.timeout(HANDSHAKE_TIMEOUT_S):
             reader, writer = await asyncio.open_connection(
-                str(address), PORT, ssl=client_context(directory), server_hostname=node_server_name(peer),
+                str(address), PAIRING_PORT, ssl=client_context(directory), server_hostname=node_server_name(peer),
                 limit=MAX_LINE_BYTES,
             )  # fmt: skip
     except ssl.SSLCertVerificationError as error:

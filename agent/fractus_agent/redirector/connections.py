@@ -25,8 +25,8 @@ from fractus_agent.redirector.netlink import (
     NetlinkError,
     attribute,
     attributes,
+    encode_message,
     in_namespace,
-    message,
 )
 from fractus_agent.redirector.nft_maps import MARK_BASE, MARK_MASK, Endpoint
 
@@ -140,7 +140,7 @@ class TcpSockets:
         """
         request = _REQUEST.pack(connection.family, socket.IPPROTO_TCP, 1 << (_TCP_INFO - 1), _STATES)
         sequence = self._netlink.sequence()
-        self._netlink.send(message(_BY_FAMILY, 0, sequence, request + connection.identity))
+        self._netlink.send(encode_message(_BY_FAMILY, 0, sequence, request + connection.identity))
         while True:
             for kind, number, body in self._netlink.receive():
                 if number != sequence:
@@ -162,7 +162,7 @@ class TcpSockets:
         """
         request = _REQUEST.pack(connection.family, socket.IPPROTO_TCP, 0, _STATES) + connection.identity
         sequence = self._netlink.sequence()
-        self._netlink.send(message(_DESTROY, NLM_F_ACK, sequence, request))
+        self._netlink.send(encode_message(_DESTROY, NLM_F_ACK, sequence, request))
         try:
             self._netlink.acknowledged({sequence}, ignore=frozenset({errno.ENOENT}))
         except NetlinkError as error:
@@ -316,5 +316,5 @@ class Conntrack:
         body = struct.pack(">BBH", socket.AF_INET, 0, 0)
         body += attribute(_CONNTRACK_MARK, struct.pack(">I", mark))
         body += attribute(_CONNTRACK_MARK_MASK, struct.pack(">I", mask))
-        self._netlink.send(message(_CONNTRACK_DELETE, NLM_F_ACK, sequence, body))
+        self._netlink.send(encode_message(_CONNTRACK_DELETE, NLM_F_ACK, sequence, body))
         self._netlink.acknowledged({sequence}, ignore=frozenset({errno.ENOENT}))

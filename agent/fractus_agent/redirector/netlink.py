@@ -62,7 +62,7 @@ def attributes(data: bytes) -> Iterator[tuple[int, bytes]]:
         data = data[(length + 3) & ~3 :]
 
 
-def message(kind: int, flags: int, sequence: int, payload: bytes) -> bytes:
+def encode_message(kind: int, flags: int, sequence: int, payload: bytes) -> bytes:
     """Encode a message with its header."""
     return _HEADER.pack(_HEADER.size + len(payload), kind, flags | NLM_F_REQUEST, sequence, 0) + payload
 
@@ -158,7 +158,7 @@ class Netlink:
             NetlinkError: The kernel refused the request, or stopped responding.
         """
         sequence = self.sequence()
-        self.send(message(kind, NLM_F_DUMP, sequence, payload))
+        self.send(encode_message(kind, NLM_F_DUMP, sequence, payload))
         while True:
             for response_kind, number, body in self.receive():
                 if number != sequence:

@@ -23,7 +23,7 @@ from fractus_agent.redirector.netlink import (
     NetlinkError,
     attribute,
     attributes,
-    message,
+    encode_message,
     nested,
 )
 
@@ -192,10 +192,10 @@ class NftMaps:
     def _transact(self, changes: Sequence[tuple[int, bytes]]) -> None:
         numbered = [(kind, self._netlink.sequence(), body) for kind, body in changes]
         fence = struct.pack(">BBH", socket.AF_UNSPEC, 0, _SUBSYSTEM >> 8)
-        batch = [message(kind, NLM_F_ACK | NLM_F_CREATE, number, body) for kind, number, body in numbered]
+        batch = [encode_message(kind, NLM_F_ACK | NLM_F_CREATE, number, body) for kind, number, body in numbered]
         first = self._netlink.sequence()
-        begin = message(_BEGIN, 0, first, fence)
-        end = message(_END, 0, self._netlink.sequence(), fence)
+        begin = encode_message(_BEGIN, 0, first, fence)
+        end = encode_message(_END, 0, self._netlink.sequence(), fence)
         self._netlink.send(b"".join((begin, *batch, end)))
         self._netlink.acknowledged({number for _, number, _ in numbered}, refusals=frozenset({first}))
 

@@ -40,7 +40,7 @@ class NodeObjectFile:
 
     def write(self, resource: Drone | EdgeNode) -> None:
         """Write the object."""
-        content = serialize(resource)
+        content = serialize_node_object(resource)
         problem = self._camera_problem(resource)
         try:
             if not self._path.exists() or self._path.read_bytes() != content:
@@ -87,7 +87,7 @@ class NodeObjectFile:
         )
 
 
-def serialize(resource: Drone | EdgeNode) -> bytes:
+def serialize_node_object(resource: Drone | EdgeNode) -> bytes:
     """Serialize the manifest for the services.
 
     Defaults are left out, so that a newer agent does not write fields that older services do not know. Characters above

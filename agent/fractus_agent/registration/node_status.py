@@ -84,7 +84,7 @@ class NodeObservation:
     recording_problems: Sequence[str] = ()
 
 
-def readiness(observed: NodeObservation) -> ConditionUpdate:
+def ready_condition(observed: NodeObservation) -> ConditionUpdate:
     """Return the condition Ready: true if components can work on the node, otherwise with the first problem."""
 
     def unready(reason: str, message: str) -> ConditionUpdate:
@@ -119,7 +119,7 @@ def node_status(observed: NodeObservation, previous: Object, generation: int | N
         generation: metadata.generation of the object, None if unknown.
         now: Wall clock time.
     """
-    conditions = [readiness(observed), observed.certified]
+    conditions = [ready_condition(observed), observed.certified]
     optional = (
         observed.described,
         observed.camera_described,

@@ -24,7 +24,7 @@ from fractus_agent.supervisor import repeat
 log = logging.getLogger(__name__)
 
 HASH_ANNOTATION = f"{GROUP}/description-hash"
-CHECK_INTERVAL_S = 10.0
+DESCRIPTION_CHECK_INTERVAL_S = 10.0
 """Seconds between checks of the description on the node."""
 RESYNC_INTERVAL_S = 300.0
 """Seconds between reads of the object. Each status write returns the object as well."""
@@ -109,7 +109,7 @@ class Registration:
                 self._stamp = None  # the next check repeats the registration even if the file stays the same
                 raise
             self._resync_s = now_s + RESYNC_INTERVAL_S
-        return CHECK_INTERVAL_S
+        return DESCRIPTION_CHECK_INTERVAL_S
 
     def on_status_written(self, body: Object | None) -> None:
         """Handle the object that a status write returned, None if it does not exist."""

@@ -33,7 +33,7 @@ PHASES = Histogram(
     buckets=_SECONDS,
 )
 
-Phase = Literal["observe", "plan", "grants", "rollout", "routes"]
+DeployPhase = Literal["observe", "plan", "grants", "rollout", "routes"]
 
 
 @contextmanager
@@ -52,7 +52,7 @@ def reconciling(kind: str) -> Iterator[None]:
 
 
 @contextmanager
-def phase(name: Phase) -> Iterator[None]:
+def phase(name: DeployPhase) -> Iterator[None]:
     """Measure a phase of deploying an Application."""
     with PHASES.labels(name).time():
         yield

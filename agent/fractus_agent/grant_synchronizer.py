@@ -59,7 +59,7 @@ class GrantDirectory:
     def contains(self, grant: Grant) -> bool:
         """Return True if exactly this Grant is stored."""
         try:
-            return self.read(grant.name) == serialize(grant)
+            return self.read(grant.name) == serialize_grant(grant)
         except FileNotFoundError:
             return False
 
@@ -75,7 +75,7 @@ class GrantDirectory:
         """Store a Grant. Return False if it was stored already."""
         if self.contains(grant):
             return False
-        write_file(self._file(grant.name), serialize(grant))
+        write_file(self._file(grant.name), serialize_grant(grant))
         return True
 
     def remove(self, name: str) -> bool:
@@ -86,7 +86,7 @@ class GrantDirectory:
         return self._path / f"{name}.json"
 
 
-def serialize(grant: Grant) -> bytes:
+def serialize_grant(grant: Grant) -> bytes:
     """Serialize the manifest for the services, without the fields that change with the status.
 
     Defaults are left out, so that a newer agent does not write fields that older services do not know.

@@ -38,7 +38,7 @@ def test_uninstall_is_refused_while_an_application_exists(kube: Kube) -> None:
         done = helm(kube, "uninstall", "fractus", "--timeout", "60s")
         assert done.returncode != 0
         log = kube.must("logs", "job/fractus-uninstall", "-n", SYSTEM)
-        assert "take down default/kept: delete all Applications first" in log
+        assert "Fractus still runs default/kept: delete all Applications first" in log
         assert kube.get("deployment", "fractus-operator", SYSTEM)
         assert kube.get("daemonset", "fractus-mobility", SYSTEM)
     finally:

@@ -343,7 +343,7 @@ class Store:
 
     async def is_reachable(self, timeout_s: float) -> bool:
         """Return True if the API server responds within the timeout. A refusal counts as a response."""
-        return await self._client.answers(timeout_s)
+        return await self._client.responds(timeout_s)
 
     async def close(self) -> None:
         """Close the connections."""

@@ -34,7 +34,7 @@ from fractus_runtime.files import remove_temporary, write_file
 log = logging.getLogger(__name__)
 
 SYNC_INTERVAL_S = 0.5
-"""Maximum delay of entries that are not urgent, so that one fsync serves several entries."""
+"""Maximum delay of entries that are not urgent. The delay allows one fsync for several entries."""
 
 MAX_SEGMENT_BYTES = 16_000_000
 """Size at which a file is closed. The chain continues in the next file."""
@@ -52,20 +52,20 @@ HANG_TIMEOUT_S = 2.0
 """Duration after which a pending write counts as a failure, until it returns."""
 
 
-def _plain(value: Any) -> Any:
-    """Return a value for JSON, with NaN and infinities as text."""
+def _finite_json(value: Any) -> Any:
+    """Return a value with NaN and infinities as text, because JSON has no such numbers."""
     if isinstance(value, float) and not math.isfinite(value):
         return str(value)
     if isinstance(value, dict):
-        return {key: _plain(inner) for key, inner in value.items()}
+        return {key: _finite_json(inner) for key, inner in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(inner) for inner in value]
+        return [_finite_json(inner) for inner in value]
     return value
 
 
 @dataclass(frozen=True, slots=True)
 class _PendingEntry:
-    """An entry that is not on disk yet. Its sequence number and hash are computed when it is written."""
+    """An entry that is not on disk yet. The sequence number and the hash are computed when the entry is written."""
 
     time: str
     kind: str
@@ -88,7 +88,7 @@ class AuditLog:
         segment_bytes: Size at which the file is closed and the next one begins.
         keep: Number of closed segments to keep.
         tls: Directory of the node's key and certificate, which sign checkpoints. None for a log without checkpoints.
-        on_entry: Called with each entry, including time and kind, before the entry is in the chain. Must not block.
+        on_entry: Called with each entry, including time and kind, before the entry is written. Must not block.
     """
 
     def __init__(
@@ -124,7 +124,7 @@ class AuditLog:
         self._lock: int | None = None
         torn = 0
         with contextlib.suppress(OSError):  # a read-only disk is reported when the first entry is written
-            whole, size = _whole_lines(path)
+            whole, size = _complete_length(path)
             torn = size - whole
             self._sound_bytes = whole if torn else None
             path.touch(0o640)  # so that verification detects a missing file
@@ -158,12 +158,12 @@ class AuditLog:
         Args:
             kind: Kind of the entry: call, takeover, control, grant, state, ...
             content: JSON values.
-            now: True to write the entry to disk without waiting for further entries.
+            now: True to write the entry to disk at once, False to wait for further entries.
 
         Raises:
             TypeError: The content contains values that JSON does not have.
         """
-        entry = _PendingEntry(self._moment(), kind, _plain(content))
+        entry = _PendingEntry(self._timestamp(), kind, _finite_json(content))
         # Raises in the caller instead of the thread if the content is not JSON.
         canonical(entry.content)
         self._on_entry({"time": entry.time, "kind": kind, **entry.content})
@@ -180,7 +180,7 @@ class AuditLog:
         self.append("grant", {"change": "refused", "name": name, "reason": reason})
 
     def clock_stepped(self, step_s: float, trusted: bool) -> None:
-        """Record a step of the clock that entries take their time from."""
+        """Record a step of the clock that gives entries their time."""
         self.append("clock", {"step_s": round(step_s, 3), "trusted": trusted})
 
     async def close(self) -> None:
@@ -211,7 +211,7 @@ class AuditLog:
                 self._urgent = False
             written = not batch or self._flush(batch)
             if written and batch:
-                self._take_off(len(batch))
+                self._dequeue(len(batch))
                 self._tidy()
             with self._changed:
                 ended = closing and (not written or not self._waiting)
@@ -220,13 +220,13 @@ class AuditLog:
             if ended:
                 return
 
-    def _take_off(self, written: int) -> None:
-        """Remove written entries from the queue, and record the number of entries that were lost while it was full."""
+    def _dequeue(self, written: int) -> None:
+        """Remove written entries from the queue. If entries were lost while the queue was full, record their number."""
         with self._changed:
             for _ in range(written):
                 self._waiting.popleft()
             if self._lost:
-                self._waiting.append(_PendingEntry(self._moment(), "lost", {"entries": self._lost}))
+                self._waiting.append(_PendingEntry(self._timestamp(), "lost", {"entries": self._lost}))
                 self._lost = 0
                 self._urgent = True
 
@@ -266,7 +266,7 @@ class AuditLog:
             self._busy_since_s = None
 
     def _until_checkpoint_s(self) -> float | None:
-        """Return the seconds until the next checkpoint, or None if there is nothing to sign or no key."""
+        """Return the seconds until the next checkpoint, or None if there is no key or no new entry."""
         if self._tls is None or self._end in (ChainEntry(), self._signed):
             return None
         due_s = self._checkpoint_due_s
@@ -281,7 +281,7 @@ class AuditLog:
         self._checkpoint_due_s = time.monotonic() + CHECKPOINT_INTERVAL_S
         self._busy_since_s = time.monotonic()
         try:
-            content = sign_checkpoint(self._path.stem, self._end, self._moment(), self._tls)
+            content = sign_checkpoint(self._path.stem, self._end, self._timestamp(), self._tls)
             write_file(self._checkpoint, content, 0o640, durable=False)
             self._signed = self._end
         except FileNotFoundError:
@@ -301,17 +301,17 @@ class AuditLog:
             return
         content = {"first": first_sequence(surplus[0]), "last": end.sequence, "last_hash": end.hash}
         with self._changed:
-            self._waiting.append(_PendingEntry(self._moment(), PRUNED, content))
+            self._waiting.append(_PendingEntry(self._timestamp(), PRUNED, content))
             self._urgent = True
         self._pruned = list(surplus)
 
-    def _moment(self) -> str:
+    def _timestamp(self) -> str:
         return datetime.fromtimestamp(self._clock(), UTC).isoformat(timespec="milliseconds")
 
     def _store(self, data: bytes) -> None:
         """Append bytes and wait until they are on disk. On failure, restore the file, because half an entry breaks the chain.
 
-        If a failed attempt or a crash left bytes that could not be removed, they are removed before the next attempt.
+        Bytes that an earlier failure or a crash left are removed first.
         """
         file = os.open(self._path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o640)
         try:
@@ -319,9 +319,9 @@ class AuditLog:
                 os.ftruncate(file, self._sound_bytes)
             self._sound_bytes = size = os.fstat(file).st_size
             try:
-                left = memoryview(data)
-                while left:
-                    left = left[os.write(file, left) :]
+                rest = memoryview(data)
+                while rest:
+                    rest = rest[os.write(file, rest) :]
                 os.fsync(file)
             except OSError:
                 os.ftruncate(file, size)
@@ -351,7 +351,7 @@ def _first_entry(path: Path) -> int:
 
 
 def _acquire(path: Path) -> tuple[int, int | None, ChainEntry]:
-    """Become the only writer of a log.
+    """Lock a log for this process as its only writer.
 
     Returns:
         The lock, the length of the complete lines if the last line is incomplete, and the last entry.
@@ -361,7 +361,7 @@ def _acquire(path: Path) -> tuple[int, int | None, ChainEntry]:
     """
     lock = _locked(path.with_name(f".{path.stem}.lock"))
     try:
-        whole, size = _whole_lines(path)
+        whole, size = _complete_length(path)
         return lock, whole if size > whole else None, _end_of_chain(path)
     except OSError:
         os.close(lock)
@@ -379,25 +379,25 @@ def _locked(path: Path) -> int:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError as error:
         os.close(lock)
-        taken = isinstance(error, BlockingIOError)
-        raise OSError(error.errno, "another process writes this log") if taken else error from None
+        locked_by_other = isinstance(error, BlockingIOError)
+        raise OSError(error.errno, "another process writes this log") if locked_by_other else error from None
     return lock
 
 
 def _chained(batch: Iterable[_PendingEntry], end: ChainEntry) -> tuple[bytes, ChainEntry]:
     """Return entries as lines that continue the chain, and the new last entry."""
     lines = []
-    for waiting in batch:
+    for pending in batch:
         sequence = end.sequence + 1
-        known = {"time": waiting.time, "boot_s": waiting.boot_s, "kind": waiting.kind}
-        entry = {"seq": sequence, **known, **waiting.content, "prev": end.hash}
+        header = {"time": pending.time, "boot_s": pending.boot_s, "kind": pending.kind}
+        entry = {"seq": sequence, **header, **pending.content, "prev": end.hash}
         entry["hash"] = digest(entry)
         end = ChainEntry(sequence, entry["hash"])
         lines.append(canonical(entry) + b"\n")
     return b"".join(lines), end
 
 
-def _whole_lines(path: Path) -> tuple[int, int]:
+def _complete_length(path: Path) -> tuple[int, int]:
     """Return the length of the complete lines of a file, and its size. A crash may leave an incomplete last line."""
     try:
         size = path.stat().st_size

@@ -1,4 +1,4 @@
-"""Hash chain of an audit log: entries, segments, and verification."""
+"""Files of an audit log: hash chain, segments and verification. Needs no key and no writer."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class ChainEntry:
 
 
 def last_entry(path: Path) -> ChainEntry | None:
-    """Return the last entry of a file, or None if there is no entry. An incomplete last line is skipped.
+    """Return the last entry of a file, or None if the file has no entry. An incomplete last line is skipped.
 
     Raises:
         ValueError: The last complete line is not an audit entry.
@@ -121,9 +121,9 @@ class Finding:
     Attributes:
         entries: Number of valid entries.
         line: Number of the first invalid line, 0 if all lines are valid.
-        problem: Description of the problem, which follows "line N". Empty if all lines are valid.
+        problem: Problem of that line, worded to follow "line N". Empty if all lines are valid.
         torn: True if the last line is incomplete, because of a crash or because it is being written.
-        before: Number of entries before the first one that were removed to free space, according to a later entry.
+        before: Number of entries that were removed at the beginning to free space, according to a later entry.
     """
 
     entries: int
@@ -139,8 +139,8 @@ def verify(lines: Iterable[bytes], part: bool = False, since: ChainEntry | None 
     Args:
         lines: Lines of the log.
         part: True if the lines are a part of the log. Then missing entries before and after them are not detected.
-        since: An entry that the log is known to have contained. It and all later entries must exist. Without it, entries at the
-            beginning must not be missing, because an attacker who removes entries can also write the entry that records the removal.
+        since: An entry that the log is known to have contained. This entry and all later ones must exist. Without it, no entry may be
+            missing at the beginning, because an attacker who removes entries can also write an entry that records the removal.
     """
     previous = ChainEntry()
     count = 0

@@ -47,7 +47,7 @@ def write_file(
 
 
 def remove_temporary(path: Path) -> None:
-    """Remove temporary files of killed writers of a file, as far as possible. Call it only in the only writer of the file."""
+    """Remove the temporary files that killed writers of a file left. Call it only from the only writer of the file."""
     with contextlib.suppress(OSError):
         for leftover in path.parent.glob(f".{glob.escape(path.name)}.*.tmp"):
             leftover.unlink(missing_ok=True)

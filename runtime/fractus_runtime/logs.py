@@ -18,7 +18,7 @@ BURST = 50
 RATE_PER_S = 0.5
 """Records per caller and second that are written after the burst."""
 MAX_CALLERS = 1_000
-"""Callers with a limit of their own. Further callers share one."""
+"""Number of callers that have separate limits. Further callers share one limit."""
 
 
 @dataclass(slots=True)
@@ -31,8 +31,8 @@ class _Bucket:
 class CallerLogLimit(logging.Filter):
     """Limits the records of each caller, so that a refused component cannot fill the disk.
 
-    Only records with an attribute `limit_by` (from `extra` of the log call) are limited, by its value and the line of code. The next
-    record that is written states how many were suppressed.
+    Only records with an attribute `limit_by` (from `extra` of the log call) are limited. Each value of it and each line of code has
+    a separate limit. The next record that is written states how many records were suppressed.
 
     Args:
         monotonic: Monotonic clock in seconds.
@@ -60,7 +60,7 @@ class CallerLogLimit(logging.Filter):
             return False
         bucket.tokens -= 1
         if bucket.suppressed and record.args and isinstance(record.args, tuple):
-            # An argument, so that the JSON format has the number as a field.
+            # The number is an argument, so that it becomes a field of the JSON format.
             record.msg = f"{record.msg} (suppressed=%d)"
             record.args = (*record.args, bucket.suppressed)
             bucket.suppressed = 0

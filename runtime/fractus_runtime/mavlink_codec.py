@@ -50,7 +50,7 @@ class UnknownMessageError(KeyError):
 
 
 class Message(NamedTuple):
-    """One MAVLink message.
+    """A MAVLink message.
 
     Attributes:
         name: Message name, for example `HEARTBEAT`.
@@ -249,7 +249,7 @@ _BAD_SIGNATURE = "Invalid signature"
 
 
 class _Protocol(mavlink.MAVLink):
-    """pymavlink's protocol object, with a replay protection that a sender without the key cannot influence."""
+    """pymavlink's protocol object, with a replay protection that only senders with the key can influence."""
 
     def check_signature(self, msgbuf: bytearray, srcSystem: int, srcComponent: int) -> bool:  # noqa: N803
         """Verify the signature of a frame.
@@ -270,7 +270,7 @@ class _Protocol(mavlink.MAVLink):
 
 
 class Endpoint:
-    """One system's end of a link: encodes the messages that it sends and parses those that it receives.
+    """End of a link: encodes the messages that a system sends, and parses the messages that it receives.
 
     Args:
         sysid: System id of the sender.
@@ -345,7 +345,7 @@ def _message_of(decoded: mavlink.MAVLink_message, frame: bytes) -> Message:
     fields = vars(decoded)
     values = {}
     for name in decoded.ordered_fieldnames:
-        # pymavlink decodes text as ASCII and keeps the bytes beside it.
+        # pymavlink decodes text as ASCII. The original bytes are in another attribute.
         value = fields.get(f"_{name}_raw", fields[name])
         values[name] = tuple(value) if isinstance(value, list) else value
     header = decoded.get_header()

@@ -1,7 +1,7 @@
 """Prometheus metrics of a process: builders of metrics, and an HTTP endpoint in the process's event loop.
 
-The HTTP server of `prometheus_client` collects in threads of its own. Metrics of Fractus are read from objects that belong
-to the event loop, so the endpoint runs in that loop.
+The metrics are read from objects that belong to the event loop, so the endpoint runs in that loop. The HTTP server of
+`prometheus_client` would read them in other threads.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ CERTIFICATE_EXPIRY = "fractus_certificate_expiry_timestamp_seconds"
 """Metric name shared by all workloads that have a certificate."""
 
 MAX_CONNECTIONS = 4
-"""Connections served at once. Further ones wait in the kernel's queue, because any host that reaches the node can connect."""
+"""Connections served at the same time. Further ones wait in the kernel's queue. Any host that reaches the node can connect."""
 REQUEST_TIMEOUT_S = 5.0
 MAX_REQUEST_BYTES = 8192
 RETRY_S = 1.0
@@ -55,8 +55,8 @@ def gauge(name: str, description: str, value: float | Mapping[str, float], label
     if not isinstance(value, Mapping):
         return GaugeMetricFamily(name, description, value=value)
     metric = GaugeMetricFamily(name, description, labels=[label] if label else [])
-    for key, each in value.items():
-        metric.add_metric([key] if label else [], each)
+    for key, number in value.items():
+        metric.add_metric([key] if label else [], number)
     return metric
 
 
@@ -108,9 +108,9 @@ class BackgroundReader(Generic[T]):
 
 @asynccontextmanager
 async def serve_metrics(listen: str, collect: Callable[[], Iterable[Metric]]) -> AsyncIterator[None]:
-    """Answer GET /metrics inside the `async with` block.
+    """Serve GET /metrics inside the `async with` block.
 
-    An address that cannot be bound does not raise: it is logged and retried, and the process runs without metrics until then.
+    If the address cannot be bound, the failure is logged and the attempt repeated. Until then the process has no metrics.
 
     Args:
         listen: HOST:PORT. An empty host stands for all addresses. If `listen` is empty, nothing is served.

@@ -123,7 +123,12 @@ def server_span(
         "rpc.method": name,
         STATUS: _OK,
     }
-    span = _start_span(method, _parent(metadata), SpanKind.SERVER, attributes)
+    # The caller's span is the parent if there is exactly one `traceparent`. A malformed value is ignored.
+    parents = [value for key, value in metadata if key == "traceparent"]
+    parent = Context()
+    if len(parents) == 1 and isinstance(parents[0], str):
+        parent = TraceContextTextMapPropagator().extract({"traceparent": parents[0]}, parent)
+    span = _start_span(method, parent, SpanKind.SERVER, attributes)
     with trace.use_span(span, end_on_exit=True, record_exception=False, set_status_on_exception=False):
         try:
             yield
@@ -179,11 +184,3 @@ def _start_span(name: str, parent: Context | None, kind: SpanKind, attributes: M
     except Exception as error:
         log.warning("tracing: span not started (error=%s)", type(error).__name__)
         return trace.INVALID_SPAN
-
-
-def _parent(metadata: Iterable[tuple[str, str | bytes]]) -> Context:
-    """Return the caller's span if there is exactly one `traceparent`. A malformed value is ignored."""
-    values = [value for name, value in metadata if name == "traceparent"]
-    if len(values) != 1 or not isinstance(values[0], str):
-        return Context()
-    return TraceContextTextMapPropagator().extract({"traceparent": values[0]}, Context())

@@ -72,6 +72,6 @@ def _keep(reservation: socket.socket) -> None:
 
 
 @atexit.register
-def _give_back() -> None:
+def _release() -> None:
     while _reservations:
         _reservations.pop().close()

@@ -219,7 +219,9 @@ async def _search(fleet: Fleet, i: int) -> Any:
     place: Floats = fleet.seen[i]
     vehicle = SimpleNamespace(home=HOME, distance_m=lambda _lat, _lon: math.hypot(place[0], place[1]))
     state = SimpleNamespace(mission=None)
-    control: Any = SimpleNamespace(autopilot=SimpleNamespace(vehicle=vehicle), cruise_mps=CRUISE_MPS, state=state)
+    control: Any = SimpleNamespace(
+        autopilot=SimpleNamespace(vehicle=vehicle), cruise_mps=CRUISE_MPS, state=state, home_moved=False
+    )
     gate: Any = SimpleNamespace(situation=lambda: now)
     flight: Any = SimpleNamespace(constraints=SimpleNamespace(compiled=fleet.scenes[i].grant))
     return await ReturnFlight(control, gate, SimpleNamespace())._next_leg(flight)  # type: ignore[arg-type]

@@ -88,11 +88,11 @@ async def step(*leases: Lease) -> None:
         if task.done():
             task.result()
         # Ended as a killed process is: nothing is given back.
-        one_give_back = one._give_back
-        one._give_back = _nothing  # type: ignore[method-assign]
+        one_release = one._release
+        one._release = _nothing  # type: ignore[method-assign]
         task.cancel()
         await asyncio.gather(task, return_exceptions=True)
-        one._give_back = one_give_back  # type: ignore[method-assign]
+        one._release = one_release  # type: ignore[method-assign]
 
 
 async def _nothing() -> None:
@@ -268,11 +268,11 @@ async def test_renewal_without_response_is_released() -> None:
     await step(first)
     clock.now += DURATION_S
     assert first.left_s == 0
-    await first._give_back()
+    await first._release()
     await step(second)
     assert second.left_s > 0
     writes = shelf.writes
-    await first._give_back()
+    await first._release()
     assert shelf.writes == writes, "what another holds is not given back"
 
 

@@ -82,7 +82,7 @@ async def in_cluster(directory: Path = SERVICE_ACCOUNT) -> Access:
 
 
 async def from_environment(context: str | None = None) -> Access:
-    """Return the access of the service account of this pod, or outside a pod that of KUBECONFIG or kubectl's kubeconfig.
+    """Return the access of this pod's service account. Outside a pod, use KUBECONFIG or kubectl's default kubeconfig.
 
     Args:
         context: Context of the kubeconfig. With a context, the service account is not used.
@@ -111,42 +111,43 @@ def with_certificate(
     if token:
         configuration.api_key["BearerToken"] = f"Bearer {token}"
 
-    async def nothing() -> None:
-        """Do nothing. Neither changes."""
+    async def keep() -> None:
+        """Do nothing, because neither the certificate nor the token changes."""
 
-    return Access(configuration, nothing)
+    return Access(configuration, keep)
 
 
 def with_tokens(configuration: Configuration, token: Callable[[], Awaitable[str]], life_s: float) -> Access:
-    """Return the access to an API server by tokens that are requested when needed.
+    """Return the access to an API server with tokens that are requested when they are needed.
 
     Args:
         configuration: Configuration of another access to the same API server. Its credentials are not used.
         token: Requests a new token.
         life_s: Time for which a token is used, in seconds. It should be valid for twice as long.
     """
-    own = copy.copy(configuration)
-    own.cert_file = own.key_file = None
+    token_configuration = copy.copy(configuration)
+    token_configuration.cert_file = None
+    token_configuration.key_file = None
     # The client calls the hook only if it has a token, which may be empty.
-    own.api_key = {"BearerToken": ""}
+    token_configuration.api_key = {"BearerToken": ""}
     renew_at_s = -math.inf
 
     async def renew() -> None:
         nonlocal renew_at_s
-        own.api_key["BearerToken"] = f"Bearer {await token()}"
+        token_configuration.api_key["BearerToken"] = f"Bearer {await token()}"
         renew_at_s = time.monotonic() + life_s
 
-    async def in_time(_configuration: Configuration) -> None:
+    async def renew_if_due(_configuration: Configuration) -> None:
         nonlocal renew_at_s
         if time.monotonic() < renew_at_s:
             return
         try:
             await renew()
         except KubeError:
-            if not own.api_key["BearerToken"]:
+            if not token_configuration.api_key["BearerToken"]:
                 raise
-            # The present token may be valid for as long again. Otherwise the API server rejects it.
+            # The current token is valid for twice `life_s`. If it is not, the API server rejects it.
             renew_at_s = time.monotonic() + life_s / 10
 
-    own.refresh_api_key_hook = in_time
-    return Access(own, renew)
+    token_configuration.refresh_api_key_hook = renew_if_due
+    return Access(token_configuration, renew)

@@ -20,7 +20,7 @@ _POLL_S = 0.05
 
 
 class BlockingClient:
-    """The API server by paths. It is thread-safe."""
+    """Sends requests to paths of the API server. Thread-safe."""
 
     def __init__(self, access: Access, field_manager: str, *, trust_env: bool = False) -> None:
         self._loop = asyncio.new_event_loop()
@@ -83,7 +83,7 @@ class BlockingClient:
         return self.call("PATCH", path, dict(body), content_type=ContentType.MERGE)
 
     def delete(self, path: str, grace_s: int | None = None) -> None:
-        """Delete an object and, in the background, the objects that it owns. A missing object is no error."""
+        """Delete an object and, in the background, the objects that it owns. A missing object is not an error."""
         options: Body = {"propagationPolicy": "Background"}
         if grace_s is not None:
             options["gracePeriodSeconds"] = grace_s
@@ -100,7 +100,7 @@ class BlockingClient:
         """Wait until the API server is ready.
 
         Raises:
-            KubeError: It was not ready in time.
+            KubeError: The API server was not ready in time.
         """
         deadline = time.monotonic() + timeout_s
         while not self.ready():

@@ -57,15 +57,15 @@ async def _lines(content: aiohttp.StreamReader, silence_s: float | None) -> Asyn
 
 
 class Client(Connection):
-    """The API server by kinds of objects."""
+    """Sends requests for kinds of objects to the API server."""
 
     def account(self, name: str, namespace: str, node: str) -> Client:
-        """Return a client of a ServiceAccount. This client requests its tokens, each bound to a Node and valid for an hour.
+        """Return a client that acts as a ServiceAccount, with tokens that are bound to a Node and valid for an hour.
 
         Args:
             name: Name of the ServiceAccount.
             namespace: Namespace of the ServiceAccount.
-            node: Node of the tokens. They become invalid when it is deleted.
+            node: Node of the tokens. The tokens become invalid when the Node is deleted.
         """
         request: Body = {
             "apiVersion": "authentication.k8s.io/v1",
@@ -77,8 +77,8 @@ class Client(Connection):
         }
 
         async def token() -> str:
-            made = await self.request("POST", _SERVICE_ACCOUNT.path(namespace, name, "token"), request)
-            return str(made["status"]["token"])
+            response = await self.request("POST", _SERVICE_ACCOUNT.path(namespace, name, "token"), request)
+            return str(response["status"]["token"])
 
         access = with_tokens(self._access.configuration, token, _TOKEN_LIFE_S / 2)
         return Client(access, self.field_manager, trust_env=self._trust_env)
@@ -87,7 +87,7 @@ class Client(Connection):
         """Read an object.
 
         Raises:
-            NotFound: There is no object of that name.
+            NotFound: No object has this name.
         """
         return await self.request("GET", kind.path(namespace, name))
 
@@ -107,7 +107,7 @@ class Client(Connection):
             namespace: Namespace of the objects. Empty: all namespaces.
             selectors: labelSelector and fieldSelector, if any.
             continue_: Continuation token of the previous page.
-            timeout_s: Maximum time of the page, in seconds. It must make progress meanwhile.
+            timeout_s: Maximum time of the page, in seconds.
 
         Raises:
             Expired: The continuation token is too old. Read the list from its beginning.
@@ -129,7 +129,7 @@ class Client(Connection):
         selectors: Mapping[str, str] | None = None,
         timeout_s: float = LIST_TIMEOUT_S,
     ) -> Page:
-        """Read a whole collection as one page, over all namespaces or one. The timeout is for each page of it."""
+        """Read a whole collection and return it as a single page. The timeout applies to each page that is read."""
         read = partial(self.list_page, kind, namespace=namespace, selectors=selectors, timeout_s=timeout_s)
         page = await read()
         items = page.items
@@ -173,7 +173,7 @@ class Client(Connection):
             **(selectors or {}),
         }
         with translated(f"watch of {kind.plural}"):
-            async with self.answer("GET", kind.path(namespace), params, silence_s=silence_s) as response:
+            async with self.open_response("GET", kind.path(namespace), params, silence_s=silence_s) as response:
                 opened()
                 async for line in _lines(response.content, silence_s):
                     if line.endswith(b"\n") and line.strip():
@@ -183,25 +183,25 @@ class Client(Connection):
                         yield event["type"], event["object"]
 
     async def log(self, pod: Key, params: Mapping[str, str], *, silence_s: float | None) -> AsyncGenerator[bytes, None]:
-        """Iterate over the lines of a container's log, without line ends. A followed log ends when the container does.
+        """Iterate over the lines of a container's log, without line ends. A followed log ends with its container.
 
         Args:
             pod: (namespace, name).
             params: Parameters of the log subresource: container, follow, previous, sinceTime, timestamps and so on.
-            silence_s: Maximum time without a line, in seconds. None for a followed log, because a container may log nothing
-                for hours, and the kubelet responds with its first line.
+            silence_s: Maximum time without a line, in seconds. None for a followed log: the kubelet responds with the first
+                line, and a container may log nothing for hours.
         """
         path = POD.path(*pod, "log")
         with translated(f"GET {path}"):
-            async with self.answer("GET", path, params, silence_s=silence_s) as response:
+            async with self.open_response("GET", path, params, silence_s=silence_s) as response:
                 async for line in _lines(response.content, silence_s):
                     yield line.rstrip(b"\r\n")
 
     async def create(self, kind: Kind, body: Body, *, strict: bool = True) -> Body:
-        """Create an object. If strict, unknown fields are refused, as by an apply, and not dropped.
+        """Create an object. If strict, unknown fields are refused, as by an apply. Otherwise they are dropped.
 
         Raises:
-            Conflict: An object of that name exists (reason AlreadyExists), or the request must be repeated (other reasons).
+            Conflict: An object of this name exists (reason AlreadyExists), or the request must be repeated (other reasons).
         """
         params = {"fieldManager": self.field_manager, "fieldValidation": "Strict" if strict else "Warn"}
         return await self.request("POST", kind.path(key_of(body)[0]), body, params=params)
@@ -216,13 +216,13 @@ class Client(Connection):
     ) -> Body:
         """Set the fields of an object by server-side apply. Fields of other managers stay.
 
-        With metadata.uid in the body, neither a deleted object nor another one of its name is written.
+        If the body has a metadata.uid, only the object with this uid is written. A deleted object is not created again.
 
         Args:
             kind: Kind of the object.
             body: The fields.
             subresource: Subresource, such as status.
-            field_manager: Replaces the field manager of the client, if several of its parts each own some fields.
+            field_manager: Owner of the fields. Default: the field manager of the client.
 
         Raises:
             Conflict: metadata.uid does not match.
@@ -259,7 +259,7 @@ class Client(Connection):
         return await self.request("PUT", kind.path(*key_of(body), subresource), body, params=params)
 
     async def delete(self, kind: Kind, key: Key, uid: str | None = None, *, orphan: bool = False) -> bool:
-        """Delete an object. A missing object is no error.
+        """Delete an object. A missing object is not an error.
 
         Args:
             kind: Kind of the object.
@@ -274,7 +274,7 @@ class Client(Connection):
         if uid is not None:
             options["preconditions"] = {"uid": uid}
         try:
-            # The response is a Status if the object is removed, else the kept object.
+            # The response is a Status if the object was removed, and the object if a finalizer or grace period keeps it.
             return (await self.request("DELETE", kind.path(*key), options)).get("kind") == "Status"
         except NotFound:
             return False

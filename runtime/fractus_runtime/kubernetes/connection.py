@@ -24,7 +24,7 @@ from fractus_runtime.kubernetes.objects import Body
 REQUEST_TIMEOUT_S = 15.0
 MAX_CONNECTIONS = 100
 _KEPT_OPEN_S = 60.0
-"""Time for which idle connections are kept, below the 90 s of the API server. A new one costs a TLS handshake."""
+"""Time for which idle connections are kept, shorter than the 90 s of the API server. A new connection costs a TLS handshake."""
 _KEEPALIVE = {"TCP_KEEPIDLE": 10, "TCP_KEEPINTVL": 5, "TCP_KEEPCNT": 3}
 """TCP keep-alive that detects a dead connection after 25 s."""
 _FAILURES = (aiohttp.ClientError, TimeoutError, OSError, ConfigException, Unconfigured)
@@ -40,14 +40,14 @@ class ContentType(StrEnum):
 
 
 class Connection:
-    """The API server by paths.
+    """Sends requests to paths of the API server.
 
     Every request ends within its timeout, with a response or a KubeError.
 
     Args:
         access: Address and credentials of the API server.
         field_manager: Owner of the written fields.
-        may_write_s: Returns for how many seconds writes may still take effect. 0 if another process may write instead.
+        may_write_s: Returns the seconds for which writes may still take effect. 0 if another process may write instead.
         trust_env: Use the proxies of the environment.
 
     Raises:
@@ -101,10 +101,10 @@ class Connection:
         silence_s = min(timeout_s, REQUEST_TIMEOUT_S)
         with translated(f"{method} {path}"):
             try:
-                # For the whole request: the timeouts of aiohttp are for its parts, and restart with every byte.
+                # Limit the whole request. The timeouts of aiohttp apply to its parts and restart with every byte.
                 async with (
                     asyncio.timeout(timeout_s),
-                    self.answer(method, path, params, body, content_type, silence_s=silence_s) as response,
+                    self.open_response(method, path, params, body, content_type, silence_s=silence_s) as response,
                 ):
                     result: Body = json.loads(await response.read())
             except TimeoutError as error:
@@ -114,15 +114,15 @@ class Connection:
     async def ready(self) -> bool:
         """Return True if the API server reports that it is ready."""
         try:
-            async with asyncio.timeout(REQUEST_TIMEOUT_S), self.answer("GET", "/readyz", None):
+            async with asyncio.timeout(REQUEST_TIMEOUT_S), self.open_response("GET", "/readyz", None):
                 return True
         except (KubeError, *_FAILURES):
             return False
 
-    async def answers(self, timeout_s: float) -> bool:
-        """Return True if the API server responds in time, even with a refusal, so that the path to it works."""
+    async def responds(self, timeout_s: float) -> bool:
+        """Return True if the network path to the API server works: it responds in time, even with a refusal."""
         try:
-            async with asyncio.timeout(timeout_s), self.answer("GET", "/livez", None):
+            async with asyncio.timeout(timeout_s), self.open_response("GET", "/livez", None):
                 return True
         except KubeError:
             return True
@@ -132,7 +132,7 @@ class Connection:
             return False
 
     @asynccontextmanager
-    async def answer(
+    async def open_response(
         self,
         method: str,
         path: str,
@@ -153,14 +153,14 @@ class Connection:
         timeout = aiohttp.ClientTimeout(
             total=None, connect=REQUEST_TIMEOUT_S, sock_connect=REQUEST_TIMEOUT_S, sock_read=silence_s
         )
-        for last in (False, True):
+        for renewed in (False, True):
             async with asyncio.timeout(silence_s):
                 headers = await self._headers(content_type)
                 self._open()
-                answer = await self._rest.request(method, url, headers, body, _request_timeout=timeout)
-            response: aiohttp.ClientResponse = answer.response
+                raw_response = await self._rest.request(method, url, headers, body, _request_timeout=timeout)
+            response: aiohttp.ClientResponse = raw_response.response
             try:
-                if response.status == HTTPStatus.UNAUTHORIZED and not last:
+                if response.status == HTTPStatus.UNAUTHORIZED and not renewed:
                     async with asyncio.timeout(silence_s):
                         await self._access.renew()
                     continue
@@ -182,7 +182,10 @@ class Connection:
         return headers
 
     def _open(self) -> None:
-        """Create the connection pool when there is an event loop. The pool of the official client keeps connections for 15 s."""
+        """Create the connection pool, which needs a running event loop.
+
+        The official client would create a pool that keeps idle connections for only 15 s.
+        """
         if self._closed:
             raise aiohttp.ClientConnectionError("the connection was closed")
         if self._rest.pool_manager is None:
@@ -197,35 +200,37 @@ class Connection:
                     socket_factory=_socket,
                 ),
                 cookie_jar=aiohttp.DummyCookieJar(),
-                # Looking up proxies doubles the time of a request, so it is done only if there are any.
+                # The lookup of proxies doubles the time of a request, so it is skipped if none is configured.
                 trust_env=self._trust_env and bool(getproxies_environment()),
             )
 
 
 def _socket(address: aiohttp.AddrInfoType) -> socket.socket:
-    """Create a socket with keep-alive. A watch sends nothing, and would not detect a dead connection."""
-    made = socket.socket(*address[:3])
-    made.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    """Create a socket with keep-alive. Without it, a watch does not detect a dead connection, because it sends nothing."""
+    new_socket = socket.socket(*address[:3])
+    new_socket.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
     for option, value in _KEEPALIVE.items():
         if hasattr(socket, option):
-            made.setsockopt(socket.IPPROTO_TCP, getattr(socket, option), value)
-    return made
+            new_socket.setsockopt(socket.IPPROTO_TCP, getattr(socket, option), value)
+    return new_socket
 
 
 async def _refuse_redirect(
     _session: aiohttp.ClientSession, _context: object, redirect: aiohttp.TraceRequestRedirectParams
 ) -> None:
     """Refuse a redirect. The API server sends none, and another server could receive Secrets in plain text."""
-    raise aiohttp.ClientError(f"refused a redirect to {redirect.response.headers.get('Location', 'nowhere')}")
+    raise aiohttp.ClientError(
+        f"refused a redirect to {redirect.response.headers.get('Location', 'an unknown address')}"
+    )
 
 
 @contextmanager
-def translated(what: str) -> Iterator[None]:
+def translated(request: str) -> Iterator[None]:
     """Raise connection errors as KubeError."""
     try:
         yield
     except (*_FAILURES, ValueError) as error:
-        raise unreachable(f"{what}: {type(error).__name__}: {error}") from error
+        raise unreachable(f"{request}: {type(error).__name__}: {error}") from error
 
 
 def _refusal(code: int, content: bytes) -> KubeError:

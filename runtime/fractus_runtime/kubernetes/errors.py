@@ -8,7 +8,7 @@ from fractus_runtime.kubernetes.objects import Body
 
 
 class KubeError(Exception):
-    """The API server refused a request, or could not be reached. If it is no subclass, retry later.
+    """The API server refused a request, or could not be reached. Retry later, except for the subclasses.
 
     Attributes:
         status: HTTP status. 0 if there was no response.
@@ -26,11 +26,11 @@ class Invalid(KubeError):
 
 
 class NotFound(KubeError):
-    """The object does not exist, or its kind does not (404)."""
+    """The object or its kind does not exist (404)."""
 
 
 class Conflict(KubeError):
-    """An object of that name exists, or it was changed meanwhile (409). Read it again."""
+    """An object of this name exists, or the object was changed since it was read (409). Read it again."""
 
 
 class Expired(KubeError):
@@ -50,7 +50,7 @@ def from_status(code: int, status: Any) -> KubeError:
 
     Args:
         code: HTTP status.
-        status: The response body: a Status object, or anything else if a proxy responded.
+        status: The response body. It is a Status object, unless a proxy responded.
     """
     body: Body = status if isinstance(status, dict) else {"message": str(status)[:500]}
     code = int(body.get("code") or code)

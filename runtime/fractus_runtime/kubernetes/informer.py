@@ -12,9 +12,9 @@ from typing import Generic, TypeVar
 from fractus_runtime.kubernetes.backoff import Backoff
 from fractus_runtime.kubernetes.client import Client
 from fractus_runtime.kubernetes.errors import Expired, KubeError
-from fractus_runtime.kubernetes.objects import Body, Key, Kind, key_of
+from fractus_runtime.kubernetes.objects import Body, Key, Kind, key_of, version_number, version_of
 
-logger = logging.getLogger(__name__)
+log = logging.getLogger(__name__)
 
 T = TypeVar("T")
 
@@ -35,7 +35,8 @@ class Informer(Generic[T]):
         client: The API server.
         kind: Kind of the objects.
         parse: Returns the part of an object to keep.
-        on_change: Called with the key, the old and the new value of each changed object. None for no object.
+        on_change: Called with the key, the old and the new value of each changed object. The old value of a created object
+            and the new value of a deleted one are None.
         selectors: labelSelector and fieldSelector, if any.
         namespace: Namespace of the objects. Empty: all namespaces.
         rng: Source of the jitter.
@@ -94,11 +95,11 @@ class Informer(Generic[T]):
         return len(self._objects)
 
     def record_write(self, key: Key, body: Body) -> None:
-        """Add the result of a write of this process, before the watch reports it. Older events are then ignored.
+        """Add the result of a write by this process before the watch reports it. Older events are then ignored.
 
-        A result that is older than the state that the watch or a list has reported is ignored.
+        A result is ignored if the watch or a list has already reported a later state.
         """
-        version = _version(body)
+        version = version_of(body)
         if 0 < version <= self._reached:
             return
         self._own_writes[key] = version
@@ -109,7 +110,7 @@ class Informer(Generic[T]):
         return asyncio.get_running_loop().time() - self._last_contact
 
     async def run(self) -> None:
-        """List and watch until cancelled. After failures, the pause grows."""
+        """List and watch until cancelled. The pause before the next attempt grows with each failure."""
         version = ""
         loop = asyncio.get_running_loop()
         while True:
@@ -118,18 +119,18 @@ class Informer(Generic[T]):
                 if not version:
                     version = await self._list()
                 opened_s = loop.time()
-                async for seen in self._watch(version):
-                    version = seen
+                async for latest in self._watch(version):
+                    version = latest
                     self._backoff.succeeded()
             except Expired:
-                logger.info("informer: watch expired, listing again (kind=%s)", self.kind.plural)
+                log.info("informer: watch expired, listing again (kind=%s)", self.kind.plural)
                 version = ""
                 ended = False
             except KubeError as error:
                 if error.status not in (0, 429) and error.status < 500:
                     version = ""
-                log = logger.warning if self._backoff.attempts else logger.info
-                log("informer: list or watch failed (kind=%s error=%s)", self.kind.plural, error)
+                report = log.warning if self._backoff.attempts else log.info
+                report("informer: list or watch failed (kind=%s error=%s)", self.kind.plural, error)
                 ended = False
             else:
                 ended = True
@@ -138,13 +139,14 @@ class Informer(Generic[T]):
             if steady:
                 self._backoff.succeeded()
             if self.age_s() >= _SILENCE_S:
-                # The API server sends bookmarks. After a restore from a backup it sends nothing until it reaches this version.
+                # The API server sends a bookmark about every minute. After a restore from a backup it sends nothing until
+                # it reaches this version again.
                 version = ""
             if not (steady and ended):
                 await asyncio.sleep(self._backoff.delay_s())
             self.restarts += 1
 
-    def _opened(self) -> None:
+    def _on_opened(self) -> None:
         self.watching = True
         self._record_contact()
 
@@ -167,7 +169,7 @@ class Informer(Generic[T]):
             continue_ = page.continue_
             if not continue_:
                 break
-        version = _number(page.resource_version)
+        version = version_number(page.resource_version)
         for key in self._objects.keys() - listed:
             # An object that was created after the list is missing in it.
             if self._own_writes.get(key, 0) <= version:
@@ -184,7 +186,7 @@ class Informer(Generic[T]):
             selectors=self._selectors,
             timeout_s=timeout_s,
             silence_s=_SILENCE_S,
-            opened=self._opened,
+            opened=self._on_opened,
         ):
             self._record_contact()
             if type_ != "BOOKMARK":
@@ -194,11 +196,11 @@ class Informer(Generic[T]):
 
     def _reach(self, version: str) -> None:
         """Record the resource version up to which all changes are known."""
-        self._reached = max(self._reached, _number(version))
+        self._reached = max(self._reached, version_number(version))
 
     def _take(self, type_: str, body: Body) -> None:
         key = key_of(body)
-        version = _version(body)
+        version = version_of(body)
         own_write = self._own_writes.get(key, 0)
         if version < own_write or (own_write and version == own_write and type_ != "DELETED"):
             return
@@ -212,8 +214,8 @@ class Informer(Generic[T]):
         try:
             new = self._parse(self._typed(body))
         except Exception:
-            # One invalid object must not hide all others. Its last valid version is kept.
-            logger.exception(
+            # An invalid object must not hide the others. Its last valid version is kept.
+            log.exception(
                 "informer: object cannot be parsed (kind=%s name=%s)", self.kind.plural, "/".join(filter(None, key))
             )
             return
@@ -231,7 +233,7 @@ class Informer(Generic[T]):
         try:
             self._on_change(key, old, new)
         except Exception:
-            logger.exception(
+            log.exception(
                 "informer: handler of a change failed (kind=%s name=%s)", self.kind.plural, "/".join(filter(None, key))
             )
 
@@ -241,12 +243,3 @@ class Informer(Generic[T]):
         item.setdefault("apiVersion", self.kind.api_version)
         item.setdefault("kind", self.kind.name)
         return item
-
-
-def _version(body: Body) -> int:
-    """Return an object's resource version as a number, or 0 if it is none. It increases with each change."""
-    return _number(str(body["metadata"].get("resourceVersion", "")))
-
-
-def _number(version: str) -> int:
-    return int(version) if version.isdecimal() else 0

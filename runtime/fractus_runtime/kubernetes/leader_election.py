@@ -1,7 +1,7 @@
 """Leader election: only the process that holds a Lease acts, so that two processes never act at the same time.
 
 The election of the official client uses the wall clock, allows five minutes for a request, and ends at the first refused
-connection. It can have two leaders for a moment.
+connection. For a moment, two processes can be its leader.
 """
 
 from __future__ import annotations
@@ -15,17 +15,17 @@ from datetime import UTC, datetime, timedelta
 
 from fractus_runtime.kubernetes.client import Client
 from fractus_runtime.kubernetes.errors import Conflict, KubeError, NotFound
-from fractus_runtime.kubernetes.objects import Body, Key, Kind
+from fractus_runtime.kubernetes.objects import Body, Key, Kind, version_of
 
-logger = logging.getLogger(__name__)
+log = logging.getLogger(__name__)
 
 LEASE = Kind("coordination.k8s.io/v1", "Lease", "leases", namespaced=True)
 _RENEWALS = 5
 _HELD_SHARE = 0.7
 _RETRY_S = 1.0
 _RETRIES = 20
-_ANSWER_SHARE = _HELD_SHARE / 2
-"""Maximum time of a response, as a share of the duration. After a stalled one, a retry is possible before the Lease is lost."""
+_RESPONSE_SHARE = _HELD_SHARE / 2
+"""Maximum time of a response, as a share of the duration. After a stalled response, one retry fits before the Lease is lost."""
 
 
 class LostLease(Exception):
@@ -38,12 +38,12 @@ class LostLease(Exception):
 class Lease:
     """A Lease of coordination.k8s.io, held by one process at a time.
 
-    Another process takes it only after it has observed it unchanged for its whole duration, by its own clock. The holder acts
-    only for a part of the duration, counted from before its request. So clocks need not agree, and a holder that was frozen
-    does not act any more.
+    Another process takes the Lease only after the Lease did not change for its whole duration, by the clock of that process.
+    The holder acts only for a part of the duration, counted from before its request. So the clocks need not agree, and a
+    holder that was frozen does not act any more.
 
-    The Lease also detects a restore of the API server to an earlier state, because its version never decreases otherwise. After
-    a restore, watches would continue from future versions and report nothing until these are reached.
+    A version of the Lease that decreases shows that the API server was restored to an earlier state. After a restore, watches
+    would continue from versions that do not exist yet, and report nothing until the API server reaches these versions.
 
     Args:
         client: The API server, with separate connections, so that no burst of requests delays a renewal.
@@ -60,8 +60,8 @@ class Lease:
         self._duration_s = duration_s
         self._time = time
         self._until = float("-inf")
-        self._seen: tuple[object, ...] = ()
-        self._seen_at = 0.0
+        self._last_state: tuple[object, ...] = ()
+        self._changed_at_s = 0.0
         self._transitions: int | None = None
         self._version = 0
         self._acquired = asyncio.Event()
@@ -78,41 +78,41 @@ class Lease:
             await self._acquired.wait()
 
     async def run(self) -> None:
-        """Take the Lease and renew it until cancelled. It is released then.
+        """Take the Lease and renew it until cancelled. Then release it.
 
         Raises:
-            LostLease: Another process has held it since, or the Lease is of an earlier state.
+            LostLease: Another process has held the Lease since this one held it, or the API server was restored.
         """
         try:
             while True:
-                asked = self._time()
+                requested_s = self._time()
                 # After a failed renewal there is time for another one.
                 pause_s = min(_RETRY_S, self._duration_s / _RETRIES)
                 try:
-                    async with asyncio.timeout(_ANSWER_SHARE * self._duration_s):
-                        taken = await self._ask()
+                    async with asyncio.timeout(_RESPONSE_SHARE * self._duration_s):
+                        taken = await self._acquire()
                     if taken:
-                        self._hold(asked)
+                        self._hold(requested_s)
                     pause_s = self._duration_s / _RENEWALS if taken else min(_RETRY_S, self._duration_s / _RENEWALS)
                 except KubeError as error:
-                    logger.info("lease: not renewed (error=%s)", error)
+                    log.info("lease: not renewed (error=%s)", error)
                 except TimeoutError:
-                    logger.info("lease: not renewed (error=no response in %.1f s)", _ANSWER_SHARE * self._duration_s)
+                    log.info("lease: not renewed (error=no response in %.1f s)", _RESPONSE_SHARE * self._duration_s)
                 await asyncio.sleep(pause_s)
         finally:
-            await self._give_back()
+            await self._release()
 
-    def _hold(self, asked: float) -> None:
+    def _hold(self, requested_s: float) -> None:
         if not self.left_s:
-            logger.info("lease: became leader (identity=%s)", self._identity)
-        self._until = asked + _HELD_SHARE * self._duration_s
+            log.info("lease: became leader (identity=%s)", self._identity)
+        self._until = requested_s + _HELD_SHARE * self._duration_s
         self._acquired.set()
 
-    async def _ask(self) -> bool:
+    async def _acquire(self) -> bool:
         """Take or renew the Lease, if this process holds it or it is free. Return True on success.
 
         Raises:
-            LostLease: Another process has held it since, or the Lease is of an earlier state.
+            LostLease: Another process has held the Lease since this one held it, or the API server was restored.
             KubeError: The API server refused the request, or did not respond.
         """
         try:
@@ -127,55 +127,55 @@ class Lease:
             )
         if (spec.get("holderIdentity") or "") not in ("", self._identity) and not self._expired(body):
             return False
-        wanted = self._wanted(body)
+        renewed = self._renewed(body)
         write = self._client.replace if spec else self._client.create
         try:
-            self._version = _version(await write(LEASE, wanted))
+            self._version = version_of(await write(LEASE, renewed))
         except Conflict:
             return False
-        self._transitions = int(wanted["spec"]["leaseTransitions"])
+        self._transitions = int(renewed["spec"]["leaseTransitions"])
         return True
 
     def _check_history(self, body: Body) -> None:
-        """Check that the Lease is not of an earlier state than the one that this process has held.
+        """Check that the API server was not restored to a state from before the last renewal by this process.
 
         Raises:
-            LostLease: It is.
+            LostLease: The API server was restored to such a state.
         """
-        if 0 < _version(body) < self._version:
+        if 0 < version_of(body) < self._version:
             raise LostLease(
-                f"the version of the Lease went back from {self._version} to {_version(body)}, as after a restore of the API"
-                f" server: the state of {self._identity} is not valid any more"
+                f"the version of the Lease went back from {self._version} to {version_of(body)}, as after a restore of the API"
+                f" server: the state of {self._identity} is no longer valid"
             )
 
     def _expired(self, body: Body) -> bool:
-        """Return True if this process has observed no change of the Lease of another process for its duration."""
+        """Return True if another process holds the Lease and has not renewed it for its duration."""
         spec = body.get("spec") or {}
         now = self._time()
         state = (spec.get("holderIdentity"), spec.get("renewTime"))
-        if state != self._seen:
-            if self._seen[:1] != state[:1]:
-                logger.info("lease: waiting for the leader to end (leader=%s)", spec.get("holderIdentity"))
-            self._seen = state
-            self._seen_at = now
-        return now - self._seen_at > max(self._duration_s, float(spec.get("leaseDurationSeconds") or 0))
+        if state != self._last_state:
+            if self._last_state[:1] != state[:1]:
+                log.info("lease: waiting for the leader to end (leader=%s)", spec.get("holderIdentity"))
+            self._last_state = state
+            self._changed_at_s = now
+        return now - self._changed_at_s > max(self._duration_s, float(spec.get("leaseDurationSeconds") or 0))
 
-    def _wanted(self, body: Body, *, free: bool = False) -> Body:
+    def _renewed(self, body: Body, *, free: bool = False) -> Body:
         now = datetime.now(UTC)
         spec = body.get("spec") or {}
-        ours = spec.get("holderIdentity") == self._identity
-        wanted = {
+        holds = spec.get("holderIdentity") == self._identity
+        renewed = {
             **spec,
             "holderIdentity": "" if free else self._identity,
             "leaseDurationSeconds": max(1, round(timedelta(seconds=self._duration_s).total_seconds())),
             "renewTime": now.strftime("%Y-%m-%dT%H:%M:%S.%fZ"),
         }
-        if not ours and not free:
-            wanted["acquireTime"] = wanted["renewTime"]
-            wanted["leaseTransitions"] = int(spec.get("leaseTransitions") or 0) + 1
-        return {**body, "spec": wanted}
+        if not holds and not free:
+            renewed["acquireTime"] = renewed["renewTime"]
+            renewed["leaseTransitions"] = int(spec.get("leaseTransitions") or 0) + 1
+        return {**body, "spec": renewed}
 
-    async def _give_back(self) -> None:
+    async def _release(self) -> None:
         """Release the Lease, so that the next process can act at once. No write of this process may be in progress.
 
         The holder is read from the API server, because a renewal without a response may have taken effect.
@@ -185,15 +185,9 @@ class Lease:
             async with asyncio.timeout(2.0):
                 body = await self._client.get(LEASE, self._name, self._namespace)
                 if (body.get("spec") or {}).get("holderIdentity") == self._identity:
-                    await self._client.replace(LEASE, self._wanted(body, free=True))
+                    await self._client.replace(LEASE, self._renewed(body, free=True))
         except (KubeError, TimeoutError) as error:
-            logger.info("lease: not released (error=%s)", error)
-
-
-def _version(body: Body) -> int:
-    """Return the version of an object as a number, or 0 if it is none. It increases with each change."""
-    version = str(body["metadata"].get("resourceVersion", ""))
-    return int(version) if version.isdecimal() else 0
+            log.info("lease: not released (error=%s)", error)
 
 
 class LeaseThread:
@@ -230,29 +224,29 @@ class LeaseThread:
         await self._acquired.wait()
 
     async def run(self) -> None:
-        """Take the Lease and renew it until cancelled. It is released before this returns.
+        """Take the Lease and renew it until cancelled. Release it before returning.
 
         Raises:
-            LostLease: Another process has held it since, or the Lease is of an earlier state.
+            LostLease: Another process has held the Lease since this one held it, or the API server was restored.
             Unconfigured: There are no credentials.
         """
         caller = asyncio.get_running_loop()
         stop = asyncio.Event()
         cancelled = threading.Event()
-        inside: list[asyncio.AbstractEventLoop] = []
+        loops: list[asyncio.AbstractEventLoop] = []
 
         async def keep() -> None:
-            inside.append(asyncio.get_running_loop())
+            loops.append(asyncio.get_running_loop())
             if cancelled.is_set():
                 return
             async with contextlib.aclosing(await self._connect()) as client:
                 self._lease = lease = Lease(client, *self._rest)
 
-                async def tell() -> None:
+                async def report_acquired() -> None:
                     await lease.held()
                     caller.call_soon_threadsafe(self._acquired.set)
 
-                parts = [asyncio.create_task(part) for part in (lease.run(), stop.wait(), tell())]
+                parts = [asyncio.create_task(part) for part in (lease.run(), stop.wait(), report_acquired())]
                 try:
                     await asyncio.wait(parts[:2], return_when=asyncio.FIRST_COMPLETED)
                     if not stop.is_set():
@@ -267,7 +261,7 @@ class LeaseThread:
             await asyncio.shield(thread)
         except asyncio.CancelledError:
             cancelled.set()
-            if inside and not thread.done():
-                inside[0].call_soon_threadsafe(stop.set)
+            if loops and not thread.done():
+                loops[0].call_soon_threadsafe(stop.set)
             await asyncio.gather(thread, return_exceptions=True)
             raise

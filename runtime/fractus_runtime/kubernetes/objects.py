@@ -42,3 +42,13 @@ def key_of(body: Body) -> Key:
     """Return the key of an object."""
     metadata = body["metadata"]
     return (metadata.get("namespace", ""), metadata["name"])
+
+
+def version_of(body: Body) -> int:
+    """Return the resource version of an object as a number, which increases with each change. 0 if it is not a number."""
+    return version_number(str(body["metadata"].get("resourceVersion", "")))
+
+
+def version_number(version: str) -> int:
+    """Return a resource version as a number, or 0 if it is not a number."""
+    return int(version) if version.isdecimal() else 0

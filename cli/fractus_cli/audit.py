@@ -17,7 +17,7 @@ from fractus_cli.output import output_option, printable
 if TYPE_CHECKING:
     from fractus_runtime.audit_checkpoints import Checkpoint
 
-    from fractus_cli.flight_export import Places
+    from fractus_cli.flight_export import Areas
 
 _FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
 _PATHS = click.argument("paths", nargs=-1, required=True, type=click.Path(exists=True, path_type=Path))
@@ -44,44 +44,44 @@ def verify_command(paths: tuple[Path, ...], since: tuple[str, ...], ca: Path | N
     PATHS are directories, logs (including their segments) or single segments. The exit code is 1 if a log is not sound. Text output
     stops at the first such log; JSON output lists all logs.
     """
-    found = find_logs(paths)
-    known = _checkpoints(since, ca)
-    for absent in known.keys() - {log.stem for log, files in found.items() if log in files}:
+    logs = find_logs(paths)
+    checkpoints = _checkpoints(since, ca)
+    for missing in checkpoints.keys() - {log.stem for log, files in logs.items() if log in files}:
         raise click.ClickException(
-            f"--since: the checkpoint belongs to {absent}.jsonl; add that log or its directory to PATHS"
+            f"--since: the checkpoint belongs to {missing}.jsonl; add that log or its directory to PATHS"
         )
-    for stem in known:
-        same = [str(log) for log, files in found.items() if log in files and log.stem == stem]
-        if len(same) > 1:
+    for stem in checkpoints:
+        matching = [str(log) for log, files in logs.items() if log in files and log.stem == stem]
+        if len(matching) > 1:
             raise click.ClickException(
-                f"--since: several logs match the checkpoint of {stem}.jsonl: {', '.join(same)}; verify one at a time"
+                f"--since: several logs match the checkpoint of {stem}.jsonl: {', '.join(matching)}; verify one at a time"
             )
     if output == "json":
-        click.echo(json.dumps([_judgement(name, files, known.get(name.stem)) for name, files in found.items()]))
-    for name, files in found.items():
-        summary = _check(name, files, known.get(name.stem))
+        click.echo(json.dumps([_result(name, files, checkpoints.get(name.stem)) for name, files in logs.items()]))
+    for name, files in logs.items():
+        summary = _check(name, files, checkpoints.get(name.stem))
         if output == "text":
             click.echo(summary)
 
 
-def _moment(context: click.Context, option: click.Parameter, text: str | None) -> int | None:
+def _parse_time(context: click.Context, option: click.Parameter, text: str | None) -> int | None:
+    """Parse an RFC 3339 time to Unix nanoseconds."""
     del context, option
-    found = parse_time_ns(text)
-    if text is not None and found is None:
+    time_ns = parse_time_ns(text)
+    if text is not None and time_ns is None:
         raise click.BadParameter(f"{text!r} is not a time with a time zone, such as 2026-06-01T12:00:00Z")
-    return found
+    return time_ns
 
 
-def _window(command: Callable[..., None]) -> Callable[..., None]:
-    before = click.option("--before", metavar="TIME", callback=_moment, help="Only entries before this time.")
-    return click.option("--after", metavar="TIME", callback=_moment, help="Only entries at or after this time.")(
-        before(command)
-    )
+def _window_options(command: Callable[..., None]) -> Callable[..., None]:
+    after = click.option("--after", metavar="TIME", callback=_parse_time, help="Only entries at or after this time.")
+    before = click.option("--before", metavar="TIME", callback=_parse_time, help="Only entries before this time.")
+    return after(before(command))
 
 
-def _problems(found: dict[Path, list[Path]]) -> list[str]:
+def _problems(logs: dict[Path, list[Path]]) -> list[str]:
     """Return the problems of logs whose chains are not sound, and print them to standard error."""
-    problems = [problem for name, files in found.items() if (problem := verify_log(name, files)[1])]
+    problems = [problem for name, files in logs.items() if (problem := verify_log(name, files)[1])]
     for problem in problems:
         click.echo(f"warning: not verified: {problem}", err=True)
     return problems
@@ -89,19 +89,21 @@ def _problems(found: dict[Path, list[Path]]) -> list[str]:
 
 @audit.command()
 @_PATHS
-@_window
-@click.option("--all", "every", is_flag=True, help="Also print permitted calls, Grants and positions of the drone.")
+@_window_options
+@click.option(
+    "--all", "all_entries", is_flag=True, help="Also print permitted calls, Grants and positions of the drone."
+)
 @output_option
-def show(paths: tuple[Path, ...], after: int | None, before: int | None, every: bool, output: str) -> None:
+def show(paths: tuple[Path, ...], after: int | None, before: int | None, all_entries: bool, output: str) -> None:
     """Print corrected and denied calls, takeovers and changes of control from the audit logs in PATHS.
 
     PATHS are as for `verify`. If the chain of a log is not sound, a warning is printed to standard error. JSON output has one
     object per line: the entry with the additional fields `node` and `log`.
     """
-    found = find_logs(paths)
-    _problems(found)
-    for entry in entries(found, Window(after, before)):
-        if not every and not is_decision(entry):
+    logs = find_logs(paths)
+    _problems(logs)
+    for entry in entries(logs, Window(after, before)):
+        if not all_entries and not is_decision(entry):
             continue
         if output == "json":
             fields = {key: value for key, value in entry.items() if key != "time_ns"}
@@ -113,8 +115,8 @@ def show(paths: tuple[Path, ...], after: int | None, before: int | None, every: 
 def _line(entry: dict[str, Any]) -> str:
     if entry.get("kind") != "state":
         return f"{entry.get('kind')}: {sentence(entry)}"
-    words = ("lat", "lon", "alt", "speed", "mode", "controller", "battery", "in_air")
-    return "state: " + ", ".join(f"{word}={entry[word]}" for word in words if word in entry)
+    names = ("lat", "lon", "alt", "speed", "mode", "controller", "battery", "in_air")
+    return "state: " + ", ".join(f"{name}={entry[name]}" for name in names if name in entry)
 
 
 @audit.command()
@@ -129,9 +131,9 @@ def _line(entry: dict[str, Any]) -> str:
     "--zones",
     multiple=True,
     type=click.Path(exists=True, path_type=Path),
-    help="Manifests (file or directory) whose Zones, and zones and areas of Grants, are exported too. May be repeated.",
+    help="Manifests (file or directory) to export with the flight: Zones, and the zones and areas of Grants. May be repeated.",
 )
-@_window
+@_window_options
 def export(
     *,
     paths: tuple[Path, ...],
@@ -143,27 +145,27 @@ def export(
 ) -> None:
     """Export flight paths, verdicts, takeovers and zones from the audit logs in PATHS.
 
-    PATHS are as for `verify`, for one or several drones. geojson and kml contain paths and decisions, csv has a row for each entry, and
-    mcap contains everything for Foxglove. If the chain of a log is not sound, a warning is printed, and written to geojson, kml and mcap.
+    PATHS are as for `verify`, for one or several drones. geojson and kml contain flight paths and decisions. csv has a row for each
+    entry. mcap contains all data for Foxglove. If the chain of a log is not sound, a warning is printed, and written to geojson, kml and mcap.
     """
-    from fractus_cli.flight_export import WRITERS, Export  # noqa: PLC0415 - showing and verifying need no geometry
+    from fractus_cli.flight_export import WRITERS, Export  # noqa: PLC0415 - only this command needs geometry
 
-    found = find_logs(paths)
-    given = Export(entries(found, Window(after, before)), _places(zones), _problems(found))
+    logs = find_logs(paths)
+    data = Export(entries(logs, Window(after, before)), _areas(zones), _problems(logs))
     if file is None:
         if target == "mcap" and sys.stdout.isatty():
             raise click.ClickException("mcap is a binary format; specify --file or redirect standard output")
-        WRITERS[target](given, sys.stdout.buffer)
+        WRITERS[target](data, sys.stdout.buffer)
         return
     with file.open("wb") as out:
-        WRITERS[target](given, out)
+        WRITERS[target](data, out)
 
 
-def _places(paths: Sequence[Path]) -> Places:
+def _areas(paths: Sequence[Path]) -> Areas:
     from fractus_core.api import Grant, Zone  # noqa: PLC0415
     from fractus_services.recording.map_features import areas_of, zones_of  # noqa: PLC0415
 
-    from fractus_cli.flight_export import Places  # noqa: PLC0415
+    from fractus_cli.flight_export import Areas  # noqa: PLC0415
     from fractus_cli.manifests import BadManifest, read_manifests  # noqa: PLC0415
 
     try:
@@ -171,44 +173,45 @@ def _places(paths: Sequence[Path]) -> Places:
     except BadManifest as error:
         raise click.ClickException(str(error)) from None
     if manifests is None:
-        return Places()
+        return Areas()
     specs = [grant.spec for grant in manifests.of(Grant).values()]
-    named = {zone.name: zone for zone in zones_of(specs)} | manifests.of(Zone)
-    shapes = [(zone, "zone", "") for _, zone in sorted(named.items())]
+    zones_by_name = {zone.name: zone for zone in zones_of(specs)} | manifests.of(Zone)
+    shapes = [(zone, "zone", "") for _, zone in sorted(zones_by_name.items())]
     shapes += [(area, area.name, spec.component) for spec in specs for area in areas_of(spec)]
     if not shapes:
         raise click.ClickException(f"--zones {', '.join(map(str, paths))}: the manifests contain no Zone and no Grant")
-    return Places(shapes)
+    return Areas(shapes)
 
 
 def _checkpoints(since: tuple[str, ...], ca: Path | None) -> dict[str, Checkpoint]:
     """Return the checkpoints by log name."""
     if not since:
         return {}
-    # Imported here because verification without checkpoints does not need cryptography.
+    # Only checkpoints need cryptography.
     from cryptography import x509  # noqa: PLC0415
     from fractus_runtime.audit_checkpoints import InvalidCheckpoint, parse_status_checkpoint, read_checkpoint  # noqa: PLC0415
 
-    known: dict[str, Checkpoint] = {}
+    checkpoints: dict[str, Checkpoint] = {}
     try:
         authorities = x509.load_pem_x509_certificates(ca.read_bytes()) if ca is not None else []
     except ValueError:
         raise click.ClickException(f"--ca {ca}: contains no certificate") from None
-    for given in since:
+    for text in since:
         try:
-            checkpoint = parse_status_checkpoint(given) or read_checkpoint(Path(given).read_bytes(), authorities)
+            checkpoint = parse_status_checkpoint(text) or read_checkpoint(Path(text).read_bytes(), authorities)
         except (OSError, InvalidCheckpoint) as error:
             reason = error.strerror if isinstance(error, OSError) else error
-            raise click.ClickException(f"--since {given}: {reason}") from None
-        if checkpoint.log in known:
+            raise click.ClickException(f"--since {text}: {reason}") from None
+        if checkpoint.log in checkpoints:
             raise click.ClickException(
-                f"--since {given}: second checkpoint of {checkpoint.log}.jsonl; specify one for each log"
+                f"--since {text}: second checkpoint of {checkpoint.log}.jsonl; specify one for each log"
             )
-        known[checkpoint.log] = checkpoint
-    return known
+        checkpoints[checkpoint.log] = checkpoint
+    return checkpoints
 
 
-def _judgement(name: Path, files: list[Path], checkpoint: Checkpoint | None) -> dict[str, Any]:
+def _result(name: Path, files: list[Path], checkpoint: Checkpoint | None) -> dict[str, Any]:
+    """Return the JSON result of a verification."""
     finding, problem = verify_log(name, files, checkpoint.entry if checkpoint is not None else None)
     return {
         "log": str(name if name in files else files[0]), "files": [str(file) for file in files], "entries": finding.entries,

@@ -23,23 +23,24 @@ def find_logs(paths: Iterable[Path]) -> dict[Path, list[Path]]:
         click.ClickException: There are no logs.
     """
     paths = tuple(paths)
-    found = logs(paths)
-    if not found:
+    segments_by_log = logs(paths)
+    if not segments_by_log:
         raise click.ClickException(f"{', '.join(map(str, paths))}: no audit log (*.jsonl) found")
-    return found
+    return segments_by_log
 
 
 def verify_log(name: Path, files: list[Path], since: ChainEntry | None = None) -> tuple[Finding, str]:
     """Verify a log. Return the finding, and the problem with its file and line (empty if the log is sound).
 
     Args:
-        name: The log.
-        files: Its segments to verify.
-        since: ChainEntry that the log must contain, see `verify`.
+        name: Path of the log. It is not among `files` if only some segments are verified.
+        files: Segments to verify.
+        since: Entry that the log must contain, see `verify`.
 
     Raises:
         click.ClickException: A segment is missing.
     """
+    # Segments, each with the number of lines before it.
     begins: list[tuple[int, Path]] = [(0, files[0])]
 
     def lines() -> Iterable[bytes]:
@@ -69,47 +70,53 @@ class Window:
         return (self.begin_ns is None or time_ns >= self.begin_ns) and (self.end_ns is None or time_ns < self.end_ns)
 
 
-def entries(found: dict[Path, list[Path]], window: Window) -> Iterator[Entry]:
-    """Iterate over the entries of several logs in time order.
+def entries(segments_by_log: dict[Path, list[Path]], window: Window) -> Iterator[Entry]:
+    """Yield the entries of several logs in order of time, with the additional fields `log` (its name), `node` and `time_ns`.
 
-    Adds `log` (name of the log), `node` and `time_ns` to each entry. Skips lines that are not entries; `verify_log` reports them.
+    Lines that are not entries are skipped, because `verify_log` reports them.
     """
-    nodes = _nodes(found)
-    each = (_entries(name.stem, nodes[name], files, window) for name, files in found.items())
-    return heapq.merge(*each, key=lambda entry: entry["time_ns"])
+    nodes = _nodes(segments_by_log)
+    per_log = (_entries(name.stem, nodes[name], files, window) for name, files in segments_by_log.items())
+    return heapq.merge(*per_log, key=lambda entry: entry["time_ns"])
 
 
 def _entries(log: str, node: str, files: Iterable[Path], window: Window) -> Iterator[Entry]:
     for _, _, line in read_lines(files):
         entry = _read(line)
         time_ns = parse_time_ns(entry.get("time"))
-        # The service may have started before the window.
+        # Read this entry even if it is before the window, because it names the node of later entries.
         node = _started(entry) or node
         if time_ns is not None and time_ns in window:
             yield entry | {"log": log, "node": node, "time_ns": time_ns}
 
 
-def _nodes(found: dict[Path, list[Path]]) -> dict[Path, str]:
-    """Return the node of each log: from its `started` entry, else from another log in the directory, else the directory name."""
-    said = {name: _first_started(files) for name, files in found.items()}
-    beside: dict[Path, set[str]] = {}
-    for name, node in said.items():
-        beside.setdefault(name.parent, set()).update(filter(None, (node,)))
+def _nodes(segments_by_log: dict[Path, list[Path]]) -> dict[Path, str]:
+    """Return the node of each log.
 
-    def other(name: Path) -> str:
-        only = beside[name.parent]
-        return next(iter(only)) if len(only) == 1 else name.parent.resolve().name
+    A `started` entry names the node. A log without such an entry belongs to the node of the other logs in its directory. If they
+    name no node or several nodes, the directory name is used.
+    """
+    started = {name: _first_started(files) for name, files in segments_by_log.items()}
+    by_directory: dict[Path, set[str]] = {}
+    for name, node in started.items():
+        by_directory.setdefault(name.parent, set()).update(filter(None, (node,)))
 
-    return {name: node or other(name) for name, node in said.items()}
+    def default(name: Path) -> str:
+        nodes = by_directory[name.parent]
+        return next(iter(nodes)) if len(nodes) == 1 else name.parent.resolve().name
+
+    return {name: node or default(name) for name, node in started.items()}
 
 
 def _first_started(files: Iterable[Path]) -> str:
+    """Return the node of the first `started` entry, or an empty string."""
     return next(
         (node for _, _, line in read_lines(files) if b'"started"' in line and (node := _started(_read(line)))), ""
     )
 
 
 def _started(entry: Entry) -> str:
+    """Return the node of a `started` entry, or an empty string."""
     return str(entry.get("node") or "") if entry.get("kind") == "started" else ""
 
 
@@ -131,5 +138,5 @@ def is_decision(entry: Entry) -> bool:
 
 
 def actor(entry: Entry) -> str:
-    """Return the component that an entry is about, or else the controller."""
+    """Return the component that an entry concerns, or the controller if it concerns no component."""
     return component_of(entry) or str(entry.get("controller") or "system")

@@ -37,7 +37,7 @@ _ARGUMENT_TYPES: dict[
     "PointGimbal": PointGimbalArgs,
     "CaptureImage": CaptureArgs,
 }
-_NEEDED: dict[str, frozenset[str]] = {
+_REQUIRED: dict[str, frozenset[str]] = {
     "Goto": frozenset({"lat", "lon"}),
     "Takeoff": frozenset({"altitude_m"}),
     "SetSpeed": frozenset({"speed_mps"}),
@@ -57,11 +57,11 @@ _BOUNDS: dict[str, tuple[float, float, str]] = {
 
 
 Parser = Callable[[click.Context, click.Parameter, str | None], Any]
-"""Callback that converts the text of an option to a value."""
+"""Callback of an option that converts its text to a value."""
 
 
 def parse_numbers(*names: str) -> Parser:
-    """Return a parser of comma-separated numbers. The names define their bounds."""
+    """Return a parser of comma-separated numbers with these names. The bounds of a number depend on its name."""
 
     def parse(context: click.Context, option: click.Parameter, text: str | None) -> tuple[float, ...] | None:
         del context, option
@@ -88,12 +88,12 @@ def parse_time(context: click.Context, option: click.Parameter, text: str | None
     if text is None:
         return None
     try:
-        moment = datetime.fromisoformat(text)
+        time = datetime.fromisoformat(text)
     except ValueError:
-        moment = None
-    if moment is None or moment.tzinfo is None:
+        time = None
+    if time is None or time.tzinfo is None:
         raise click.BadParameter(f"{text!r} is not a time with a time zone, such as 2026-06-01T12:00:00Z")
-    return moment.timestamp()
+    return time.timestamp()
 
 
 def parse_call(method: str, text: str) -> Call:
@@ -105,24 +105,24 @@ def parse_call(method: str, text: str) -> Call:
     if method not in METHODS:
         raise BadManifest(f"--method: unknown method {method}; use one of: {', '.join(sorted(METHODS))}")
     try:
-        # Integers are parsed as floats, so that a very long integer is a number out of range.
-        given = json.loads(text, parse_int=float, object_pairs_hook=_reject_duplicates)
+        # Parse integers as floats, because the JSON parser fails on very long integers. As floats they are out of range.
+        values = json.loads(text, parse_int=float, object_pairs_hook=_reject_duplicates)
     except json.JSONDecodeError as error:
         raise BadManifest(f"--args: invalid JSON: {error.msg} at character {error.pos + 1}") from None
     except RecursionError:
         raise BadManifest("--args: the JSON is nested too deeply; use an object with numbers") from None
-    if not isinstance(given, dict):
+    if not isinstance(values, dict):
         raise BadManifest('--args: use a JSON object, such as {"lat": 39.36, "lon": 22.95, "alt": 10}')
     argument_type = _ARGUMENT_TYPES.get(method)
     if argument_type is None:
-        if given:
+        if values:
             raise BadManifest(f"--args: {method} takes no arguments")
         return Call(method)
     names = {_plain(f.name): f.name for f in fields(argument_type)} | {f.name: f.name for f in fields(argument_type)}
     if argument_type is GotoArgs:
         names |= {"altitude": "alt", "altitudeReference": "reference"}
     arguments: dict[str, Any] = {}
-    for name, value in given.items():
+    for name, value in values.items():
         field = names.get(name)
         if field is None:
             raise BadManifest(
@@ -132,9 +132,9 @@ def parse_call(method: str, text: str) -> Call:
             raise BadManifest(f"--args: {name} is specified twice under two names; specify it once")
         if value is not None:
             arguments[field] = _value(name, field, value)
-    missing = sorted(_NEEDED.get(method, frozenset()) - set(arguments))
+    missing = sorted(_REQUIRED.get(method, frozenset()) - set(arguments))
     if missing:
-        raise BadManifest(f"--args: {method} needs {' and '.join(missing)}")
+        raise BadManifest(f"--args: {method} requires {' and '.join(missing)}")
     args: Args = argument_type(**arguments)
     return Call(method, args)
 

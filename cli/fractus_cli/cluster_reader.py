@@ -98,7 +98,7 @@ def kube_errors_explained() -> Iterator[None]:
     except (KubeError, ExceptionGroup) as error:
         first: Exception = error
         while isinstance(first, ExceptionGroup):
-            first = first.exceptions[0]  # the first failure is the cause; it cancelled the other tasks
+            first = first.exceptions[0]  # The first failure is the cause. It cancelled the other tasks.
         if not isinstance(first, KubeError):
             raise
         remedy = "check your permissions" if first.status else "check the cluster and --kubeconfig"
@@ -115,8 +115,8 @@ def get_application(cluster: ClusterReader, namespace: str, name: str) -> Body:
     if body is not None:
         return body
     bodies = cluster.list_permitted(f"{GROUP}/namespaces/{namespace}/applications") or ()
-    near = difflib.get_close_matches(name, [b["metadata"]["name"] for b in bodies], n=1)
-    hint = f"did you mean {near[0]}?" if near else "`fractus status` lists Applications"
+    similar = difflib.get_close_matches(name, [b["metadata"]["name"] for b in bodies], n=1)
+    hint = f"did you mean {similar[0]}?" if similar else "`fractus status` lists Applications"
     raise click.ClickException(f"Application {namespace}/{name} not found; {hint}")
 
 

@@ -60,7 +60,7 @@ class Finding:
     """Result of a check.
 
     Attributes:
-        level: error: Fractus does not work until it is fixed; warning: Fractus works with restrictions.
+        level: `ok`, `warning` (Fractus works with restrictions) or `error` (Fractus does not work).
         check: Name of the check.
         message: One sentence.
         remedy: Command or action that fixes the problem. Empty if there is no problem.
@@ -113,29 +113,31 @@ def examine(cluster: ClusterReader, now: datetime) -> Iterator[Finding]:
 def _version(version: Body) -> Iterator[Finding]:
     numbers = (int(re.sub(r"\D.*", "", str(version.get(part) or "0")) or 0) for part in ("major", "minor"))
     if tuple(numbers) < MIN_VERSION:
-        needed = ".".join(map(str, MIN_VERSION))
+        required = ".".join(map(str, MIN_VERSION))
         message = f"{version.get('gitVersion')} does not support selectable CRD fields and node names in tokens"
-        yield Finding("error", "version", message, f"upgrade Kubernetes to {needed} or newer")
+        yield Finding("error", "version", message, f"upgrade Kubernetes to {required} or newer")
     else:
         yield Finding("ok", "version", f"Kubernetes {version.get('gitVersion')}")
 
 
 def _kinds(cluster: ClusterReader) -> Iterator[Finding]:
     bodies = cluster.list("/apis/apiextensions.k8s.io/v1/customresourcedefinitions")
-    known = {body["metadata"]["name"]: conditions_of(body).get("Established", {}).get("status") for body in bodies}
-    missing = [f"{k.PLURAL}.fractus.dev" for k in KINDS if known.get(f"{k.PLURAL}.fractus.dev") != "True"]
+    established = {
+        body["metadata"]["name"]: conditions_of(body).get("Established", {}).get("status") for body in bodies
+    }
+    missing = [f"{k.PLURAL}.fractus.dev" for k in KINDS if established.get(f"{k.PLURAL}.fractus.dev") != "True"]
     if missing:
         yield Finding("error", "kinds", f"{', '.join(missing)}: not installed", _CRDS)
     schemas = {body["metadata"]["name"]: _schema(body) for body in bodies}
-    lacking = [
+    missing_fields = [
         f"{kind.KIND} has no {field}"
         for kind in KINDS
         if f"{kind.PLURAL}.fractus.dev" not in missing
         for field in _missing_fields(_schema(crd(kind)), schemas[f"{kind.PLURAL}.fractus.dev"])
     ]
-    if lacking:
-        more = f" and {len(lacking) - _LISTED} more" if len(lacking) > _LISTED else ""
-        yield Finding("error", "kinds", f"CRDs of another release: {', '.join(lacking[:_LISTED])}{more}", _CRDS)
+    if missing_fields:
+        more = f" and {len(missing_fields) - _LISTED} more" if len(missing_fields) > _LISTED else ""
+        yield Finding("error", "kinds", f"CRDs of another release: {', '.join(missing_fields[:_LISTED])}{more}", _CRDS)
     elif not missing:
         yield Finding("ok", "kinds", f"all {len(KINDS)} kinds are installed")
 
@@ -148,13 +150,13 @@ def _schema(definition: Body) -> Body:
 
 
 def _missing_fields(expected: Body, installed: Body, prefix: str = "") -> Iterator[str]:
-    """Return the fields that are missing in the installed schema. The API server would drop them."""
+    """Yield the fields that are missing in the installed schema. The API server would drop their values."""
     for name, field in (expected.get("properties") or {}).items():
-        known = (installed.get("properties") or {}).get(name)
-        if known is None:
+        installed_field = (installed.get("properties") or {}).get(name)
+        if installed_field is None:
             yield f"{prefix}{name}"
         else:
-            yield from _missing_fields(field, known, f"{prefix}{name}.")
+            yield from _missing_fields(field, installed_field, f"{prefix}{name}.")
     if isinstance(expected.get("items"), dict):
         yield from _missing_fields(expected["items"], installed.get("items") or {}, prefix)
 
@@ -165,7 +167,7 @@ def _operator(cluster: ClusterReader) -> Iterator[Finding]:
         yield Finding("error", "operator", "chart fractus is not installed", _HELM)
         return
     ready = (deployment.get("status") or {}).get("readyReplicas", 0)
-    wanted = deployment["spec"].get("replicas", 1)
+    desired = deployment["spec"].get("replicas", 1)
     lease = cluster.get(f"/apis/coordination.k8s.io/v1/namespaces/{SYSTEM}/leases/fractus-operator") or {}
     leader = (lease.get("spec") or {}).get("holderIdentity")
     logs = f"kubectl -n {SYSTEM} logs deployment/fractus-operator"
@@ -173,11 +175,11 @@ def _operator(cluster: ClusterReader) -> Iterator[Finding]:
     if failed.get("status") == "True" and failed.get("reason") == "FailedCreate":
         yield Finding("error", "operator", f"pods cannot be created: {failed.get('message')}", _creation_remedy(failed))
     elif not ready or not leader:
-        yield Finding("error", "operator", f"{ready} of {wanted} ready, leader: {leader or 'none'}", logs)
-    elif ready < wanted:
-        yield Finding("warning", "operator", f"{ready} of {wanted} ready, leader: {leader}", logs)
+        yield Finding("error", "operator", f"{ready} of {desired} ready, leader: {leader or 'none'}", logs)
+    elif ready < desired:
+        yield Finding("warning", "operator", f"{ready} of {desired} ready, leader: {leader}", logs)
     else:
-        yield Finding("ok", "operator", f"{ready} of {wanted} ready, leader: {leader}")
+        yield Finding("ok", "operator", f"{ready} of {desired} ready, leader: {leader}")
 
 
 def _services(cluster: ClusterReader) -> Iterator[Finding]:
@@ -190,16 +192,16 @@ def _services(cluster: ClusterReader) -> Iterator[Finding]:
             continue
         status = body.get("status") or {}
         ready = status.get("numberReady", 0)
-        wanted = status.get("desiredNumberScheduled", 0)
-        if status.get("currentNumberScheduled", 0) < wanted:
+        desired = status.get("desiredNumberScheduled", 0)
+        if status.get("currentNumberScheduled", 0) < desired:
             failed = _creation_failure(cluster, name)
             message = f"pods of {name} cannot be created: {failed.get('message', 'reason unknown')}"
             yield Finding("error", "services", message, _creation_remedy(failed))
-        elif ready < wanted:
+        elif ready < desired:
             remedy = f"kubectl -n {SYSTEM} describe pods -l app.kubernetes.io/component={name.removeprefix('fractus-')}"
-            yield Finding("warning", "services", f"{name} is ready on {ready} of {wanted} nodes", remedy)
+            yield Finding("warning", "services", f"{name} is ready on {ready} of {desired} nodes", remedy)
         else:
-            yield Finding("ok", "services", f"{name} is ready on all {wanted} nodes")
+            yield Finding("ok", "services", f"{name} is ready on all {desired} nodes")
 
 
 def _creation_failure(cluster: ClusterReader, daemon_set: str) -> Body:
@@ -228,24 +230,24 @@ def _admission(cluster: ClusterReader) -> Iterator[Finding]:
 
 
 def _foreign_pods(cluster: ClusterReader) -> Iterator[Finding]:
-    """Find pods (for example of a network plugin) on drones and edge nodes that the admission policies reject if they are recreated."""
+    """Find running pods, for example of a network plugin, that the admission policies will reject when the pods are recreated."""
     policy = cluster.get(f"{_ADMISSION}/validatingadmissionpolicies/fractus-pods") or {}
     selector = ((policy.get("spec") or {}).get("matchConstraints") or {}).get("namespaceSelector") or {}
     exempt = [name for e in selector.get("matchExpressions") or () for name in e.get("values") or ()]
     nodes = cluster.list("/api/v1/nodes", labelSelector=f"{CLASS} in (drone, edge)")
-    guarded = {node["metadata"]["name"] for node in nodes}
-    pods = cluster.list("/api/v1/pods", fieldSelector="spec.hostNetwork=true") if exempt and guarded else ()
-    refused = {
+    protected = {node["metadata"]["name"] for node in nodes}
+    pods = cluster.list("/api/v1/pods", fieldSelector="spec.hostNetwork=true") if exempt and protected else ()
+    examples = {
         pod["metadata"]["namespace"]: f"{pod['metadata']['name']} on {pod['spec']['nodeName']}"
         for pod in pods
-        if pod["spec"].get("nodeName") in guarded
+        if pod["spec"].get("nodeName") in protected
         and pod["metadata"]["namespace"] not in exempt
         and _is_subject_to_policy(pod)
     }
     # Setting the value replaces the previous one, so each remedy lists all namespaces.
-    listed = ",".join(n for n in (*exempt, *sorted(refused)) if n != SYSTEM)
+    listed = ",".join(n for n in (*exempt, *sorted(examples)) if n != SYSTEM)
     remedy = f"if they belong to the cluster: {_HELM} --reuse-values --set 'admission.exemptNamespaces={{{listed}}}'"
-    for namespace, name in sorted(refused.items()):
+    for namespace, name in sorted(examples.items()):
         message = f"{namespace}: pods in the host network, such as {name}, will be rejected when they are recreated"
         yield Finding("warning", "admission", message, remedy)
 
@@ -292,14 +294,14 @@ def _scheduling_remedy(pod: Body) -> str:
 def _authority(config_map: Body | None, now: datetime) -> Iterator[Finding]:
     text = ((config_map or {}).get("data") or {}).get("ca.crt", "")
     if not text:
-        remedy = "the operator creates it when it starts: see the check operator"
-        yield Finding("error", "certificates", "there is no certificate authority yet", remedy)
+        remedy = "the operator creates it when it starts; see the result of the check `operator`"
+        yield Finding("error", "certificates", "the certificate authority does not exist yet", remedy)
         return
     try:
         ends = min(c.not_valid_after_utc for c in x509.load_pem_x509_certificates(text.encode()))
     except ValueError as error:
         remedy = f"kubectl -n {SYSTEM} get configmap fractus-ca -o yaml"
-        yield Finding("error", "certificates", f"the certificate authority cannot be read: {error}", remedy)
+        yield Finding("error", "certificates", f"invalid certificate authority: {error}", remedy)
         return
     if ends - now < EXPIRY:
         level: Literal["warning", "error"] = "error" if ends < now else "warning"
@@ -376,7 +378,7 @@ def _node(node: Body, node_class: str, body: Body | None) -> Iterator[Finding]:
         findings.append(Finding("error", "nodes", f"{name} has no {kind}: its agent has not registered it", remedy))
     else:
         for type_, condition in sorted(conditions_of(body).items()):
-            # Services that wait for a landing and missions are not problems.
+            # ServicesCurrent is False while services wait for a landing, and OnMission without a mission. Neither is a problem.
             if condition["status"] != "True" and type_ not in {"ServicesCurrent", "OnMission"}:
                 message = f"{name}: {type_}: {condition['reason']}: {condition.get('message', '')}".rstrip(": ")
                 remedy = f"kubectl describe {'drone' if node_class == 'drone' else 'edgenode'} {name}"
@@ -394,4 +396,4 @@ def _policies(cluster: ClusterReader) -> Iterator[Finding]:
                     "error", "policies", f"{name}: {ready.get('message')}", f"correct it: kubectl edit {name}"
                 )
     if not cluster.list(f"{GROUP}/depots"):
-        yield Finding("warning", "depots", "there is no Depot", "apply a Depot, from which drones start (see examples)")
+        yield Finding("warning", "depots", "there is no Depot", "apply a Depot, the base of drones (see examples)")

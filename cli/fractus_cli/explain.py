@@ -25,10 +25,10 @@ _LISTED = 5
 @click.command()
 @click.argument("name", metavar="APPLICATION")
 @click.option("-n", "--namespace", default="default", show_default=True, help="Namespace of the Application.")
-@click.option("--all", "everything", is_flag=True, help="List all rejected nodes and events instead of five.")
+@click.option("--all", "list_all", is_flag=True, help="List all rejected nodes and events instead of five.")
 @output_option
 @kubeconfig_option
-def explain(name: str, namespace: str, everything: bool, output: str, config: str | None) -> int:
+def explain(name: str, namespace: str, list_all: bool, output: str, config: str | None) -> int:
     """Explain where APPLICATION runs, why other nodes were rejected, and what policies changed.
 
     The exit code is 2 if there is no plan, or if policies forbid the mission as planned.
@@ -38,7 +38,7 @@ def explain(name: str, namespace: str, everything: bool, output: str, config: st
     if output == "json":
         click.echo(json.dumps(summary))
     else:
-        click.echo("\n".join(map(printable, lines(summary, None if everything else _LISTED))))
+        click.echo("\n".join(map(printable, lines(summary, None if list_all else _LISTED))))
     conflict = (summary["drone"] or {}).get("policyConflict")
     return EXIT_PROBLEM if not summary["placements"] or conflict else 0
 
@@ -103,8 +103,8 @@ def lines(summary: dict[str, Any], limit: int | None) -> Iterator[str]:
         yield "There is no plan."
     if summary["drone"]:
         yield from _drone(summary["drone"])
-    for placed in summary["placements"]:
-        yield from _placement(placed)
+    for placement in summary["placements"]:
+        yield from _placement(placement)
     yield from _rejections(summary, limit)
     yield from _policies(summary["policies"])
     if summary["forbidden"]:
@@ -117,10 +117,10 @@ def lines(summary: dict[str, Any], limit: int | None) -> Iterator[str]:
 
 def _drone(drone: Body) -> Iterator[str]:
     shared = f", flown by {drone['sharedWith']}" if drone.get("sharedWith") else ""
-    others = ", ".join(f"{a['node']} ({a['score']:.3g})" for a in drone.get("alternatives") or ())
+    alternatives = ", ".join(f"{a['node']} ({a['score']:.3g})" for a in drone.get("alternatives") or ())
     score = f" (score {drone['score']:.3g})" if drone.get("score") is not None else ""
     yield f"Drone: {drone['node']}{score}{shared}" + (
-        f"; next best: {others}" if others else "; no other drone is suitable"
+        f"; next best: {alternatives}" if alternatives else "; no other drone is suitable"
     )
     mission = drone.get("mission")
     if mission:
@@ -138,16 +138,16 @@ def _drone(drone: Body) -> Iterator[str]:
         yield f"  Conflict: {drone['policyConflict']}"
 
 
-def _placement(placed: Body) -> Iterator[str]:
+def _placement(placement: Body) -> Iterator[str]:
     reason = {
         "drone": "on the selected drone",
-        "static": f"for location {placed.get('location', 0)}",
+        "static": f"for location {placement.get('location', 0)}",
         "hybrid-edge": "covers part of the operation area",
         "hybrid-drone": "on the drone, next to the component that it serves",
         "cloud": "any cloud node",
-    }.get(placed["role"], placed["role"])
-    coverage = f", {placed['coverage']:.0%} of it" if placed.get("coverage") else ""
-    yield f"{placed['component']}: {placed.get('node') or 'cloud'} ({reason}{coverage})"
+    }.get(placement["role"], placement["role"])
+    coverage = f", {placement['coverage']:.0%} of it" if placement.get("coverage") else ""
+    yield f"{placement['component']}: {placement.get('node') or 'cloud'} ({reason}{coverage})"
 
 
 def _rejections(summary: dict[str, Any], limit: int | None) -> Iterator[str]:
@@ -161,15 +161,15 @@ def _rejections(summary: dict[str, Any], limit: int | None) -> Iterator[str]:
         if limit is not None and len(rejections) > limit:
             yield f"  and {len(rejections) - limit} more (--all)"
     if summary["rejectedOmitted"]:
-        yield f"{summary['rejectedOmitted']} more rejected nodes are not listed in the plan, most because of distance"
+        yield f"{summary['rejectedOmitted']} more rejected nodes are not listed in the plan; most of them are out of range"
 
 
 def _policies(policies: dict[str, Sequence[Body]]) -> Iterator[str]:
     for instance, granted in policies.items():
         yield f"Policies for {instance}: " + (
-            "; ".join(f"{p['name']} ({p['type']}{_in(p['zones'])})" for p in granted) or "none"
+            "; ".join(f"{p['name']} ({p['type']}{_scope(p['zones'])})" for p in granted) or "none"
         )
 
 
-def _in(zones: Sequence[str]) -> str:
+def _scope(zones: Sequence[str]) -> str:
     return f" in {', '.join(zones)}" if zones else ", everywhere"

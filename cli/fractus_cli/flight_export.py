@@ -20,7 +20,7 @@ from fractus_services.recording.segment_writer import McapWriter
 from fractus_cli.audit_logs import Entry, actor, is_decision
 
 GAP_NS = 10_000_000_000
-"""A longer gap between state entries ends a path. The flight recorder writes two entries per second while the motors run."""
+"""Time between two state entries that ends a path. While the motors run, the audit log has two state entries per second."""
 
 _COLUMNS = (
     "time", "node", "log", "kind", "lat", "lon", "alt_m", "amsl_m", "speed_mps", "battery", "mode", "controller", "component",
@@ -29,15 +29,21 @@ _COLUMNS = (
 
 
 @dataclass(frozen=True, slots=True)
-class Places:
-    """Zones and areas to export with the flight. The property `kind` of a feature is its type."""
+class Areas:
+    """Zones and areas to export with the flight.
 
-    areas: Sequence[tuple[Zone, str, str]] = ()
-    """Shapes, each with its kind and its component (empty for none)."""
+    Attributes:
+        shapes: Shapes, each with its kind and its component. The component is an empty string for zones.
+    """
+
+    shapes: Sequence[tuple[Zone, str, str]] = ()
 
     def features(self) -> list[Feature]:
-        """Return GeoJSON features."""
-        return [to_feature(zone, kind, **({"component": owner} if owner else {})) for zone, kind, owner in self.areas]
+        """Return GeoJSON features with the properties `kind` and, for areas of a component, `component`."""
+        return [
+            to_feature(zone, kind, **({"component": component} if component else {}))
+            for zone, kind, component in self.shapes
+        ]
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,12 +52,12 @@ class Export:
 
     Attributes:
         entries: Entries in time order, see `audit_logs.entries`.
-        places: Zones and areas.
+        areas: Zones and areas.
         problems: Problems of the hash chains. Empty if they are sound.
     """
 
     entries: Iterable[Entry]
-    places: Places
+    areas: Areas
     problems: Sequence[str]
 
 
@@ -66,7 +72,7 @@ class _Path:
 
 @dataclass(slots=True)
 class _DroneFlights:
-    """Paths and decisions of a drone, with positions as longitude, latitude and metres above mean sea level."""
+    """Paths and decisions of a drone. Positions are longitude and latitude in degrees, and metres above mean sea level."""
 
     paths: list[_Path] = field(default_factory=list)
     decisions: list[tuple[Entry, tuple[float, float, float] | None]] = field(default_factory=list)
@@ -96,31 +102,31 @@ class _DroneFlights:
 
 def _flights_by_node(entries: Iterable[Entry]) -> dict[str, _DroneFlights]:
     """Return paths and decisions by node. Nodes without either are omitted."""
-    flown: dict[str, _DroneFlights] = {}
+    by_node: dict[str, _DroneFlights] = {}
     for entry in entries:
-        flown.setdefault(entry["node"], _DroneFlights()).add(entry)
-    return {node: one for node, one in sorted(flown.items()) if one.paths or one.decisions}
+        by_node.setdefault(entry["node"], _DroneFlights()).add(entry)
+    return {node: flights for node, flights in sorted(by_node.items()) if flights.paths or flights.decisions}
 
 
 def write_geojson(export: Export, out: IO[bytes]) -> None:
     """Write a FeatureCollection (RFC 7946) with paths, decisions and areas. Altitudes are metres above mean sea level."""
     features: list[Feature] = []
-    flown = _flights_by_node(export.entries)
-    for path in (path for one in flown.values() for path in one.paths):
-        spots = [list(point) for point in path.points]
-        line = len(spots) > 1
+    by_node = _flights_by_node(export.entries)
+    for path in (path for flights in by_node.values() for path in flights.paths):
+        positions = [list(point) for point in path.points]
+        is_line = len(positions) > 1
         features.append({
             "type": "Feature",
             "properties": {"kind": "path", "node": path.node, "begin": _iso(path.times[0]), "end": _iso(path.times[-1])}
             | ({"times": [_iso(time_ns) for time_ns in path.times]}),
-            "geometry": {"type": "LineString" if line else "Point", "coordinates": spots if line else spots[0]},
+            "geometry": {"type": "LineString" if is_line else "Point", "coordinates": positions if is_line else positions[0]},
         })  # fmt: skip
-    for entry, at in (decision for one in flown.values() for decision in one.decisions):
+    for entry, at in (decision for flights in by_node.values() for decision in flights.decisions):
         geometry = {"type": "Point", "coordinates": list(at)} if at is not None else None
         features.append({"type": "Feature", "properties": _decision_properties(entry), "geometry": geometry})
-    features += export.places.features()
-    whole: dict[str, Any] = {"type": "FeatureCollection", "verified": not export.problems, "features": features}
-    out.write(json.dumps(whole, ensure_ascii=False, indent=1).encode() + b"\n")
+    features += export.areas.features()
+    document: dict[str, Any] = {"type": "FeatureCollection", "verified": not export.problems, "features": features}
+    out.write(json.dumps(document, ensure_ascii=False, indent=1).encode() + b"\n")
 
 
 def _decision_properties(entry: Entry) -> dict[str, Any]:
@@ -135,16 +141,15 @@ def _decision_properties(entry: Entry) -> dict[str, Any]:
 
 def write_kml(export: Export, out: IO[bytes]) -> None:
     """Write a KML document (OGC 07-147r2): a folder for each drone with flight lines and decision points, and the areas."""
-    flown = _flights_by_node(export.entries)
-    marks = [f"<description>{escape(one)}</description>\n" for one in (" ".join(export.problems),) if one]
-    marks += [_folder(node, one) for node, one in flown.items()]
-    marks += [zone_placemark(zone, []) for zone, _, _ in export.places.areas]
-    out.write(kml_document(marks).encode())
+    elements = [f"<description>{escape(' '.join(export.problems))}</description>\n"] if export.problems else []
+    elements += [_folder(node, flights) for node, flights in _flights_by_node(export.entries).items()]
+    elements += [zone_placemark(zone, []) for zone, _, _ in export.areas.shapes]
+    out.write(kml_document(elements).encode())
 
 
-def _folder(node: str, flown: _DroneFlights) -> str:
-    points = (_point(entry, at) for entry, at in flown.decisions if at is not None)
-    return f"<Folder><name>{escape(node)}</name>\n{''.join((*map(_line, flown.paths), *points))}</Folder>\n"
+def _folder(node: str, flights: _DroneFlights) -> str:
+    points = (_point(entry, at) for entry, at in flights.decisions if at is not None)
+    return f"<Folder><name>{escape(node)}</name>\n{''.join((*map(_line, flights.paths), *points))}</Folder>\n"
 
 
 def _line(path: _Path) -> str:
@@ -152,7 +157,7 @@ def _line(path: _Path) -> str:
     end = _iso(path.times[-1])
     return (
         f"<Placemark><name>flight {begin}</name><TimeSpan><begin>{begin}</begin><end>{end}</end></TimeSpan>"
-        f"<LineString><altitudeMode>absolute</altitudeMode><coordinates>{' '.join(map(_spot, path.points))}</coordinates>"
+        f"<LineString><altitudeMode>absolute</altitudeMode><coordinates>{' '.join(map(_coordinates, path.points))}</coordinates>"
         "</LineString></Placemark>\n"
     )
 
@@ -162,11 +167,11 @@ def _point(entry: Entry, at: tuple[float, float, float]) -> str:
     return (
         f"<Placemark><name>{escape(name)}</name><description>{escape(sentence(entry))}</description>"
         f"<TimeStamp><when>{_iso(entry['time_ns'])}</when></TimeStamp>"
-        f"<Point><altitudeMode>absolute</altitudeMode><coordinates>{_spot(at)}</coordinates></Point></Placemark>\n"
+        f"<Point><altitudeMode>absolute</altitudeMode><coordinates>{_coordinates(at)}</coordinates></Point></Placemark>\n"
     )
 
 
-def _spot(point: tuple[float, float, float]) -> str:
+def _coordinates(point: tuple[float, float, float]) -> str:
     lon, lat, amsl = point
     return f"{lon!r},{lat!r},{amsl:.2f}"
 
@@ -180,27 +185,27 @@ def write_csv(export: Export, out: IO[bytes]) -> None:
         policies = entry.get("policies")
         renamed = {"alt_m": entry.get("alt"), "amsl_m": entry.get("amsl"), "speed_mps": entry.get("speed")}
         names = " ".join(map(str, policies)) if isinstance(policies, list) else ""
-        added = {"component": component_of(entry), "policies": names, "time": _iso(entry["time_ns"])}
-        writer.writerow({key: value for key, value in (entry | renamed | added).items() if _plain(value)})
+        computed = {"component": component_of(entry), "policies": names, "time": _iso(entry["time_ns"])}
+        writer.writerow({key: value for key, value in (entry | renamed | computed).items() if _is_scalar(value)})
     text.detach()
 
 
-def _plain(value: object) -> bool:
+def _is_scalar(value: object) -> bool:
     return isinstance(value, str | int | float)
 
 
 def write_mcap(export: Export, out: IO[bytes]) -> None:
     """Write a file for Foxglove: location, state, decisions and log of each node, and the areas as GeoJSON."""
-    # The writer needs the file position, which a pipe does not have.
-    file = McapWriter(cast(IO[bytes], _Counted(out)))
+    # McapWriter calls tell(), which a pipe does not support.
+    file = McapWriter(cast(IO[bytes], _CountingWriter(out)))
     file.add_metadata("audit", {"verified": "no" if export.problems else "yes", "problems": "\n".join(export.problems)})
-    features = export.places.features()
+    features = export.areas.features()
     for entry in export.entries:
         time_ns = entry["time_ns"]
         node = entry["node"]
         records = list(audit_records(entry, node))
         if entry.get("kind") == "state":
-            records += _located(entry, node)
+            records += _location(entry, node)
         if features:
             records.append(zones(time_ns, features))
             features = []
@@ -209,25 +214,25 @@ def write_mcap(export: Export, out: IO[bytes]) -> None:
     file.close()
 
 
-class _Counted:
-    """Sequentially written file that counts its bytes."""
+class _CountingWriter:
+    """Output stream that counts its bytes."""
 
     def __init__(self, out: IO[bytes]) -> None:
         self._out = out
-        self._at = 0
+        self._position = 0
 
     def write(self, data: bytes) -> int:
-        self._at += len(data)
+        self._position += len(data)
         return self._out.write(data)
 
     def tell(self) -> int:
-        return self._at
+        return self._position
 
     def flush(self) -> None:
         self._out.flush()
 
 
-def _located(entry: Entry, node: str) -> Iterator[Any]:
+def _location(entry: Entry, node: str) -> Iterator[Any]:
     lat = finite_number(entry.get("lat"))
     lon = finite_number(entry.get("lon"))
     amsl = finite_number(entry.get("amsl"))

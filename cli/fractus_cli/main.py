@@ -22,7 +22,7 @@ _MARKERS = {
     "sim": "matplotlib",
     "view": "aiohttp",
 }
-"""A module of each extra. Finding it takes a millisecond; importing a command to see if it works takes a second."""
+"""A module that each extra installs. Finding it takes a millisecond, and importing a command takes up to a second."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,8 +33,8 @@ class Entry:
 
     Attributes:
         location: MODULE:ATTRIBUTE.
-        summary: Its line in `fractus --help`.
-        extra: The extra of fractus-drones that the command needs; "sim" for the distribution fractus-sim; empty for the base.
+        summary: Text in `fractus --help`.
+        extra: Extra of fractus-drones that the command requires, or an empty string. "sim" stands for the distribution fractus-sim.
     """
 
     location: str
@@ -56,15 +56,15 @@ class Entry:
 
 
 COMMANDS: dict[str, Entry] = {
-    "audit": Entry("fractus_cli.audit:audit", "Check, show and export audit logs of a node's services and agent.", "services"),
+    "audit": Entry("fractus_cli.audit:audit", "Verify, show and export audit logs of a node's services and agent.", "services"),
     "camera": Entry("fractus_services.commands:camera", "Run the camera service of a node.", "services"),
     "camera-world": Entry("fractus_world.__main__:camera_world", "Serve images of a camera above a simulated world.", "sim"),
-    "cluster": Entry("fractus_cluster.cli:cluster", "Run a multi-node Kubernetes cluster on this machine.", "sim"),
+    "cluster": Entry("fractus_cluster.cli:cluster", "Run a Kubernetes cluster of several nodes on this machine.", "sim"),
     "completion": Entry("fractus_cli.completion:completion", "Print the completion script of a shell."),
     "doctor": Entry("fractus_cli.doctor:doctor", "Check a cluster and print a remedy for each problem.", "operator"),
     "experiment": Entry("fractus_sim.experiment.cli:experiment", "Run experiments with faults, checks and a report.", "sim"),
     "explain": Entry("fractus_cli.explain:explain", "Explain the plan of an Application.", "kube"),
-    "grants": Entry("fractus_cli.grants:grants", "Sign Grants and make certificates, without Kubernetes.", "operator"),
+    "grants": Entry("fractus_cli.grants:grants", "Sign Grants and issue certificates, without Kubernetes.", "operator"),
     "images": Entry("fractus_cluster.images.cli:images", "Build the container images of Fractus with buildah.", "sim"),
     "mobility": Entry("fractus_services.commands:mobility", "Run the mobility service of a drone.", "services"),
     "plan": Entry("fractus_cli.plan:plan", "Plan Applications from manifests, without a cluster.", "geometry"),
@@ -114,14 +114,14 @@ class LazyGroup(click.Group):
 
 
 def _missing(name: str, entry: Entry, error: ImportError) -> click.Command:
-    lacking = error.name or str(error)
+    module = error.name or str(error)
 
     @click.command(name, hidden=True, add_help_option=False, context_settings={"ignore_unknown_options": True})
     @click.argument("rest", nargs=-1, type=click.UNPROCESSED)
     def hint(rest: tuple[str, ...]) -> None:
         del rest
         raise click.ClickException(
-            f"`fractus {name}` needs {lacking}; install it with: pip install '{entry.requirement}'"
+            f"`fractus {name}` requires {module}; install it with: pip install '{entry.requirement}'"
         )
 
     return hint
@@ -143,7 +143,7 @@ def run(arguments: Sequence[str] | None = None) -> int:
         outcome = fractus.main(
             args=list(arguments) if arguments is not None else None, prog_name="fractus", standalone_mode=False
         )
-    except Exception as error:  # print one line instead of a traceback
+    except Exception as error:  # Print one line instead of a traceback.
         return _report(error)
     except KeyboardInterrupt:
         return _print_error("interrupted", EXIT_INTERRUPTED)
@@ -152,7 +152,7 @@ def run(arguments: Sequence[str] | None = None) -> int:
 
 def _report(error: Exception) -> int:
     while isinstance(error, ExceptionGroup):
-        error = error.exceptions[0]  # the first failure is the cause; it cancelled the other tasks
+        error = error.exceptions[0]  # The first failure is the cause. It cancelled the other tasks.
     match error:
         case click.exceptions.NoArgsIsHelpError():
             click.echo(error.format_message())

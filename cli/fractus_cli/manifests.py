@@ -1,4 +1,4 @@
-"""Read manifests of any kinds from files and directories, and provide the inventory and Applications for planning."""
+"""Read manifests from files and directories, and provide the inventory and Applications for planning."""
 
 from __future__ import annotations
 
@@ -38,8 +38,8 @@ R = TypeVar("R", bound=Resource)
 
 _SUFFIXES = frozenset({".yaml", ".yml", ".json"})
 _ASSUMED_CLOUD = "cloud"
-_READ: tuple[type[Resource], ...] = (Application, DeploymentPlan, Depot, Drone, EdgeNode, Policy, Zone)
-_EVERY = frozenset(kind.KIND for kind in KINDS)
+_DEFAULT_KINDS: tuple[type[Resource], ...] = (Application, DeploymentPlan, Depot, Drone, EdgeNode, Policy, Zone)
+_ALL_KINDS = frozenset(kind.KIND for kind in KINDS)
 _METADATA = frozenset(
     {
         "name", "generateName", "namespace", "labels", "annotations", "finalizers", "ownerReferences", "managedFields",
@@ -70,12 +70,12 @@ class Manifest:
 
         Args:
             problem: Problem and field.
-            described: Description of the object in the message. Default: kind and name.
+            described: Description of the object in the message. Default: its kind and name.
         """
         metadata = self.body.get("metadata")
         name = metadata.get("name", "") if isinstance(metadata, dict) else ""
-        about = described or f"{self.body.get('kind')} {name}".strip()
-        return BadManifest(f"{self.where(problem.field)}: {about}: {problem}")
+        subject = described or f"{self.body.get('kind')} {name}".strip()
+        return BadManifest(f"{self.where(problem.field)}: {subject}: {problem}")
 
     def where(self, path: str = "") -> str:
         """Return FILE:LINE of a field."""
@@ -102,8 +102,8 @@ class Manifests:
 
     def applications(self) -> list[Application]:
         """Return the Applications in planning order: first those with a driver (passengers may share its drone), then by name."""
-        every = [f.resource for f in self.objects.values() if isinstance(f.resource, Application)]
-        return sorted(every, key=lambda a: (a.spec.driver is None, a.key))
+        applications = [f.resource for f in self.objects.values() if isinstance(f.resource, Application)]
+        return sorted(applications, key=lambda a: (a.spec.driver is None, a.key))
 
     def previous(self, application: Application) -> DeploymentPlan | None:
         """Return the current plan of an Application if the manifests contain it."""
@@ -152,15 +152,15 @@ class Unlimited(Mapping[str, float]):
         return math.inf
 
     def __iter__(self) -> Iterator[str]:
-        """Contain no named resource."""
+        """Return an empty iterator, because no resource is limited."""
         return iter(())
 
     def __len__(self) -> int:
-        """Contain no named resource."""
+        """Return 0, because no resource is limited."""
         return 0
 
 
-def read_manifests(paths: Iterable[pathlib.Path], kinds: Iterable[type[Resource]] = _READ) -> Manifests:
+def read_manifests(paths: Iterable[pathlib.Path], kinds: Iterable[type[Resource]] = _DEFAULT_KINDS) -> Manifests:
     """Read files, and the .yaml, .yml and .json files in directories, recursively.
 
     Args:
@@ -242,7 +242,7 @@ def _resource(manifest: Manifest, kinds: Mapping[str, type[Resource]]) -> Resour
             return None
         metadata = body.get("metadata")
         if not isinstance(metadata, dict) or not isinstance(metadata.get("name"), str):
-            raise InvalidObject("metadata.name", "must be a text; give the object a name")
+            raise InvalidObject("metadata.name", "must be a string; specify the name of the object")
         unknown = sorted(metadata.keys() - _METADATA)
         if unknown:
             raise InvalidObject(f"metadata.{unknown[0]}", "there is no such field; remove it, or correct its name")
@@ -252,21 +252,21 @@ def _resource(manifest: Manifest, kinds: Mapping[str, type[Resource]]) -> Resour
 
 
 def _is_read(body: Mapping[str, Any], kinds: Collection[str]) -> bool:
-    """Return True if the object is read, False if it is of another project or of no use here.
+    """Return True if an object must be parsed. Objects of other projects and kinds that are not in `kinds` are skipped.
 
     Raises:
-        InvalidObject: The object claims to be of a Fractus kind that does not exist.
+        InvalidObject: The object has a kind that the group of Fractus does not have, or a kind of Fractus in a wrong group.
     """
     kind = str(body.get("kind"))
     version = body.get("apiVersion")
-    if version is None and kind in _EVERY:
+    if version is None and kind in _ALL_KINDS:
         raise InvalidObject("apiVersion", f"is missing; write {API_VERSION}")
     group, _, _ = str(version).rpartition("/")
-    if kind in _EVERY and group != GROUP and (not group or difflib.get_close_matches(group, [GROUP], cutoff=0.7)):
+    if kind in _ALL_KINDS and group != GROUP and (not group or difflib.get_close_matches(group, [GROUP], cutoff=0.7)):
         raise InvalidObject("apiVersion", f"{version} has no kind {kind}; write {API_VERSION}")
-    if group == GROUP and kind not in _EVERY:
-        near = difflib.get_close_matches(kind, _EVERY, n=1)
-        hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(sorted(_EVERY))}"
+    if group == GROUP and kind not in _ALL_KINDS:
+        similar = difflib.get_close_matches(kind, _ALL_KINDS, n=1)
+        hint = f"did you mean {similar[0]}?" if similar else f"use one of: {', '.join(sorted(_ALL_KINDS))}"
         raise InvalidObject("kind", f"{GROUP} has no kind {kind}; {hint}")
     return kind == "Node" or (kind in kinds and group == GROUP)
 
@@ -281,14 +281,14 @@ def _host(document: dict[str, Any]) -> Host:
     spec = _part(document, "spec")
     status = _part(document, "status")
     labels = _part(metadata, "labels", "metadata.labels")
-    described = _part(status, "allocatable", "status.allocatable") or _part(status, "capacity", "status.capacity")
+    resources = _part(status, "allocatable", "status.allocatable") or _part(status, "capacity", "status.capacity")
     conditions = status.get("conditions") or ()
     if not isinstance(conditions, list | tuple) or not all(isinstance(c, dict) for c in conditions):
         raise InvalidObject("status.conditions", "must be a list of conditions")
     allocatable: Mapping[str, float] = Unlimited()
-    if described:
+    if resources:
         amounts: dict[str, float] = {}
-        for resource, amount in described.items():
+        for resource, amount in resources.items():
             try:
                 amounts[resource] = amount_of(amount)
             except (ValueError, TypeError):

@@ -40,9 +40,9 @@ def plan_all(manifests: Manifests, settings: Settings) -> list[PlanResult]:
     if not applications:
         raise BadManifest("the manifests contain no Application; specify a file with an Application")
     for application in applications:
-        before = manifests.previous(application)
-        if before is not None:
-            current_plans[application.key] = (application, before.spec)
+        current_plan = manifests.previous(application)
+        if current_plan is not None:
+            current_plans[application.key] = (application, current_plan.spec)
     for application in applications:
         previous = current_plans.pop(application.key, (application, None))[1]
         available = inventory
@@ -65,7 +65,7 @@ def plan_all(manifests: Manifests, settings: Settings) -> list[PlanResult]:
 
 
 def _without(inventory: Inventory, application: Application, plan: DeploymentPlanSpec) -> Inventory:
-    """Return the inventory for the next Application: the drone is claimed and the resources are booked."""
+    """Return the inventory without the drone and the resources that a plan uses."""
     hosts: dict[str, Host] = dict(inventory.hosts)
     components = {component.name: component for component in application.spec.components}
     for placed in plan.placements:

@@ -80,16 +80,16 @@ def plan(
     ignores all other kinds. Prints the DeploymentPlans that the operator would create. A DeploymentPlan in the input is
     treated as the current plan: placements that are still feasible are kept.
 
-    Nodes define resources (status.allocatable) and readiness. Nodes with the label fractus.dev/class=cloud or
+    Nodes specify resources (status.allocatable) and readiness. Nodes with the label fractus.dev/class=cloud or
     fractus.dev/cloud=true form the cloud. If there is no Node object, each Drone and EdgeNode has a Node with unlimited
     resources, and there is a cloud. A Drone without a Ready condition is assumed to be Ready, and fully charged if it has
     no battery status.
 
-    Applications are planned one after the other: first those with a driver, then by name. Each of them claims its drone
-    and its resources.
+    Applications are planned one after the other: first Applications with a driver, then the others, each by name. A planned
+    Application claims its drone and its resources.
 
-    The route of each drone is judged by the Policies and Zones that apply at --time and at the end of the mission. The plan
-    lists the legs that are denied, corrected or replaced by a detour.
+    The Policies and Zones at --time and at the end of the mission apply to the route of each drone. The plan lists the legs that
+    are denied, corrected or replaced by a detour.
 
     Exit code: 0 if all Applications are feasible, 2 if one is infeasible, 1 for bad input. In yaml and json, an infeasible
     Application has the annotation fractus.dev/infeasible, no placements, and the rejected nodes. The operator creates no
@@ -155,8 +155,8 @@ def _as_yaml(results: Sequence[PlanResult]) -> str:
 
 def _as_json(results: Sequence[PlanResult]) -> str:
     bodies = _bodies(results)
-    whole = bodies[0] if len(bodies) == 1 else {"apiVersion": "v1", "kind": "List", "items": bodies}
-    return json.dumps(whole, indent=2) + "\n"
+    document = bodies[0] if len(bodies) == 1 else {"apiVersion": "v1", "kind": "List", "items": bodies}
+    return json.dumps(document, indent=2) + "\n"
 
 
 def _as_geojson(results: Sequence[PlanResult], inventory: Inventory, settings: Settings) -> str:

@@ -29,7 +29,7 @@ Feature = dict[str, Any]
 def plan_map(
     application: Application, plan: DeploymentPlanSpec, inventory: Inventory, settings: Settings
 ) -> Iterator[Feature]:
-    """Return features for the operation area, the part of each control point, the route, transit legs, and nodes."""
+    """Yield features: the operation area, its part for each control point, the route, transit legs and nodes."""
     name = "/".join(application.key)
     area = operation_area(application.spec, inventory.depots, settings.safety_radius_m)
     if plan.operation_area is not None:
@@ -45,18 +45,18 @@ def plan_map(
     for leg in plan.drone.transit if plan.drone is not None else ():
         yield _feature(line_geojson((leg.start, leg.end)), name, "transit", {"stroke": "#7f7f7f"})
     for node, instances in _by_node(plan.placements).items():
-        place = _place(node, inventory)
-        if place is not None:
+        position = _position(node, inventory)
+        if position is not None:
             components = ", ".join(f"{p.component} ({p.role})" for p in instances)
             colour = next((c for role, c in _COLOURS.items() if any(p.role == role for p in instances)), "#7f7f7f")
-            shape = {"type": "Point", "coordinates": [place.lon, place.lat]}
+            shape = {"type": "Point", "coordinates": [position.lon, position.lat]}
             properties = {"marker-color": colour, "node": node, "instances": [p.instance for p in instances]}
             yield _feature(shape, name, components, properties)
 
 
 def _feature(geometry: Mapping[str, Any], application: str, title: str, properties: Mapping[str, Any]) -> Feature:
-    whole = {"application": application, "title": title, **properties}
-    return {"type": "Feature", "properties": whole, "geometry": dict(geometry)}
+    all_properties = {"application": application, "title": title, **properties}
+    return {"type": "Feature", "properties": all_properties, "geometry": dict(geometry)}
 
 
 def _by_node(placements: Sequence[PlannedInstance]) -> dict[str, list[PlannedInstance]]:
@@ -67,7 +67,7 @@ def _by_node(placements: Sequence[PlannedInstance]) -> dict[str, list[PlannedIns
     return nodes
 
 
-def _place(node: str, inventory: Inventory) -> Point | None:
+def _position(node: str, inventory: Inventory) -> Point | None:
     located = inventory.located()
     for index in (located.edge_nodes, located.stands):
         if node in index:

@@ -30,6 +30,7 @@ from fractus_cli.output import output_option
 R = TypeVar("R", bound=Resource)
 
 IN_AIR_M = 0.5
+"""Altitude above home, in metres, from which the drone counts as flying."""
 
 
 @click.group()
@@ -128,34 +129,33 @@ def _question(paths: Sequence[pathlib.Path], drone_file: pathlib.Path, options: 
     files = {path.resolve(): path for path in (*paths, drone_file, application) if path is not None}.values()
     manifests = read_manifests(_without_nested(list(files)))
     if not manifests.of(Policy):
-        click.echo("note: --policies has no Policy; only the limits of the drone apply", err=True)
+        click.echo("note: --policies contains no Policy, so only the limits of the drone apply", err=True)
     drone = _drone(manifests, drone_file)
-    grant = (
-        _unrestricted_grant(manifests, drone)
-        if application is None
-        else _planned_grant(manifests, drone, application, component)
-    )
+    if application is None:
+        grant = _unrestricted_grant(manifests, drone)
+    else:
+        grant = _planned_grant(manifests, drone, application, component)
     return Question(call, _situation(drone, options), grant)
 
 
 def _without_nested(paths: list[pathlib.Path]) -> list[pathlib.Path]:
-    """Return the paths that are not inside another one, because each object must be read only once."""
+    """Return the paths that are not inside another path, so that each object is read only once."""
     directories = [path.resolve() for path in paths if path.is_dir()]
     return [p for p in paths if not any(d in p.resolve().parents for d in directories)]
 
 
-def _from(manifests: Manifests, path: pathlib.Path, kind: type[R]) -> list[R]:
+def _objects_in(manifests: Manifests, path: pathlib.Path, kind: type[R]) -> list[R]:
     """Return the objects of a kind that were read from a file or directory."""
-    inside = path.resolve()
+    root = path.resolve()
     return [
         loaded.resource
         for loaded in manifests.objects.values()
-        if isinstance(loaded.resource, kind) and loaded.manifest.file.resolve().is_relative_to(inside)
+        if isinstance(loaded.resource, kind) and loaded.manifest.file.resolve().is_relative_to(root)
     ]
 
 
 def _drone(manifests: Manifests, file: pathlib.Path) -> Drone:
-    drones = _from(manifests, file, Drone)
+    drones = _objects_in(manifests, file, Drone)
     if len(drones) != 1:
         names = ", ".join(sorted(drone.name for drone in drones)) or "none"
         raise BadManifest(f"{file}: --drone must contain exactly one Drone, not {len(drones)} ({names})")
@@ -168,7 +168,7 @@ def _planned_grant(manifests: Manifests, drone: Drone, file: pathlib.Path, compo
     Raises:
         BadManifest: The component does not exist, or there is no plan that places it on the drone.
     """
-    applications = _from(manifests, file, Application)
+    applications = _objects_in(manifests, file, Application)
     if len(applications) != 1:
         raise BadManifest(f"{file}: --application must contain exactly one Application, not {len(applications)}")
     application = applications[0]
@@ -195,6 +195,9 @@ def _unrestricted_grant(manifests: Manifests, drone: Drone) -> GrantSpec:
     features = drone.spec.services.mobility
     depots = manifests.inventory().depots
     depot = depots.get(drone.spec.depot or "")
+    limits = None
+    if features:
+        limits = GrantedLimits(max_altitude=features.max_altitude, max_speed=features.max_speed)
     grant = GrantSpec.model_validate(
         {
             "node": drone.name,
@@ -206,9 +209,7 @@ def _unrestricted_grant(manifests: Manifests, drone: Drone) -> GrantSpec:
             "services": [{"service": service, "methods": sorted(methods)} for service, methods in METHODS_OF.items()],
             "depot": depot.spec.location if depot is not None else None,
             "home": drone.spec.home,
-            "limits": GrantedLimits(max_altitude=features.max_altitude, max_speed=features.max_speed)
-            if features
-            else None,
+            "limits": limits,
         }
     )
     return refresh(grant, manifests.inventory())
@@ -220,7 +221,7 @@ def _situation(drone: Drone, options: Mapping[str, Any]) -> Situation:
     time_s = options["time_s"] if options["time_s"] is not None else datetime.now(tz=UTC).timestamp()
     flying = alt > IN_AIR_M
     camera = drone.spec.services.camera
-    moved = camera is not None and camera.mount is not None and camera.mount.gimbal
+    has_gimbal = camera is not None and camera.mount is not None and camera.mount.gimbal
     return Situation(
         time_s=time_s,
         lat=lat,
@@ -233,8 +234,8 @@ def _situation(drone: Drone, options: Mapping[str, Any]) -> Situation:
         armed=flying,
         in_air=flying,
         airframe=Airframe(retraces=options["way_home"] == "retraced"),
-        # The attitude of a gimbal is unknown here, because it is measured in flight.
-        attitude=None if moved else Attitude(0.0, 0.0, math.degrees(math.atan2(east, north))),
+        # The attitude of a gimbal is measured only in flight.
+        attitude=None if has_gimbal else Attitude(0.0, 0.0, math.degrees(math.atan2(east, north))),
         lens=bounding_lens(camera),
     )
 
@@ -242,11 +243,11 @@ def _situation(drone: Drone, options: Mapping[str, Any]) -> Situation:
 def _home(drone: Drone, options: Mapping[str, Any]) -> Home:
     if options["home"] is not None:
         return Home(*options["home"])
-    stated = drone.spec.home
-    if stated is None:
+    home = drone.spec.home
+    if home is None:
         return Home(options["at"][0], options["at"][1], 0.0)
-    known = stated.alt is not None and stated.altitude_reference == "amsl"
-    return Home(stated.lat, stated.lon, stated.alt if known and stated.alt is not None else 0.0)
+    amsl_m = home.alt if home.altitude_reference == "amsl" else None
+    return Home(home.lat, home.lon, amsl_m or 0.0)
 
 
 # -- output --
@@ -259,7 +260,7 @@ def _arguments_of(verdict: Verdict) -> dict[str, Any] | None:
 
 
 def _as_json(verdict: Verdict) -> str:
-    whole = {
+    document = {
         "action": verdict.action,
         "takeover": verdict.takeover,
         "args": _arguments_of(verdict),
@@ -269,7 +270,7 @@ def _as_json(verdict: Verdict) -> str:
         "brakeFirst": verdict.brake_first,
         "filters": [f.action for f in verdict.filters],
     }
-    return json.dumps(whole, indent=2) + "\n"
+    return json.dumps(document, indent=2) + "\n"
 
 
 def _as_text(verdict: Verdict) -> str:

@@ -20,7 +20,8 @@ from fractus_core.identity.authority import Authority, BrokenAuthority, Data
 from fractus_core.identity.grant_signer import GrantSigner
 from fractus_runtime.files import write_file
 
-LIFE = timedelta(days=365)
+DEFAULT_LIFE = timedelta(days=365)
+"""Default validity of the certificates of nodes and components."""
 
 
 def _now() -> datetime:
@@ -38,7 +39,11 @@ class StandalonePki:
     """
 
     def __init__(
-        self, directory: Path, authority: Authority, clock: Callable[[], datetime] = _now, life: timedelta = LIFE
+        self,
+        directory: Path,
+        authority: Authority,
+        clock: Callable[[], datetime] = _now,
+        life: timedelta = DEFAULT_LIFE,
     ) -> None:
         self._directory = directory
         self._authority = authority
@@ -47,7 +52,7 @@ class StandalonePki:
         self._signer = GrantSigner(authority, clock)
 
     @classmethod
-    def create(cls, directory: Path, clock: Callable[[], datetime] = _now, life: timedelta = LIFE) -> Self:
+    def create(cls, directory: Path, clock: Callable[[], datetime] = _now, life: timedelta = DEFAULT_LIFE) -> Self:
         """Open a directory. Create its certificate authority if there is none.
 
         Raises:
@@ -58,7 +63,7 @@ class StandalonePki:
         return cls.open(directory, clock, life)
 
     @classmethod
-    def open(cls, directory: Path, clock: Callable[[], datetime] = _now, life: timedelta = LIFE) -> Self:
+    def open(cls, directory: Path, clock: Callable[[], datetime] = _now, life: timedelta = DEFAULT_LIFE) -> Self:
         """Open a directory.
 
         Raises:
@@ -68,7 +73,7 @@ class StandalonePki:
         data = _read(folder)
         if not data:
             raise BrokenAuthority(
-                f"{folder}: no certificate authority; create it with: fractus grants init {directory}"
+                f"{folder}: certificate authority not found; create it with: fractus grants init {directory}"
             )
         try:
             return cls(directory, Authority.from_data(data), clock, life)
@@ -94,21 +99,21 @@ class StandalonePki:
         Raises:
             InvalidObject: The identity is invalid.
         """
-        found = ComponentIdentity.parse(identity)
-        if found is None or not is_subdomain(found.namespace) or not is_subdomain(found.instance):
+        parsed = ComponentIdentity.parse(identity)
+        if parsed is None or not is_subdomain(parsed.namespace) or not is_subdomain(parsed.instance):
             raise InvalidObject("spec.instance", f"{identity} is not the identity of a component instance")
-        folder = self._directory / "components" / f"{found.namespace}.{found.instance}"
+        folder = self._directory / "components" / f"{parsed.namespace}.{parsed.instance}"
         now = self._clock()
         if self._authority.is_current(_read(folder), identity, now):
             return folder
         return _write(folder, self._authority.issue_component(identity, now, self._life))
 
     def sign(self, manifest: dict[str, Any], replaces: Grant | None = None) -> dict[str, Any]:
-        """The manifest of a Grant, signed.
+        """Return the signed manifest of a Grant.
 
         Args:
-            manifest: The Grant.
-            replaces: Older Grant that this one must take precedence over.
+            manifest: Manifest of the Grant.
+            replaces: Earlier Grant that the signed Grant replaces.
 
         Raises:
             InvalidObject: The manifest is not a Grant.
@@ -119,8 +124,8 @@ class StandalonePki:
         """Sign a Grant and store it atomically in the directory that the services of its node read.
 
         Args:
-            manifest: The Grant.
-            grants: Directory (--grants of the services).
+            manifest: Manifest of the Grant.
+            grants: Directory that the services read (their option --grants).
 
         Raises:
             InvalidObject: The manifest is not a Grant, does not limit the drone, or its node has no certificate.
@@ -129,7 +134,8 @@ class StandalonePki:
         name = parsed.name
         if not (self._directory / "nodes" / parsed.spec.node / "tls.crt").is_file():
             raise InvalidObject(
-                "spec.node", f"{parsed.spec.node} has no certificate here; issue it with: fractus grants init --node"
+                "spec.node",
+                f"{parsed.spec.node} has no certificate in this directory; issue it with: fractus grants init --node",
             )
         if "/" in name or name.startswith("."):
             raise InvalidObject("metadata.name", f"{name!r} is not a valid file name")

@@ -12,7 +12,7 @@ import click
 from fractus_cli.cluster_reader import GROUP, Body, ClusterReader, conditions_of, kubeconfig_option, open_cluster, table
 from fractus_cli.output import output_option, printable
 
-PERIOD_S = 2.0
+WATCH_INTERVAL_S = 2.0
 
 
 @click.command()
@@ -23,7 +23,7 @@ PERIOD_S = 2.0
 def status(namespace: str, watch: bool, output: str, config: str | None) -> None:
     """Show the drones, edge nodes and Applications of a cluster.
 
-    With permissions in a single namespace, use --namespace. Only the Applications are shown then.
+    Users with permissions in one namespace must specify --namespace. The output then contains only Applications.
     """
     with open_cluster(config) as cluster:
         while True:
@@ -33,7 +33,7 @@ def status(namespace: str, watch: bool, output: str, config: str | None) -> None
             click.echo(json.dumps(summary) if output == "json" else "\n".join(map(printable, lines(summary))))
             if not watch:
                 return
-            time.sleep(PERIOD_S)
+            time.sleep(WATCH_INTERVAL_S)
 
 
 def collect(cluster: ClusterReader, namespace: str) -> dict[str, Any]:
@@ -69,15 +69,19 @@ def lines(summary: dict[str, Any]) -> list[str]:
         (f"{a['namespace']}/{a['name']}", a["phase"], a["drone"], a["pods"], a["message"])
         for a in summary["applications"]
     ]
-    shown = table(("APPLICATION", "PHASE", "DRONE", "PODS", "MESSAGE"), applications)
+    application_table = table(("APPLICATION", "PHASE", "DRONE", "PODS", "MESSAGE"), applications)
     if summary["forbidden"]:
-        return [*shown, "", f"You are not permitted to list {' and '.join(summary['forbidden'])} of this cluster."]
+        return [
+            *application_table,
+            "",
+            f"You are not permitted to list {' and '.join(summary['forbidden'])} of this cluster.",
+        ]
     return [
         *table(("DRONE", "STATE", "CONTROLLER", "BATTERY", "READY", "SERVICES", "LAST SEEN", "MESSAGE"), drones),
         "",
         *table(("EDGE NODE", "READY", "SERVICES", "LAST SEEN", "MESSAGE"), edges),
         "",
-        *shown,
+        *application_table,
     ]
 
 

@@ -57,31 +57,31 @@ def import_(file: pathlib.Path, source: str, prefix: str, without: tuple[str, ..
     except BadManifest as error:
         raise click.ClickException(str(error)) from None
     try:
-        found = read(content.decode("utf-8-sig"), without)
-        named = [_renamed(zone, prefix) for zone in found.zones]
-        for zone in named:
+        imported = read(content.decode("utf-8-sig"), without)
+        zones = [_renamed(zone, prefix) for zone in imported.zones]
+        for zone in zones:
             check_zone(zone)
     except UnicodeDecodeError:
         raise click.ClickException(f"{file}: not a UTF-8 text file") from None
     except formats.InexactFeatures as error:
-        *most, last = (f"{_where(file, content, one)}: {one}" for one in error.every)
-        _print_notes(most)
+        *notes, last = (f"{_where(file, content, problem)}: {problem}" for problem in error.every)
+        _print_notes(notes)
         raise click.ClickException(last) from None
     except InvalidObject as error:
         raise click.ClickException(f"{file}: {error}") from None
-    _print_notes(found.notes)
-    if not named:
+    _print_notes(imported.notes)
+    if not zones:
         raise click.ClickException(f"{file}: the file contains no zone")
-    click.echo(dump_documents(map(_manifest, named)), nl=False)
+    click.echo(dump_documents(map(_manifest, zones)), nl=False)
 
 
 def _where(file: pathlib.Path, content: bytes, problem: InvalidObject) -> str:
-    """Return the location of a field, with its line for JSON formats."""
+    """Return the file of a problem, with the line of its field for JSON formats."""
     try:
-        found = parse_documents(content, str(file), is_json=True)
+        documents = parse_documents(content, str(file), is_json=True)
     except BadDocument:
         return str(file)
-    return found.where(found.values[0], problem.field) if found.values else str(file)
+    return documents.where(documents.values[0], problem.field) if documents.values else str(file)
 
 
 @zones.command("export")
@@ -93,18 +93,18 @@ def export(paths: tuple[pathlib.Path, ...], target: str, inclusion: bool) -> Non
     if inclusion and target != "qgc-plan":
         raise click.ClickException("--inclusion requires --to qgc-plan")
     try:
-        every = sorted(read_manifests(paths).of(Zone).values(), key=lambda zone: zone.name)
+        zones = sorted(read_manifests(paths).of(Zone).values(), key=lambda zone: zone.name)
     except BadManifest as error:
         raise click.ClickException(str(error)) from None
-    if not every:
+    if not zones:
         raise click.ClickException("the manifests contain no Zone")
     write = _WRITERS.get(target)
     try:
-        found = write(every) if write is not None else formats.write_qgc_plan(every, inclusion=inclusion)
+        exported = write(zones) if write is not None else formats.write_qgc_plan(zones, inclusion=inclusion)
     except InvalidObject as error:
         raise click.ClickException(str(error)) from None
-    _print_notes(found.notes)
-    click.echo(found.text, nl=False)
+    _print_notes(exported.notes)
+    click.echo(exported.text, nl=False)
 
 
 def _renamed(zone: Zone, prefix: str) -> Zone:

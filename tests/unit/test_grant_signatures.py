@@ -436,7 +436,7 @@ def test_policy_without_zone_area_is_not_signed() -> None:
 
 def test_standalone_pki_signs_no_grant_for_node_without_certificate(tmp_path: Path) -> None:
     pki = StandalonePki.create(tmp_path / "pki")
-    with pytest.raises(InvalidObject, match="drone-1 has no certificate here"):
+    with pytest.raises(InvalidObject, match="drone-1 has no certificate in this directory"):
         pki.grant(manifest(), tmp_path / "grants")
     pki.node("drone-1")
     assert pki.grant(manifest(), tmp_path / "grants").is_file()

@@ -237,7 +237,7 @@ BOW_TIE = [{"lat": 0, "lon": 0}, {"lat": 1e-3, "lon": 1e-3}, {"lat": 0, "lon": 1
         ([{"kind": "Drone", "metadata": {}}], "Drone: apiVersion: is missing; write fractus.dev/v1alpha1"),
         (
             [{"apiVersion": "fractus.dev/v1alpha1", "kind": "Drone"}],
-            "Drone: metadata.name: must be a text; give the object a name",
+            "Drone: metadata.name: must be a string; specify the name of the object",
         ),
         (
             [TRAFFIC | {"kind": "Aplication"}],

@@ -115,7 +115,7 @@ def test_text_output_has_action_arguments_and_policies() -> None:
     ("options", "sentence"),
     [
         (("--method", "Fly", "--at", POSITION), "unknown method Fly"),
-        (("--method", "Goto", "--at", POSITION), "Goto needs lat and lon"),
+        (("--method", "Goto", "--at", POSITION), "Goto requires lat and lon"),
         (("--method", "Goto", "--args", "{", "--at", POSITION), "invalid JSON"),
         (("--method", "Goto", "--args", "[1]", "--at", POSITION), "JSON object"),
         (("--method", "Goto", "--args", '{"lat": "x", "lon": 1}', "--at", POSITION), "lat must be a number"),
@@ -126,7 +126,7 @@ def test_text_output_has_action_arguments_and_policies() -> None:
         (("--method", "Land", "--at", "91,2,3"), "lat must be"),
         (("--method", "Land", "--at", "1,2,1e300"), "alt must be"),
         (("--method", "Land", "--at", POSITION, "--velocity", "1e300,0,0"), "n must be"),
-        (("--method", "Goto", "--args", '{"lat": null, "lon": 1}', "--at", POSITION), "Goto needs lat"),
+        (("--method", "Goto", "--args", '{"lat": null, "lon": 1}', "--at", POSITION), "Goto requires lat"),
         (("--method", "Goto", "--args", '{"lat": true, "lon": 1}', "--at", POSITION), "lat must be a number"),
         (("--method", "Goto", "--args", '{"lat": 1, "lon": 1, "alt": 1, "altitude": 2}', "--at", POSITION), "twice"),
         (
@@ -183,4 +183,4 @@ def test_zones_are_found_in_another_file_than_their_policies(tmp_path: pathlib.P
 
 def test_missing_policies_are_reported() -> None:
     result = run("--method", "Goto", "--args", json.dumps(FREE), "--at", POSITION, policies=DRONE)
-    assert (result.exit_code, "has no Policy" in result.stderr) == (0, True)
+    assert (result.exit_code, "contains no Policy" in result.stderr) == (0, True)

@@ -128,10 +128,11 @@ format: env ## Format the code
 	$(RUN) ruff format
 
 .PHONY: generate
-generate: env ## Generate the CRDs, the stubs of the .proto files, the chart's defaults and the charts' README.md
+generate: env ## Generate the CRDs, the stubs of the .proto files, the types of the page's events, the chart's defaults and the charts' README.md
 	$(RUN) python -m fractus_core.api.crd crds
 	$(RUN) python -m grpc_tools.protoc -Iproto --python_out=proto --pyi_out=proto --grpc_python_out=proto \
 		proto/fractus_proto/v1/*.proto
+	$(RUN) python -m fractus_view.typescript view/web/src/events.ts
 	cp charts/fractus/values.yaml charts/fractus/files/values.yaml
 	$(RUN) python docs/pages.py
 

@@ -21,9 +21,9 @@ from typing import Any
 
 from aiohttp import web
 from axe_playwright_python.async_playwright import Axe
-from fractus_view.events import Areas, Event, Fix, State
+from fractus_view.events import Areas, Event, Feature, Fix, State
 from fractus_view.hub import Hub
-from fractus_view.server import View
+from fractus_view.server import ViewServer
 from playwright.async_api import Browser, async_playwright
 
 MAX_MAP_MS = 1_000.0
@@ -63,8 +63,11 @@ class Fleet:
         self.count = count
         self.hub = Hub()
         corners = [[22.94, 39.35], [22.96, 39.35], [22.96, 39.37], [22.94, 39.37], [22.94, 39.35]]
-        area = {"type": "Polygon", "coordinates": [corners]}
-        feature = {"type": "Feature", "properties": {"kind": "zone", "name": "field"}, "geometry": area}
+        feature: Feature = {
+            "type": "Feature",
+            "properties": {"kind": "zone", "name": "field"},
+            "geometry": {"type": "Polygon", "coordinates": [corners]},
+        }
         self.hub.publish([Areas("bench", round(time.time() * 1000), [feature]), *self.events()])
 
     def events(self) -> list[Event]:
@@ -95,7 +98,7 @@ class Fleet:
 
 async def measure(browser: Browser, count: int, seconds: float) -> dict[str, float]:
     """The map's delay, and frames and scripts' time (ms) while some drones fly."""
-    shown = View(Fleet(count), frozenset())
+    shown = ViewServer(Fleet(count), frozenset())
     runner = web.AppRunner(shown.application(), shutdown_timeout=0.1)
     await runner.setup()
     site = web.TCPSite(runner, "127.0.0.1", 0)

@@ -10,9 +10,8 @@ import json
 import re
 from collections.abc import AsyncIterator, Callable, Iterable
 from contextlib import aclosing
-from dataclasses import fields
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 from unittest.mock import AsyncMock
 
 import pytest
@@ -24,12 +23,13 @@ from fractus_services.recording import messages
 from fractus_services.recording.messages import Record
 from fractus_services.recording.segment_writer import McapWriter
 from fractus_view import command, server
-from fractus_view.command import Site, view
+from fractus_view.command import ServerOptions, view
 from fractus_view.events import Event, Fix, Problem, State, Verdict
 from fractus_view.hub import RECENT, TRAIL, Hub, Trail
-from fractus_view.mcap_tail import Damaged, Tail
-from fractus_view.server import PAGE, View
-from fractus_view.sources import Following, Replay
+from fractus_view.mcap_tail import DamagedFile, Tail
+from fractus_view.server import PAGE, ViewServer
+from fractus_view.sources import GrowingRecordings, Replay
+from fractus_view.typescript import typescript_types
 from scraping import scraped, values
 
 ROOT = Path(__file__).parents[2]
@@ -98,9 +98,9 @@ def test_damaged_recording_is_reported_and_its_beginning_is_shown(recording: Pat
     events = list(Replay([recording]).events())
     assert events_of(Fix, events)
     (problem,) = events_of(Problem, events)
-    assert "damaged" in problem.text
+    assert "the rest of a recording cannot be read" in problem.text
     recording.write_bytes(b"no recording at all")
-    with pytest.raises(Damaged, match="not an MCAP"):
+    with pytest.raises(DamagedFile, match="not an MCAP"):
         list(Tail(recording).read())
 
 
@@ -222,7 +222,7 @@ def test_trail_covers_the_flight_with_a_limited_number_of_positions() -> None:
 
 
 async def test_recordings_directory_is_followed_while_services_write(tmp_path: Path) -> None:
-    following = Following(tmp_path)
+    following = GrowingRecordings(tmp_path)
     task = asyncio.create_task(following.run())
     buffer = io.BytesIO()
     write(buffer, records())
@@ -245,8 +245,8 @@ async def test_recordings_directory_is_followed_while_services_write(tmp_path: P
 
 
 @pytest.fixture
-async def served(recording: Path) -> AsyncIterator[tuple[str, View]]:
-    live_view = View(Replay([recording]), frozenset())
+async def served(recording: Path) -> AsyncIterator[tuple[str, ViewServer]]:
+    live_view = ViewServer(Replay([recording]), frozenset())
     runner = web.AppRunner(live_view.application(), shutdown_timeout=0.1)
     await runner.setup()
     site = web.TCPSite(runner, "127.0.0.1", 0)
@@ -255,7 +255,7 @@ async def served(recording: Path) -> AsyncIterator[tuple[str, View]]:
     await runner.cleanup()
 
 
-async def test_requests_without_token_are_refused(served: tuple[str, View]) -> None:
+async def test_requests_without_token_are_refused(served: tuple[str, ViewServer]) -> None:
     address, live_view = served
     async with ClientSession() as session:
         for path in ("/", "/stream", "/pictures/0-0-0", "/?token=wrong", "/?token=%FF", "/sources.sha256", "/nothing"):
@@ -267,7 +267,7 @@ async def test_requests_without_token_are_refused(served: tuple[str, View]) -> N
             assert response.status == 200
 
 
-async def test_health_endpoint_requires_no_token(served: tuple[str, View]) -> None:
+async def test_health_endpoint_requires_no_token(served: tuple[str, ViewServer]) -> None:
     address, live_view = served
     async with ClientSession() as session:
         async with session.get(f"{address}/healthz") as response:
@@ -279,7 +279,7 @@ async def test_health_endpoint_requires_no_token(served: tuple[str, View]) -> No
             assert response.status == 503
 
 
-async def test_token_in_address_is_replaced_by_http_only_cookie(served: tuple[str, View]) -> None:
+async def test_token_in_address_is_replaced_by_http_only_cookie(served: tuple[str, ViewServer]) -> None:
     address, live_view = served
     async with ClientSession() as session:
         async with session.get(f"{address}/?token={live_view.token}", allow_redirects=False) as response:
@@ -291,7 +291,7 @@ async def test_token_in_address_is_replaced_by_http_only_cookie(served: tuple[st
             assert response.status == 200
 
 
-async def test_cookie_is_secure_behind_tls(served: tuple[str, View]) -> None:
+async def test_cookie_is_secure_behind_tls(served: tuple[str, ViewServer]) -> None:
     address, live_view = served
     async with ClientSession() as session:
         for proto, secure in (("https", True), ("http", False)):
@@ -303,11 +303,11 @@ async def test_cookie_is_secure_behind_tls(served: tuple[str, View]) -> None:
 
 
 async def test_open_page_is_closed_when_the_token_changes(
-    served: tuple[str, View], monkeypatch: pytest.MonkeyPatch
+    served: tuple[str, ViewServer], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     address, live_view = served
     hub = live_view.source = Hub()  # type: ignore[assignment]
-    monkeypatch.setattr(server, "ALIVE_S", 0.05)
+    monkeypatch.setattr(server, "KEEPALIVE_S", 0.05)
     async with ClientSession(headers={hdrs.AUTHORIZATION: f"Bearer {live_view.token}"}) as session:
         async with asyncio.timeout(20), session.get(f"{address}/stream") as response:
             await response.content.readuntil(b"\n\n")
@@ -319,12 +319,12 @@ async def test_open_page_is_closed_when_the_token_changes(
 
 
 async def test_token_follows_its_file(
-    served: tuple[str, View], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    served: tuple[str, ViewServer], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     _, live_view = served
     file = tmp_path / "token"
     file.write_text("first random token\n")
-    monkeypatch.setattr(command, "TOKEN_PERIOD_S", 0.01)
+    monkeypatch.setattr(command, "TOKEN_INTERVAL_S", 0.01)
     task = asyncio.create_task(command._follow_token(file, live_view))
 
     output = ""
@@ -341,18 +341,18 @@ async def test_token_follows_its_file(
         file.write_text("second random token\n")
         await until(lambda: live_view.token == "second random token")
         file.write_bytes(b"\xff" * 32)
-        await until(lambda: "no one may look: " in output and "has no token" in output)
+        await until(lambda: "access denied to all pages: " in output and "contains no token" in output)
         assert live_view.token != "second random token"
         file.unlink()
-        await until(lambda: "cannot be read" in output)
+        await until(lambda: "cannot read" in output)
         file.write_text("third random token\n")
         await until(lambda: live_view.token == "third random token")
-        await until(lambda: output.endswith("has a token again\n"))
+        await until(lambda: "token read again from" in output)
     finally:
         task.cancel()
 
 
-async def test_other_methods_and_foreign_host_names_are_refused(served: tuple[str, View]) -> None:
+async def test_other_methods_and_foreign_host_names_are_refused(served: tuple[str, ViewServer]) -> None:
     address, live_view = served
     bearer = {hdrs.AUTHORIZATION: f"Bearer {live_view.token}"}
     async with ClientSession() as session:
@@ -372,7 +372,7 @@ async def test_other_methods_and_foreign_host_names_are_refused(served: tuple[st
             assert response.content_type == "text/event-stream"
 
 
-async def test_every_response_has_security_headers(served: tuple[str, View]) -> None:
+async def test_every_response_has_security_headers(served: tuple[str, ViewServer]) -> None:
     address, live_view = served
     async with ClientSession(headers={hdrs.AUTHORIZATION: f"Bearer {live_view.token}"}) as session:
         for path in ("/", "/stream", "/nothing", "/pictures/0-0-0"):
@@ -388,8 +388,8 @@ async def test_every_response_has_security_headers(served: tuple[str, View]) -> 
 async def test_view_metrics_count_requests(recording: Path) -> None:
     port = free_port()
     metrics = free_port()
-    site = Site("127.0.0.1", port, (), None, f"127.0.0.1:{metrics}")
-    task = asyncio.create_task(command._serve(Following(recording.parent), site))
+    site = ServerOptions("127.0.0.1", port, (), None, f"127.0.0.1:{metrics}")
+    task = asyncio.create_task(command._serve(GrowingRecordings(recording.parent), site))
     try:
         async with asyncio.timeout(20), ClientSession() as session:
             while not (await asyncio.to_thread(scraped, metrics)):
@@ -406,7 +406,7 @@ async def test_view_metrics_count_requests(recording: Path) -> None:
         await asyncio.gather(task, return_exceptions=True)
 
 
-async def test_view_metrics_count_open_pages(served: tuple[str, View]) -> None:
+async def test_view_metrics_count_open_pages(served: tuple[str, ViewServer]) -> None:
     address, live_view = served
     live_view.source = Hub()  # type: ignore[assignment]
 
@@ -427,10 +427,10 @@ def test_invalid_arguments_are_refused_with_message(
     (tmp_path / "short").write_text("secret\n")
     (tmp_path / "text.mcap").write_text("no recording")
     for arguments, message in (
-        ([], "or give recordings to replay"),
-        ([str(recording), "--recordings", str(tmp_path)], "one of them"),
-        ([str(recording), "--context", "k3s"], "one of them"),
-        ([str(recording), "--token-file", str(tmp_path / "short")], "has no token: write 16"),
+        ([], "or specify recordings to replay"),
+        ([str(recording), "--recordings", str(tmp_path)], "specify only one source"),
+        ([str(recording), "--context", "k3s"], "specify only one source"),
+        ([str(recording), "--token-file", str(tmp_path / "short")], "contains no token; write at least 16"),
         ([str(tmp_path / "text.mcap")], "is not an MCAP file"),
         ([str(recording), "--listen", "8650"], "is not HOST:PORT"),
         ([str(recording), "--listen", "203.0.113.1:8650"], "choose another with --listen"),
@@ -453,14 +453,8 @@ def test_built_page_matches_its_sources() -> None:
     assert {name: digest for digest, name in (line.split("  ") for line in lines)} == digests
 
 
-def test_page_declares_all_fields_of_events() -> None:
-    declared = dict(
-        re.findall(r"export interface (\w+) \{(.*?)\n\}", (ROOT / "view/web/src/events.ts").read_text(), re.DOTALL)
-    )
-    for kind in get_args(Event):
-        names = re.findall(r"^  (\w+):", declared[kind.__name__], re.MULTILINE)
-        assert names == ["type", *(field.name for field in fields(kind))]
-        assert f'type: "{kind.__name__.lower()}"' in declared[kind.__name__]
+def test_typescript_types_of_events_are_current() -> None:
+    assert (ROOT / "view/web/src/events.ts").read_text() == typescript_types(), "run `make generate`"
 
 
 def test_page_loads_no_external_resources() -> None:

@@ -88,11 +88,11 @@ def address(recordings: Path) -> Iterator[str]:
 
 
 def shows_the_end(page: Page) -> None:
-    """The page at the last moment of its recording."""
-    page.get_by_label("Moment shown").wait_for()
+    """Move the page to the end of its recording."""
+    page.get_by_label("Shown time").wait_for()
     expect(page.locator("#mode")).to_have_text("replay", timeout=TIMEOUT_MS)
     page.get_by_role("button", name="Pause").or_(page.get_by_role("button", name="Play")).click()
-    slider = page.get_by_label("Moment shown")
+    slider = page.get_by_label("Shown time")
     for _ in range(12):
         slider.press("PageUp")
 
@@ -127,7 +127,7 @@ def test_a_flight_is_shown_with_its_zones_verdicts_and_pictures(browser: Browser
 def test_everything_is_done_by_the_keyboard(browser: Browser, address: str) -> None:
     with opened(browser, address) as page:
         shows_the_end(page)
-        slider = page.get_by_label("Moment shown")
+        slider = page.get_by_label("Shown time")
         end = float(slider.input_value())
         slider.press("ArrowLeft")
         assert end - float(slider.input_value()) == pytest.approx(1_000, abs=150)
@@ -139,7 +139,7 @@ def test_everything_is_done_by_the_keyboard(browser: Browser, address: str) -> N
         for _ in range(40):
             page.keyboard.press("Tab")
             reached.add(page.evaluate("document.activeElement.id || document.activeElement.className"))
-        assert {"skip", "play", "speed", "moment", "verdict-filter", "name", "time", "maplibregl-canvas"} <= reached
+        assert {"skip", "play", "speed", "shown-time", "verdict-filter", "name", "time", "maplibregl-canvas"} <= reached
         drone = page.get_by_role("button", name="drone-1: show on the map")
         drone.press("Enter")
         expect(drone).to_have_attribute("aria-pressed", "true")
@@ -159,7 +159,7 @@ def test_verdicts_are_said_as_they_happen(browser: Browser, address: str) -> Non
         log = page.get_by_role("log", name="New verdicts")
         expect(log).to_be_empty()
         for _ in range(12):
-            page.get_by_label("Moment shown").press("PageUp")
+            page.get_by_label("Shown time").press("PageUp")
         expect(log).to_contain_text("drone-1: ", timeout=TIMEOUT_MS)
 
 

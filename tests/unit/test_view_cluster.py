@@ -16,8 +16,8 @@ from fractus_runtime.kubernetes import Body, Kind, KubeError, Page
 from fractus_runtime.metrics import metrics_text
 from fractus_view import cluster as cluster_module
 from fractus_view import command, objects
-from fractus_view.cluster import KINDS, Cluster
-from fractus_view.server import View
+from fractus_view.cluster import KINDS, ClusterSource
+from fractus_view.server import ViewServer
 from scraping import assert_documented, values
 
 NOW_MS = 1_780_000_000_000
@@ -132,10 +132,10 @@ class Clock:
 
 
 @contextlib.asynccontextmanager
-async def watched(server: ApiServer, clock: Clock, monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[Cluster]:
-    monkeypatch.setattr(cluster_module, "CONTACT_S", 0.01)
-    monkeypatch.setattr(cluster_module, "GATHER_S", 0.01)
-    cluster = Cluster(server, "", clock)  # type: ignore[arg-type]
+async def watched(server: ApiServer, clock: Clock, monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[ClusterSource]:
+    monkeypatch.setattr(cluster_module, "PROBE_INTERVAL_S", 0.01)
+    monkeypatch.setattr(cluster_module, "PUBLISH_INTERVAL_S", 0.01)
+    cluster = ClusterSource(server, "", clock)  # type: ignore[arg-type]
     task = asyncio.create_task(cluster.run())
     try:
         async with asyncio.timeout(20):
@@ -145,7 +145,7 @@ async def watched(server: ApiServer, clock: Clock, monkeypatch: pytest.MonkeyPat
         await asyncio.gather(task, return_exceptions=True)
 
 
-async def until(cluster: Cluster, condition: Any) -> list[dict[str, Any]]:
+async def until(cluster: ClusterSource, condition: Any) -> list[dict[str, Any]]:
     """Return the events up to the first batch with an event that fulfils the condition."""
     events: list[dict[str, Any]] = []
     async with aclosing(cluster.stream("")) as stream:
@@ -163,7 +163,7 @@ def last(events: list[dict[str, Any]], type_: str) -> dict[str, Any]:
 async def test_view_metrics_equal_their_documentation(monkeypatch: pytest.MonkeyPatch) -> None:
     async with watched(ApiServer(*ALL), Clock(), monkeypatch) as cluster:
         await until(cluster, lambda event: event["type"] == "policies")
-        text = metrics_text([*View(cluster, frozenset()).metrics(), *cluster.metrics()]).decode()
+        text = metrics_text([*ViewServer(cluster, frozenset()).metrics(), *cluster.metrics()]).decode()
     assert_documented(text, "View")
     samples = values(text)
     assert all(samples["fractus_view_watch_open", kind.PLURAL] == 1 for kind in KINDS)
@@ -261,15 +261,15 @@ async def test_invalid_object_is_reported(monkeypatch: pytest.MonkeyPatch) -> No
     invalid = resource("Zone", "odd", {"area": {"square": 1}})
     async with watched(ApiServer(*ALL, invalid), Clock(), monkeypatch) as cluster:
         events = await until(cluster, lambda event: event["type"] == "problem")
-    assert "a Zone cannot be read" in last(events, "problem")["text"]
+    assert "invalid Zone, not shown" in last(events, "problem")["text"]
 
 
 def test_silent_drone_is_not_shown_as_flying() -> None:
     silent = {"flightState": "unknown", "lastFlightState": "flying", "position": {"lat": 1, "lon": 2, "alt": 3}}
     shown = objects.state(api.Drone.from_body(resource("Drone", "a", {}, silent)), NOW_MS)
-    assert shown.phase == "not heard of, last in the air"
+    assert shown.phase == "not reporting, last in the air"
     new = api.Drone.from_body(resource("Drone", "a", {}))
-    assert (objects.state(new, NOW_MS).phase, objects.fix(new, NOW_MS)) == ("not heard of", None)
+    assert (objects.state(new, NOW_MS).phase, objects.fix(new, NOW_MS)) == ("not reporting", None)
 
 
 def test_every_flight_state_has_a_phase_text() -> None:
@@ -306,7 +306,7 @@ def test_view_reads_no_kinds_with_secrets() -> None:
     [
         (KubeError(0, "Unreachable", "no route"), "no route; check the cluster and --context"),
         (KubeError(404, "NotFound", "not found"), "install the chart fractus-crds"),
-        (KubeError(403, "Forbidden", "forbidden"), "the role view is enough"),
+        (KubeError(403, "Forbidden", "forbidden"), "the role view is sufficient"),
     ],
 )
 def test_unreadable_cluster_is_reported_at_start(

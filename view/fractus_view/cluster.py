@@ -1,10 +1,11 @@
-"""Live flights of a cluster: watches its objects, and reports when their state is stale."""
+"""Live flights of a cluster: watches its objects, and reports if the shown state is stale."""
 
 from __future__ import annotations
 
 import asyncio
 import time
 from collections.abc import AsyncIterator, Callable, Iterator
+from operator import attrgetter
 from typing import Any, TypeVar
 
 from fractus_core import api
@@ -16,17 +17,17 @@ from fractus_view import objects
 from fractus_view.events import Applications, Areas, Contact, Event, Gone, Links, Policies, Problem
 from fractus_view.hub import Hub
 
-GATHER_S = 0.2
-"""Seconds for which changes are collected before they are published."""
+PUBLISH_INTERVAL_S = 0.2
+"""Interval between two publications of changes, in seconds."""
 
-CONTACT_S = 1.0
-"""Seconds between two connectivity checks of the API server."""
+PROBE_INTERVAL_S = 1.0
+"""Interval between two probes of the API server, in seconds."""
 
-ANSWER_S = 3.0
-"""An API server that needs more seconds to respond counts as unreachable."""
+PROBE_TIMEOUT_S = 3.0
+"""Response time, in seconds, from which the API server counts as unreachable."""
 
-GRACE_S = 2.0
-"""Seconds after which a silent watch is reported. Watches end and restart regularly."""
+STALE_AFTER_S = 2.0
+"""Time without contact, in seconds, from which the state counts as stale. Watches end and restart regularly."""
 
 T = TypeVar("T", bound=api.Resource)
 
@@ -36,13 +37,13 @@ KINDS: tuple[type[api.Resource], ...] = (
 """Kinds that are watched."""
 
 
-class Cluster:
-    """Source of a cluster's flights. It only reads.
+class ClusterSource:
+    """`Source` of a cluster's flights. It only reads the cluster.
 
     Args:
-        client: of the API server.
-        namespace: whose applications are shown; empty: all.
-        now_ms: Unix milliseconds.
+        client: Client of the API server.
+        namespace: Namespace of the shown applications. An empty string shows all namespaces.
+        now_ms: Returns the current time in Unix milliseconds.
     """
 
     def __init__(
@@ -53,8 +54,8 @@ class Cluster:
         self._now_ms = now_ms
         self._hub = Hub()
         self._changed: set[type[api.Resource]] = set()
-        self._drones: set[str] = set()
-        self._heard_ms = now_ms()
+        self._changed_drones: set[str] = set()
+        self._last_contact_ms = now_ms()
         self._informers: dict[type[api.Resource], Informer[Any]] = {
             model: self._informer(model, namespace if model.NAMESPACED else "") for model in KINDS
         }
@@ -72,27 +73,27 @@ class Cluster:
         """List all objects once.
 
         Raises:
-            KubeError: the API server cannot be reached, has not our kinds, or refuses them.
+            KubeError: The API server is unreachable, the kinds of Fractus are not installed, or access to them is denied.
         """
         for informer in self._informers.values():
-            await self._ask(informer.kind)
+            await self._probe(informer.kind)
 
     async def run(self) -> None:
         """Watch until cancelled."""
         async with asyncio.TaskGroup() as group:
             for informer in self._informers.values():
                 group.create_task(informer.run())
-            group.create_task(self._keep_contact())
-            group.create_task(self._tell())
+            group.create_task(self._report_contact())
+            group.create_task(self._publish_changes())
 
     def metrics(self) -> Iterator[Metric]:
         """Yield the metrics of the watches."""
-        listed = [each for each in self._informers.values() if each.synced.is_set()]
-        opened = {each.kind.plural: float(each.watching) for each in listed}
+        synced = [informer for informer in self._informers.values() if informer.synced.is_set()]
+        watching = {informer.kind.plural: float(informer.watching) for informer in synced}
         yield gauge(
-            "fractus_view_watch_open", "1 while the watch of a kind is open (view of a cluster).", opened, "kind"
+            "fractus_view_watch_open", "1 while the watch of a kind is open (view of a cluster).", watching, "kind"
         )
-        ages_s = {each.kind.plural: each.age_s() for each in listed}
+        ages_s = {informer.kind.plural: informer.age_s() for informer in synced}
         yield gauge(
             "fractus_view_watch_age_seconds",
             "Seconds since the last message of the API server about a kind. Above 100 the watch is dead.",
@@ -107,29 +108,29 @@ class Cluster:
             try:
                 return model.from_body(body)
             except api.InvalidObject as error:
-                self._hub.publish([Problem(self._now_ms(), f"a {model.KIND} cannot be read: {error}")])
+                self._hub.publish([Problem(self._now_ms(), f"invalid {model.KIND}, not shown: {error}")])
                 raise
 
         def changed(key: Key, _old: T | None, _new: T | None) -> None:
             self._changed.add(model)
             if model is api.Drone:
-                self._drones.add(key[1])
+                self._changed_drones.add(key[1])
 
         kind = Kind(api.API_VERSION, model.KIND, model.PLURAL, model.NAMESPACED)
         return Informer(self._client, kind, parse, changed, namespace=namespace)
 
-    async def _tell(self) -> None:
+    async def _publish_changes(self) -> None:
         for informer in self._informers.values():
             await informer.synced.wait()
         self._changed = set(KINDS)
         while True:
             changed = self._changed
             self._changed = set()
-            drones = self._drones
-            self._drones = set()
+            drones = self._changed_drones
+            self._changed_drones = set()
             if changed:
                 self._hub.publish(self._events(changed, drones))
-            await asyncio.sleep(GATHER_S)
+            await asyncio.sleep(PUBLISH_INTERVAL_S)
 
     def _events(self, changed: set[type[api.Resource]], drones: set[str]) -> Iterator[Event]:
         now_ms = self._now_ms()
@@ -143,14 +144,16 @@ class Cluster:
             plans = {
                 (plan.metadata.namespace or "", plan.spec.application): plan for plan in self._all(api.DeploymentPlan)
             }
-            yield Areas("plans", now_ms, objects.intentions(self._all(api.Application), plans))
+            yield Areas("plans", now_ms, objects.planned_flights(self._all(api.Application), plans))
         if api.Application in changed:
-            found = sorted(map(objects.application, self._all(api.Application)), key=lambda each: each.name)
-            yield Applications(now_ms, found)
+            applications = map(objects.application, self._all(api.Application))
+            yield Applications(now_ms, sorted(applications, key=attrgetter("name")))
         if api.DirectLink in changed:
-            yield Links(now_ms, sorted(map(objects.link, self._all(api.DirectLink)), key=lambda each: each.name))
+            links = map(objects.link, self._all(api.DirectLink))
+            yield Links(now_ms, sorted(links, key=attrgetter("name")))
         if api.Policy in changed:
-            yield Policies(now_ms, sorted(map(objects.policy, self._all(api.Policy)), key=lambda each: each.name))
+            policies = map(objects.policy, self._all(api.Policy))
+            yield Policies(now_ms, sorted(policies, key=attrgetter("name")))
 
     def _drone(self, name: str, now_ms: int) -> Iterator[Event]:
         drone: api.Drone | None = self._informers[api.Drone].get(("", name))
@@ -167,26 +170,27 @@ class Cluster:
 
     # Staleness
 
-    async def _keep_contact(self) -> None:
-        """Check the API server continuously, because a broken watch looks like a watch without changes."""
+    async def _report_contact(self) -> None:
+        """Probe the API server continuously, because a broken watch looks like a watch without changes."""
         while True:
             problem = await self._problem()
             now_ms = self._now_ms()
             if problem is None:
-                self._heard_ms = now_ms
+                self._last_contact_ms = now_ms
                 self._hub.publish([Contact(now_ms, None, "")])
-            elif now_ms - self._heard_ms > GRACE_S * 1000:
-                self._hub.publish([Contact(now_ms, self._heard_ms, problem)])
-            await asyncio.sleep(CONTACT_S)
+            elif now_ms - self._last_contact_ms > STALE_AFTER_S * 1000:
+                self._hub.publish([Contact(now_ms, self._last_contact_ms, problem)])
+            await asyncio.sleep(PROBE_INTERVAL_S)
 
     async def _problem(self) -> str | None:
         """Return the reason why the state may be stale, or None."""
-        unheard = [each for each in self._informers.values() if not (each.watching and each.synced.is_set())]
+        informers = list(self._informers.values())
+        unwatched = [informer for informer in informers if not (informer.watching and informer.synced.is_set())]
         try:
-            await self._ask((unheard or list(self._informers.values()))[0].kind)
+            await self._probe((unwatched or informers)[0].kind)
         except KubeError as error:
             return str(error)
-        return f"{unheard[0].kind.plural} are not watched yet" if unheard else None
+        return f"{unwatched[0].kind.plural} are not watched yet" if unwatched else None
 
-    async def _ask(self, kind: Kind) -> None:
-        await self._client.request("GET", kind.path(self._namespace), params={"limit": "1"}, timeout_s=ANSWER_S)
+    async def _probe(self, kind: Kind) -> None:
+        await self._client.request("GET", kind.path(self._namespace), params={"limit": "1"}, timeout_s=PROBE_TIMEOUT_S)

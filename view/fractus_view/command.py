@@ -1,4 +1,4 @@
-"""`fractus view`: serve the page until interrupted."""
+"""`fractus view`: serves the page until interrupted."""
 
 from __future__ import annotations
 
@@ -17,28 +17,33 @@ from fractus_runtime.kubernetes import Client, KubeError, Unconfigured, from_env
 from fractus_runtime.metrics import serve_metrics
 from prometheus_client import Metric
 
-from fractus_view.cluster import Cluster
+from fractus_view.cluster import ClusterSource
 from fractus_view.mcap_tail import MAGIC
-from fractus_view.server import View
-from fractus_view.sources import Following, Replay, Source
+from fractus_view.server import ViewServer
+from fractus_view.sources import GrowingRecordings, Replay, Source
 
 DEFAULT_LISTEN = "127.0.0.1:8650"
-MIN_TOKEN = 16
-TOKEN_PERIOD_S = 1.0
-"""Seconds after which the token file is read again."""
+MIN_TOKEN_LENGTH = 16
+TOKEN_INTERVAL_S = 1.0
+"""Interval at which the token file is read again, in seconds."""
 
 _REMEDIES = {
-    0: "check the cluster and --context, or give recordings to replay",
+    0: "check the cluster and --context, or specify recordings to replay",
     404: "install the chart fractus-crds",
 }
+"""Remedies by status of the API server's response. 0 means no response."""
 
 
 @dataclass(frozen=True, slots=True)
-class Site:
-    """Parse the options of the server: address, additional host names, and token file (None creates a token).
+class ServerOptions:
+    """Options of the server.
 
     Attributes:
-        metrics: where Prometheus is answered; empty: nowhere.
+        host: Address to listen on.
+        port: Port to listen on. 0 selects a free port.
+        hostnames: Additional host names by which browsers may address the server.
+        token_file: File that contains the token. None creates a token at each start.
+        metrics: HOST:PORT for Prometheus metrics. An empty string serves no metrics.
     """
 
     host: str
@@ -48,10 +53,10 @@ class Site:
     metrics: str = ""
 
 
-def _listen(_context: click.Context, _option: click.Parameter, text: str) -> tuple[str, int]:
+def _parse_address(_context: click.Context, _option: click.Parameter, text: str) -> tuple[str, int]:
     host, _, port = text.rpartition(":")
     if not host or not port.isdecimal() or int(port) > 65535:
-        raise click.BadParameter(f"{text!r} is not HOST:PORT, such as {DEFAULT_LISTEN}")
+        raise click.BadParameter(f"{text!r} is not HOST:PORT, for example {DEFAULT_LISTEN}")
     return host.removeprefix("[").removesuffix("]"), int(port)
 
 
@@ -64,37 +69,41 @@ def _listen(_context: click.Context, _option: click.Parameter, text: str) -> tup
     "directory",
     type=click.Path(path_type=Path, exists=True, file_okay=False),
     metavar="DIRECTORY",
-    help="Follow what services record below it now.",
+    help="Follow the recordings that services are writing below this directory.",
 )
-@click.option("-n", "--namespace", default="", help="Only the applications of this namespace of the cluster.")
-@click.option("--context", help="Of the kubeconfig; else its current one.")
+@click.option("-n", "--namespace", default="", help="Show only the applications of this namespace.")
+@click.option("--context", help="Context of the kubeconfig. Default: its current context.")
 @click.option(
     "--kubeconfig",
     "config",
     type=click.Path(path_type=Path, exists=True, dir_okay=False),
-    help="Which cluster; else KUBECONFIG, then ~/.kube/config.",
+    help="Kubeconfig of the cluster. Default: KUBECONFIG, or ~/.kube/config.",
 )
 @click.option(
     "--listen",
-    callback=_listen,
+    callback=_parse_address,
     default=DEFAULT_LISTEN,
     show_default=True,
     metavar="HOST:PORT",
-    help="Where to serve; port 0 takes a free one.",
+    help="Address of the page. Port 0 selects a free port.",
 )
 @click.option(
-    "--hostname", "hostnames", multiple=True, metavar="NAME", help="What browsers may call it as well; repeat."
+    "--hostname",
+    "hostnames",
+    multiple=True,
+    metavar="NAME",
+    help="Additional host name by which browsers may address the page. Repeatable.",
 )
 @click.option(
     "--token-file",
     type=click.Path(path_type=Path, exists=True, dir_okay=False),
-    help="Who knows what is in it now may look; else a new token is made at each start.",
+    help="File with the access token. The file is read again when it changes. Default: a new token at each start.",
 )
 @click.option(
     "--metrics",
     default="",
     metavar="[HOST]:PORT",
-    help="Where to answer GET /metrics, without a token; else nowhere.",
+    help="Address of the Prometheus metrics, which need no token. Default: no metrics.",
 )
 def view(
     *,
@@ -108,56 +117,64 @@ def view(
     token_file: Path | None,
     metrics: str,
 ) -> None:
-    """Show flights on a web page: those of a cluster, as they happen, or a replay of RECORDINGs (MCAP files).
+    """Show flights on a web page.
 
-    It prints the page's address, which has a token in it, and serves until interrupted. It changes nothing.
+    Without arguments, the page shows the current flights of a cluster. With RECORDING arguments (MCAP files), it replays them.
+
+    The command prints the address of the page, which contains an access token, and serves the page until interrupted. The page
+    is read-only.
     """
-    of_cluster = bool(namespace or context or config)
-    if bool(recordings) + (directory is not None) + of_cluster > 1:
-        raise click.UsageError("give recordings to replay, --recordings, or the options of a cluster: one of them")
-    site = Site(*listen, hostnames, token_file, metrics)
+    uses_cluster = bool(namespace or context or config)
+    if bool(recordings) + (directory is not None) + uses_cluster > 1:
+        raise click.UsageError("specify only one source: recordings to replay, --recordings, or options of a cluster")
+    options = ServerOptions(*listen, hostnames, token_file, metrics)
     if directory is not None:
-        asyncio.run(_serve(Following(directory), site))
+        asyncio.run(_serve(GrowingRecordings(directory), options))
     elif recordings:
-        asyncio.run(_serve(_replay(recordings), site))
+        asyncio.run(_serve(_replay(recordings), options))
     else:
-        asyncio.run(_serve_cluster(config, context, namespace, site))
+        asyncio.run(_serve_cluster(config, context, namespace, options))
 
 
-def _token(path: Path) -> str:
+def _read_token(path: Path) -> str:
+    """Read the token from its file.
+
+    Raises:
+        click.ClickException: The file cannot be read, or contains no suitable token.
+    """
     try:
         token = path.read_bytes().decode(errors="replace").strip()
     except OSError as error:
-        raise click.ClickException(f"{path} cannot be read: {error.strerror or error}") from error
-    if len(token) < MIN_TOKEN or not token.isascii() or not token.isprintable():
+        raise click.ClickException(f"cannot read {path}: {error.strerror or error}") from error
+    if len(token) < MIN_TOKEN_LENGTH or not token.isascii() or not token.isprintable():
         raise click.ClickException(
-            f"{path} has no token: write {MIN_TOKEN} ASCII characters or more, of chance, into it"
+            f"{path} contains no token; write at least {MIN_TOKEN_LENGTH} random ASCII characters into it"
         )
     return token
 
 
-async def _follow_token(path: Path, shown: View) -> None:
+async def _follow_token(path: Path, server: ViewServer) -> None:
     """Use the current token of the file. Earlier tokens become invalid."""
-    told = ""
+    reported = ""
     failed = False
     while True:
-        await asyncio.sleep(TOKEN_PERIOD_S)
+        await asyncio.sleep(TOKEN_INTERVAL_S)
         try:
-            shown.token = _token(path)
+            server.token = _read_token(path)
             problem = ""
             failed = False
         except click.ClickException as error:
-            # A file is empty for a moment while it is written.
-            problem = error.message if failed else told
+            # Ignore a single failure, because a file may be empty for a moment while it is written.
+            problem = error.message if failed else reported
             failed = True
             if problem:
-                # A random token that nobody knows.
-                shown.token = secrets.token_urlsafe(32)
-        if problem != told:
-            said = f"view: no one may look: {problem}" if problem else f"view: {path} has a token again"
-            with suppress(OSError):  # The reader of standard output may have ended.
-                click.echo(said, err=True)
-        told = problem
+                # Lock the page with a random token that nobody knows.
+                server.token = secrets.token_urlsafe(32)
+        if problem != reported:
+            text = f"view: access denied to all pages: {problem}" if problem else f"view: token read again from {path}"
+            with suppress(OSError):  # The process that reads standard error may have ended.
+                click.echo(text, err=True)
+        reported = problem
 
 
 def _replay(recordings: tuple[Path, ...]) -> Source:
@@ -165,39 +182,39 @@ def _replay(recordings: tuple[Path, ...]) -> Source:
         with path.open("rb") as file:
             if file.read(len(MAGIC)) != MAGIC:
                 raise click.ClickException(
-                    f"{path} is not an MCAP file; give a file that a service wrote with --recordings"
+                    f"{path} is not an MCAP file; specify a file that a service wrote with --recordings"
                 )
     return Replay(recordings)
 
 
-async def _serve_cluster(config: Path | None, context: str | None, namespace: str, site: Site) -> None:
+async def _serve_cluster(config: Path | None, context: str | None, namespace: str, options: ServerOptions) -> None:
     try:
         access = await (kubeconfig(config, context) if config is not None else from_environment(context))
         client = Client(access, "fractus-view")
     except Unconfigured as error:
-        raise click.ClickException(f"{error}; or give recordings to replay") from error
+        raise click.ClickException(f"{error}; or specify recordings to replay") from error
     async with aclosing(client):
-        cluster = Cluster(client, namespace)
+        cluster = ClusterSource(client, namespace)
         try:
             await cluster.check()
         except KubeError as error:
-            remedy = _REMEDIES.get(error.status, "check your permissions: the role view is enough")
+            remedy = _REMEDIES.get(error.status, "check your permissions; the role view is sufficient")
             raise click.ClickException(f"{error}; {remedy}") from error
-        await _serve(cluster, site, cluster.metrics)
+        await _serve(cluster, options, cluster.metrics)
 
 
-async def _serve(source: Source, where: Site, metrics: Callable[[], Iterable[Metric]] = tuple) -> None:
+async def _serve(source: Source, options: ServerOptions, metrics: Callable[[], Iterable[Metric]] = tuple) -> None:
     stopped = asyncio.Event()
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, stopped.set)
-    served = View(source, frozenset(name.lower() for name in (where.host, *where.hostnames)))
-    given = where.token_file
-    if given is not None:
-        served.token = _token(given)
-    host = where.host
-    port = where.port
-    runner = web.AppRunner(served.application(), access_log=None, handle_signals=False, shutdown_timeout=1.0)
+    server = ViewServer(source, frozenset(name.lower() for name in (options.host, *options.hostnames)))
+    token_file = options.token_file
+    if token_file is not None:
+        server.token = _read_token(token_file)
+    host = options.host
+    port = options.port
+    runner = web.AppRunner(server.application(), access_log=None, handle_signals=False, shutdown_timeout=1.0)
     await runner.setup()
     try:
         site = web.TCPSite(runner, host, port)
@@ -207,23 +224,27 @@ async def _serve(source: Source, where: Site, metrics: Callable[[], Iterable[Met
             raise click.ClickException(
                 f"cannot listen on {host}:{port}: {error.strerror or error}; choose another with --listen"
             ) from error
-        bound = runner.addresses[0][1]
-        name = f"[{host}]" if ":" in host else host
-        # The user knows a given token, and more people can read logs.
-        said = f"?token={served.token}" if given is None else "?token=..."
-        click.echo(f"view: open http://{name}:{bound}/{said}")
-        if not _loopback(host):
-            click.echo("view: others on this network can read what is sent, the token too: put TLS before it", err=True)
-        following = None if given is None else asyncio.create_task(_follow_token(given, served))
-        async with serve_metrics(where.metrics, lambda: [*served.metrics(), *metrics()]):
+        actual_port = runner.addresses[0][1]
+        url_host = f"[{host}]" if ":" in host else host
+        # Do not print the token of a file: the user knows it, and other people may read the log.
+        token = server.token if token_file is None else "..."
+        click.echo(f"view: open http://{url_host}:{actual_port}/?token={token}")
+        if not _is_loopback(host):
+            click.echo(
+                "view: connections are not encrypted, so others on this network can read them and the token; put a TLS proxy in"
+                " front of this server",
+                err=True,
+            )
+        token_task = None if token_file is None else asyncio.create_task(_follow_token(token_file, server))
+        async with serve_metrics(options.metrics, lambda: [*server.metrics(), *metrics()]):
             await stopped.wait()
-        if following is not None:
-            following.cancel()
+        if token_task is not None:
+            token_task.cancel()
     finally:
         await runner.cleanup()
 
 
-def _loopback(host: str) -> bool:
+def _is_loopback(host: str) -> bool:
     try:
         return ip_address(host).is_loopback
     except ValueError:

@@ -1,13 +1,11 @@
-"""Events for the page, and their encoding."""
+"""Events for the page, and their encoding. `fractus_view.typescript` generates the types of the page from this module."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
-
-# `view/web/src/events.ts` declares the same fields; a test compares them.
+from typing import Any, Literal, NotRequired, TypedDict
 
 
 @dataclass(frozen=True, slots=True)
@@ -15,12 +13,12 @@ class Fix:
     """Position of a drone.
 
     Attributes:
-        drone: its node.
-        time_ms: Unix milliseconds, as of every event.
-        lat: degrees.
-        lon: degrees.
-        amsl_m: metres above sea level.
-        heading_deg: clockwise from north; None where it is not known.
+        drone: Name of the drone's node, as in all events.
+        time_ms: Time in Unix milliseconds, as in all events.
+        lat: Latitude in degrees.
+        lon: Longitude in degrees.
+        amsl_m: Altitude above mean sea level in metres, or None if it is unknown.
+        heading_deg: Heading in degrees clockwise from north, or None if it is unknown.
     """
 
     drone: str
@@ -33,10 +31,16 @@ class Fix:
 
 @dataclass(frozen=True, slots=True)
 class State:
-    """State of a drone: altitude above home, ground speed, remaining battery (0 to 1), and control authority.
+    """State of a drone.
 
     Attributes:
-        seen_ms: when the drone itself said so; None: then.
+        altitude_m: Altitude above home in metres.
+        speed_mps: Ground speed in metres per second.
+        battery: Remaining charge from 0 to 1.
+        mode: Flight mode of the autopilot, or an empty string.
+        controller: Control authority, or an empty string.
+        phase: Phase of the flight, for people.
+        seen_ms: Time of the drone's report in Unix milliseconds, or None if it equals `time_ms`.
     """
 
     drone: str
@@ -60,7 +64,19 @@ class Gone:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """Verdict on a call or on the flight, with the policies that decided."""
+    """Verdict on a call or on the flight.
+
+    Attributes:
+        kind: Kind of the audit entry: `call`, `monitor` or `takeover`.
+        component: Component that called, or an empty string.
+        method: Called method, or an empty string.
+        action: Verdict on a call: `allow`, `correct`, `deny` or `takeover`.
+        code: Reason for programs.
+        reason: Reason for people.
+        policies: Names of the policies that decided.
+        lat: Latitude of the drone in degrees, or None if it is unknown.
+        lon: Longitude of the drone in degrees, or None if it is unknown.
+    """
 
     drone: str
     time_ms: int
@@ -85,17 +101,48 @@ class Note:
     text: str
 
 
+class AltitudeBand(TypedDict):
+    """Altitude limits of an area in metres. A missing limit is unlimited."""
+
+    lower: NotRequired[float]
+    upper: NotRequired[float]
+    reference: NotRequired[str]
+
+
+class FeatureProperties(TypedDict):
+    """Properties of an area or place. `kind` is zone, operationArea, corridor, path, depot or edgeNode."""
+
+    kind: str
+    name: str
+    application: NotRequired[str]
+    component: NotRequired[str]
+    altitude: NotRequired[AltitudeBand]
+    description: NotRequired[str]
+    state: NotRequired[str]
+
+
+class Geometry(TypedDict):
+    """GeoJSON geometry."""
+
+    type: Literal["Polygon", "MultiPolygon", "LineString", "MultiLineString", "Point"]
+    coordinates: Sequence[Any]
+
+
+class Feature(TypedDict):
+    """GeoJSON feature: a zone, area, planned path or place."""
+
+    type: Literal["Feature"]
+    properties: FeatureProperties
+    geometry: Geometry
+
+
 @dataclass(frozen=True, slots=True)
 class Areas:
-    """Zones, areas, planned paths and places of one origin as GeoJSON features. They replace the earlier ones.
-
-    Each has `kind` (zone, operationArea, corridor, path, depot or edgeNode) and `name` among its properties, and maybe
-    `altitude`, a `component` or an `application` that it is of, and a `state`.
-    """
+    """Zones, areas, planned paths and places of one origin. They replace the earlier ones of this origin."""
 
     origin: str
     time_ms: int
-    features: Sequence[Mapping[str, Any]]
+    features: Sequence[Feature]
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,7 +171,7 @@ class Link:
     Attributes:
         lat: Latitude of the node in degrees.
         lon: Longitude of the node in degrees.
-        traffic: Current path, `cloud` or `direct`; empty if unknown.
+        traffic: Current path of the traffic, `cloud` or `direct`, or an empty string if it is unknown.
     """
 
     name: str
@@ -168,8 +215,8 @@ class Contact:
     """Staleness of the shown state. Sent about once per second, even without changes.
 
     Attributes:
-        stale_since_ms: Time since which the source has sent nothing; None if the state is current.
-        text: Reason in one sentence.
+        stale_since_ms: Time of the last contact in Unix milliseconds, or None if the state is current.
+        text: Reason in one sentence, or an empty string.
     """
 
     time_ms: int
@@ -212,6 +259,6 @@ def encode(event: Event) -> str:
     return json.dumps(content, separators=(",", ":"), allow_nan=False)
 
 
-def message(id_: str, encoded: Iterable[str]) -> bytes:
-    """Return encoded events as one message of the event stream. A client that reconnects sends its id."""
+def stream_message(id_: str, encoded: Iterable[str]) -> bytes:
+    """Return encoded events as one message of the event stream. A client that reconnects sends the id of its last message."""
     return f"id: {id_}\ndata: [{','.join(encoded)}]\n\n".encode()

@@ -1,4 +1,4 @@
-"""Current state and recent changes for any number of pages. Memory does not depend on their number or speed."""
+"""Current state and recent events for any number of pages. Memory does not depend on the number or speed of the pages."""
 
 from __future__ import annotations
 
@@ -24,23 +24,23 @@ from fractus_view.events import (
     State,
     Verdict,
     encode,
-    message,
+    stream_message,
 )
 
 RECENT = 4_000
 """Number of stored events. A page that is further behind receives the current state."""
 
 TRAIL = 600
-"""Number of positions of a drone's path for a new page."""
+"""Maximum number of positions of a drone's path that a new page receives."""
 
-_KEPT = {Verdict: 300, Note: 200, Picture: 60, Problem: 10}
-"""Number of past verdicts, notes and pictures for a new page."""
+_HISTORY_SIZES = {Verdict: 300, Note: 200, Picture: 60, Problem: 10}
+"""Number of past events by type that a new page receives."""
 
 _BATCH = 500
 
 
 class Trail:
-    """Path of a drone with a bounded number of positions: a longer path has fewer positions per minute."""
+    """Path of a drone with a bounded number of positions. A longer path has fewer positions per minute."""
 
     def __init__(self) -> None:
         self._fixes: list[Fix] = []
@@ -57,7 +57,7 @@ class Trail:
             self._spacing_ms *= 2
 
     def __iter__(self) -> Iterator[Fix]:
-        """Return the positions, oldest first, always including the newest."""
+        """Yield the positions, oldest first. The newest position is always included."""
         yield from self._fixes
         if self._last is not None and self._last is not self._fixes[-1]:
             yield self._last
@@ -66,8 +66,8 @@ class Trail:
 class Hub:
     """Distributes events of one source to pages.
 
-    All pages read the same short memory of events, each from where it is. One that is slower than the source finds its
-    place forgotten, and starts over with what is known: nothing is queued for anyone.
+    All pages read the same buffer of recent events, each from its own position. There is no queue per page. If a page is so
+    slow that its next event is no longer buffered, it receives the current state.
     """
 
     def __init__(self) -> None:
@@ -75,71 +75,71 @@ class Hub:
         self._count = 0
         self._recent: deque[str] = deque(maxlen=RECENT)
         self._trails: dict[str, Trail] = {}
-        self._holding: dict[tuple[type, str], Event] = {}
-        self._happened: dict[type, deque[Event]] = {kind: deque(maxlen=bound) for kind, bound in _KEPT.items()}
-        self._news = asyncio.Event()
+        self._current: dict[tuple[type, str], Event] = {}
+        self._history: dict[type, deque[Event]] = {kind: deque(maxlen=size) for kind, size in _HISTORY_SIZES.items()}
+        self._published = asyncio.Event()
 
     def publish(self, events: Iterable[Event]) -> None:
         """Publish events to all pages."""
         for event in events:
-            self._remember(event)
+            self._store(event)
             self._recent.append(encode(event))
             self._count += 1
-        self._news.set()
-        self._news = asyncio.Event()
+        self._published.set()
+        self._published = asyncio.Event()
 
-    def _remember(self, event: Event) -> None:
+    def _store(self, event: Event) -> None:
         match event:
             case Fix():
                 self._trails.setdefault(event.drone, Trail()).add(event)
             case State():
-                self._holding[State, event.drone] = event
+                self._current[State, event.drone] = event
             case Areas():
-                self._holding[Areas, event.origin] = event
+                self._current[Areas, event.origin] = event
             case Applications() | Links() | Policies() | Contact():
-                self._holding[type(event), ""] = event
+                self._current[type(event), ""] = event
             case Gone():
                 self._trails.pop(event.drone, None)
-                self._holding.pop((State, event.drone), None)
+                self._current.pop((State, event.drone), None)
             case _:
-                self._happened[type(event)].append(event)
+                self._history[type(event)].append(event)
 
     def snapshot(self) -> Iterator[Event]:
-        """Return the events for a new page."""
-        yield from self._holding.values()
+        """Yield the events for a new page."""
+        yield from self._current.values()
         for trail in self._trails.values():
             yield from trail
-        for happened in self._happened.values():
-            yield from happened
+        for events in self._history.values():
+            yield from events
 
     async def stream(self, last_id: str) -> AsyncIterator[bytes]:
         """Yield messages of the event stream while the client reads them.
 
         Args:
-            last_id: of the last message that the page heard; empty if none.
+            last_id: Id of the last message that the page received, or an empty string.
         """
-        place = self._place(last_id)
-        if place is not None:
-            yield message(self._id(place), [LIVE])
+        position = self._position(last_id)
+        if position is not None:
+            yield stream_message(self._id(position), [LIVE])
         while True:
-            news = self._news
-            if place is None or place < self._count - len(self._recent):
-                place = self._count
-                yield message(self._id(place), [RESET, *map(encode, self.snapshot()), LIVE])
-            elif place < self._count:
-                first = place - (self._count - len(self._recent))
+            published = self._published
+            if position is None or position < self._count - len(self._recent):
+                position = self._count
+                yield stream_message(self._id(position), [RESET, *map(encode, self.snapshot()), LIVE])
+            elif position < self._count:
+                first = position - (self._count - len(self._recent))
                 batch = [self._recent[i] for i in range(first, min(first + _BATCH, len(self._recent)))]
-                place += len(batch)
-                yield message(self._id(place), batch)
+                position += len(batch)
+                yield stream_message(self._id(position), batch)
             else:
-                await news.wait()
+                await published.wait()
 
-    def _id(self, place: int) -> str:
-        return f"{self._epoch}-{place}"
+    def _id(self, position: int) -> str:
+        return f"{self._epoch}-{position}"
 
-    def _place(self, last_id: str) -> int | None:
-        """Return the position of a page in the event stream; None if it has none in this hub."""
-        epoch, _, place = last_id.partition("-")
-        if epoch != self._epoch or not place.isdecimal() or int(place) > self._count:
+    def _position(self, last_id: str) -> int | None:
+        """Return the number of events that a page has received, or None if the id is not from this hub."""
+        epoch, _, position = last_id.partition("-")
+        if epoch != self._epoch or not position.isdecimal() or int(position) > self._count:
             return None
-        return int(place)
+        return int(position)

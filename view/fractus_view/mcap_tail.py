@@ -1,4 +1,4 @@
-"""Sequential reader of MCAP files with JSON messages, also while they are written."""
+"""Sequential reader of MCAP files with JSON messages, which may still be growing."""
 
 from __future__ import annotations
 
@@ -22,37 +22,42 @@ MAX_RECORD_BYTES = 100_000_000
 _HEAD = struct.Struct("<BQ")
 
 
-class Damaged(ValueError):
-    """The file is not an MCAP file, or is damaged from some point on."""
+class DamagedFile(ValueError):
+    """The file is not an MCAP file, or its remaining part is damaged."""
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
-    """Position of a message: its record in the file, and the number of earlier messages in this record."""
+class MessageLocation:
+    """Location of a message in its file.
+
+    Attributes:
+        offset: Byte offset of the record that contains the message. The record may be a chunk of several messages.
+        index: Number of records before the message in the chunk.
+    """
 
     offset: int
     index: int
 
 
 @dataclass(frozen=True, slots=True)
-class Told:
-    """One message. Times are in Unix milliseconds."""
+class RecordedMessage:
+    """A message with its time in Unix milliseconds."""
 
     topic: str
     schema: str
     time_ms: int
     content: dict[str, Any]
-    place: Place
+    location: MessageLocation
 
 
 class Tail:
-    """Reader of one file's messages in the order of writing.
+    """Reads the messages of one file once, in the order of writing.
 
     Args:
-        path: the file; what was read of it is not read again.
+        path: MCAP file.
 
     Attributes:
-        finished: whether the file was closed, and read to its end.
+        finished: True if the writer closed the file and all its messages were read.
     """
 
     def __init__(self, path: Path) -> None:
@@ -62,26 +67,26 @@ class Tail:
         self._schemas: dict[int, str] = {}
         self._channels: dict[int, tuple[str, str]] = {}
 
-    def read(self) -> Iterator[Told]:
+    def read(self) -> Iterator[RecordedMessage]:
         """Yield the complete messages that were not read yet.
 
         Raises:
-            Damaged: the file cannot be read further, now or later.
-            OSError: the file cannot be read.
+            DamagedFile: The rest of the file cannot be read, now or later.
+            OSError: The file cannot be read.
         """
         with self.path.open("rb") as file:
             while not self.finished:
-                place = self._offset
-                found = _record(file, place)
-                if found is None:
+                offset = self._offset
+                record = _read_record(file, offset)
+                if record is None:
                     return
-                opcode, body, self._offset = found
-                # Only the index follows.
+                opcode, body, self._offset = record
+                # After DATA_END, only the index follows.
                 self.finished = opcode == Opcode.DATA_END
-                yield from self._messages(opcode, body, place)
+                yield from self._messages(opcode, body, offset)
 
-    def _messages(self, opcode: int, body: bytes, offset: int) -> Iterator[Told]:
-        for index, record in enumerate(_inside(opcode, body, self.path)):
+    def _messages(self, opcode: int, body: bytes, offset: int) -> Iterator[RecordedMessage]:
+        for index, record in enumerate(_parse_record(opcode, body, self.path)):
             if isinstance(record, Schema):
                 self._schemas[record.id] = record.name
             elif isinstance(record, Channel) and record.message_encoding == "json":
@@ -90,31 +95,33 @@ class Tail:
                 topic, schema = self._channels[record.channel_id]
                 content = _content(record)
                 if content is not None:
-                    yield Told(topic, schema, record.log_time // 1_000_000, content, Place(offset, index))
+                    location = MessageLocation(offset, index)
+                    yield RecordedMessage(topic, schema, record.log_time // 1_000_000, content, location)
 
 
-def message_at(path: Path, place: Place) -> dict[str, Any] | None:
-    """Return the content of one message, or None.
+def message_at(path: Path, location: MessageLocation) -> dict[str, Any] | None:
+    """Return the content of one message, or None if the location contains no complete JSON message.
 
     Raises:
-        Damaged: the file cannot be read there.
-        OSError: the file cannot be read.
+        DamagedFile: The file is damaged at this location.
+        OSError: The file cannot be read.
     """
     with path.open("rb") as file:
-        found = _record(file, place.offset)
-    if found is None:
+        record = _read_record(file, location.offset)
+    if record is None:
         return None
-    records = list(_inside(found[0], found[1], path))
-    record = records[place.index] if place.index < len(records) else None
-    return _content(record) if isinstance(record, Message) else None
+    opcode, body, _ = record
+    records = _parse_record(opcode, body, path)
+    message = records[location.index] if location.index < len(records) else None
+    return _content(message) if isinstance(message, Message) else None
 
 
-def _record(file: IO[bytes], offset: int) -> tuple[int, bytes, int] | None:
-    """Return opcode and content of the record at a position, and the position of the next one; None if it is incomplete."""
+def _read_record(file: IO[bytes], offset: int) -> tuple[int, bytes, int] | None:
+    """Return opcode and content of the record at an offset, and the offset of the next record. Return None if it is incomplete."""
     if offset == 0:
         start = file.read(len(MAGIC))
         if start != MAGIC[: len(start)]:
-            raise Damaged(f"{file.name} is not an MCAP file")
+            raise DamagedFile(f"{file.name} is not an MCAP file")
         offset = len(MAGIC)
     file.seek(offset)
     head = file.read(_HEAD.size)
@@ -122,13 +129,13 @@ def _record(file: IO[bytes], offset: int) -> tuple[int, bytes, int] | None:
         return None
     opcode, length = _HEAD.unpack(head)
     if length > MAX_RECORD_BYTES:
-        raise Damaged(f"{file.name} is damaged at byte {offset}")
+        raise DamagedFile(f"{file.name} is damaged at byte {offset}")
     body = file.read(length)
     return (opcode, body, offset + _HEAD.size + length) if len(body) == length else None
 
 
-def _inside(opcode: int, body: bytes, path: Path) -> list[Any]:
-    """Return the records inside a chunk, or the record itself; empty for records without messages."""
+def _parse_record(opcode: int, body: bytes, path: Path) -> list[Any]:
+    """Return the records of a chunk, or a single schema, channel or message. Other records have no messages."""
     stream = ReadDataStream(BytesIO(body))
     try:
         match opcode:
@@ -141,8 +148,8 @@ def _inside(opcode: int, body: bytes, path: Path) -> list[Any]:
             case Opcode.MESSAGE:
                 return [Message.read(stream, len(body))]
     except Exception as error:
-        # The decompression libraries raise various exceptions.
-        raise Damaged(f"{path} is damaged: {error}") from error
+        # Decompression libraries raise many types of exceptions.
+        raise DamagedFile(f"{path} is damaged: {error}") from error
     return []
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from datetime import datetime
-from typing import Any
+from typing import cast
 
 from fractus_core import api
 from fractus_core.api.geometry import Area, Circle, Position
@@ -13,10 +13,10 @@ from fractus_core.api.policies import PolicySpec, ZoneSpec
 from fractus_core.geo import line_geojson
 from fractus_core.geo.formats.geojson import zone_feature
 
-from fractus_view.events import Application, Fix, Link, Policy, State
-from fractus_view.translation import who
+from fractus_view.events import Application, Feature, FeatureProperties, Fix, Geometry, Link, Policy, State
+from fractus_view.translation import short_name
 
-OVER = frozenset({"Completed", "Failed", "Invalid"})
+ENDED_PHASES = frozenset({"Completed", "Failed", "Invalid"})
 """Phases in which an application's plan is no longer relevant."""
 
 _PHASES = {
@@ -29,154 +29,164 @@ _PHASES = {
 
 _REFERENCES = {"home": "home", "amsl": "sea level", "terrain": "ground"}
 
-Feature = dict[str, Any]
-
 
 def fix(drone: api.Drone, now_ms: int) -> Fix | None:
-    """Return the reported position of a drone."""
-    place = drone.status.position if drone.status is not None else None
-    if place is None:
+    """Return the reported position of a drone, or None if there is none."""
+    position = drone.status.position if drone.status is not None else None
+    if position is None:
         return None
-    return Fix(
-        drone.name, now_ms, place.lat, place.lon, place.alt if place.altitude_reference == "amsl" else None, None
-    )
+    amsl_m = position.alt if position.altitude_reference == "amsl" else None
+    return Fix(drone.name, now_ms, position.lat, position.lon, amsl_m, heading_deg=None)
 
 
 def state(drone: api.Drone, now_ms: int) -> State:
     """Return the reported state of a drone."""
-    said = drone.status or api.nodes.DroneStatus()
-    phase = _PHASES.get(said.flight_state)
+    status = drone.status or api.nodes.DroneStatus()
+    phase = _PHASES.get(status.flight_state)
     if phase is None:
-        last = _PHASES.get(said.last_flight_state or "")
-        phase = f"not heard of, last {last}" if last else "not heard of"
-    place = said.position
+        last_phase = _PHASES.get(status.last_flight_state or "")
+        phase = f"not reporting, last {last_phase}" if last_phase else "not reporting"
+    position = status.position
     return State(
         drone=drone.name,
         time_ms=now_ms,
-        altitude_m=place.alt if place is not None and place.altitude_reference == "home" else None,
+        altitude_m=position.alt if position is not None and position.altitude_reference == "home" else None,
         speed_mps=None,
-        battery=said.battery.remaining if said.battery is not None else None,
+        battery=status.battery.remaining if status.battery is not None else None,
         mode="",
-        controller=who(said.controller),
+        controller=short_name(status.controller),
         phase=phase,
-        seen_ms=_unix_ms(said.last_seen),
+        seen_ms=_unix_ms(status.last_seen),
     )
 
 
-def application(given: api.Application) -> Application:
+def application(resource: api.Application) -> Application:
     """Return the state of an application."""
-    said = given.status
-    ready = _condition(said.conditions if said is not None else (), "Ready")
+    status = resource.status
+    ready = _condition(status.conditions if status is not None else (), "Ready")
     return Application(
-        name="/".join(given.key),
-        drone=(said.drone if said is not None else None) or "",
-        phase=(said.phase if said is not None else None) or "Pending",
+        name="/".join(resource.key),
+        drone=(status.drone if status is not None else None) or "",
+        phase=(status.phase if status is not None else None) or "Pending",
         reason=ready.reason if ready is not None else "",
-        text=(said.message if said is not None else None) or "the operator has not seen it yet",
+        text=(status.message if status is not None else None) or "waiting for the operator",
     )
 
 
-def link(given: api.DirectLink) -> Link:
+def link(resource: api.DirectLink) -> Link:
     """Return a direct link and its state."""
-    spec = given.spec
-    said = given.status
+    spec = resource.spec
+    status = resource.status
     return Link(
-        name=given.name,
+        name=resource.name,
         drone=spec.drone,
         node=spec.node,
         lat=spec.position.lat,
         lon=spec.position.lon,
-        phase=(said.phase if said is not None else None) or "Idle",
-        traffic=(said.traffic if said is not None else None) or "",
-        reason=(said.reason if said is not None else None) or "",
-        text=(said.message if said is not None else None) or "",
+        phase=(status.phase if status is not None else None) or "Idle",
+        traffic=(status.traffic if status is not None else None) or "",
+        reason=(status.reason if status is not None else None) or "",
+        text=(status.message if status is not None else None) or "",
     )
 
 
-def policy(given: api.Policy) -> Policy:
-    """Return the summary of a policy, or the reason why it is not ready."""
-    ready = _condition(given.status.conditions if given.status is not None else (), "Ready")
-    text = _phrase(given.spec)
+def policy(resource: api.Policy) -> Policy:
+    """Return the summary of a policy. If the policy is not ready, the summary begins with the reason."""
+    ready = _condition(resource.status.conditions if resource.status is not None else (), "Ready")
+    text = _summary(resource.spec)
     if ready is not None and ready.status == "False":
         text = f"not in force: {ready.message or ready.reason} ({text})"
-    return Policy(given.name, text, given.spec.selector.zones)
+    return Policy(resource.name, text, resource.spec.selector.zones)
 
 
-def _phrase(spec: PolicySpec) -> str:
+def _summary(spec: PolicySpec) -> str:
     match spec.type:
         case "AccessControl":
             return f"{spec.kind} of {', '.join(spec.methods)}"
         case "LimitControl":
             unit = "m/s" if spec.kind == "speed" else f"m above {_REFERENCES[spec.altitude_reference]}"
-            bounds = (("at least", spec.lower_limit), ("at most", spec.upper_limit))
-            said = " and ".join(f"{word} {value:g}" for word, value in bounds if value is not None)
-            return f"{spec.kind} {said} {unit}, {spec.limit_action}"
+            limits = (("at least", spec.lower_limit), ("at most", spec.upper_limit))
+            limits_text = " and ".join(f"{word} {value:g}" for word, value in limits if value is not None)
+            return f"{spec.kind} {limits_text} {unit}, {spec.limit_action}"
         case "GeofenceControl":
             return f"{spec.kind}, {spec.geofence_action}"
         case "PrivacyControl":
             return f"pictures: {spec.action}"
 
 
-def zones(given: Iterable[api.Zone]) -> list[Feature]:
-    """Return the zones by name."""
-    return [_placed(zone, "zone") for zone in sorted(given, key=lambda zone: zone.name)]
+def zones(resources: Iterable[api.Zone]) -> list[Feature]:
+    """Return the zones, sorted by name."""
+    return [_zone_feature(zone, "zone") for zone in sorted(resources, key=lambda zone: zone.name)]
 
 
 def places(edge_nodes: Iterable[api.EdgeNode], depots: Iterable[api.Depot]) -> list[Feature]:
     """Return depots as circles and edge nodes as points."""
-    found = [_placed(_disc(depot), "depot") for depot in sorted(depots, key=lambda depot: depot.name)]
+    features = [_zone_feature(_disc(depot), "depot") for depot in sorted(depots, key=lambda depot: depot.name)]
     for node in sorted(edge_nodes, key=lambda node: node.name):
         ready = _condition(node.status.conditions if node.status is not None else (), "Ready")
-        state = (
-            "not heard of" if ready is None else "ready" if ready.status == "True" else ready.message or ready.reason
+        if ready is None:
+            state = "not reporting"
+        elif ready.status == "True":
+            state = "ready"
+        else:
+            state = ready.message or ready.reason
+        location = node.spec.location
+        features.append(
+            {
+                "type": "Feature",
+                "properties": {"kind": "edgeNode", "name": node.name, "state": state},
+                "geometry": {"type": "Point", "coordinates": [location.lon, location.lat]},
+            }
         )
-        shape = {"type": "Point", "coordinates": [node.spec.location.lon, node.spec.location.lat]}
-        found.append(_feature("edgeNode", node.name, shape, state=state))
-    return found
+    return features
 
 
-def intentions(
+def planned_flights(
     applications: Iterable[api.Application], plans: Mapping[tuple[str, str], api.DeploymentPlan]
 ) -> list[Feature]:
     """Return operation areas and planned paths of applications that have not ended.
 
     Args:
-        applications: all that are known.
-        plans: by namespace and name of the application.
+        applications: Applications.
+        plans: Plans by namespace and name of their application.
     """
-    found: list[Feature] = []
-    for each in sorted(applications, key=lambda each: each.key):
-        plan = plans.get(each.key)
-        if plan is None or (each.status is not None and each.status.phase in OVER):
+    features: list[Feature] = []
+    for resource in sorted(applications, key=lambda resource: resource.key):
+        plan = plans.get(resource.key)
+        if plan is None or (resource.status is not None and resource.status.phase in ENDED_PHASES):
             continue
-        name = "/".join(each.key)
+        name = "/".join(resource.key)
         if plan.spec.operation_area is not None:
-            found.append(_feature("operationArea", name, plan.spec.operation_area, application=name))
-        for component, path in _paths(each):
+            features.append(_application_feature("operationArea", name, plan.spec.operation_area))
+        for component, path in _paths(resource):
             if len(path) > 1:
-                found.append(_feature("path", name, line_geojson(path), application=name, component=component))
-        for leg in plan.spec.drone.transit if plan.spec.drone is not None else ():
-            shape = line_geojson((leg.start, leg.end))
-            found.append(_feature("path", name, shape, application=name, component="system"))
-    return found
+                features.append(_application_feature("path", name, line_geojson(path), component))
+        transit = plan.spec.drone.transit if plan.spec.drone is not None else ()
+        features += [
+            _application_feature("path", name, line_geojson((leg.start, leg.end)), "system") for leg in transit
+        ]
+    return features
 
 
-def _paths(given: api.Application) -> Iterator[tuple[str, tuple[Position, ...]]]:
-    for component in given.spec.components:
+def _paths(resource: api.Application) -> Iterator[tuple[str, tuple[Position, ...]]]:
+    for component in resource.spec.components:
         for point in component.control_points:
             yield component.name, point.path or ()
         if component.points_of_interest is not None:
             yield component.name, component.points_of_interest.points
 
 
-def _feature(kind: str, name: str, geometry: Mapping[str, Any], **more: str) -> Feature:
-    return {"type": "Feature", "properties": {"name": name, "kind": kind, **more}, "geometry": dict(geometry)}
+def _application_feature(kind: str, application: str, geometry: Mapping[str, object], component: str = "") -> Feature:
+    properties: FeatureProperties = {"kind": kind, "name": application, "application": application}
+    if component:
+        properties["component"] = component
+    return {"type": "Feature", "properties": properties, "geometry": cast(Geometry, geometry)}
 
 
-def _placed(zone: api.Zone, kind: str) -> Feature:
+def _zone_feature(zone: api.Zone, kind: str) -> Feature:
     feature = zone_feature(zone, [])
     feature["properties"]["kind"] = kind
-    return feature
+    return cast(Feature, feature)
 
 
 def _disc(depot: api.Depot) -> api.Zone:
@@ -185,8 +195,8 @@ def _disc(depot: api.Depot) -> api.Zone:
 
 
 def _condition(conditions: Iterable[Condition], type_: str) -> Condition | None:
-    return next((each for each in conditions if each.type == type_), None)
+    return next((condition for condition in conditions if condition.type == type_), None)
 
 
-def _unix_ms(moment: datetime | None) -> int | None:
-    return None if moment is None else round(moment.timestamp() * 1000)
+def _unix_ms(time: datetime | None) -> int | None:
+    return None if time is None else round(time.timestamp() * 1000)

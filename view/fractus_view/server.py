@@ -1,4 +1,4 @@
-"""Web server of the view. It responds to GET and HEAD requests with the token."""
+"""Web server of the view. It serves the page, the event stream and pictures to clients with the token."""
 
 from __future__ import annotations
 
@@ -33,31 +33,31 @@ HEADERS = {
     "Referrer-Policy": "no-referrer",
     "X-Content-Type-Options": "nosniff",
 }
-"""Headers of every response: the page loads nothing from other servers, and other pages can neither embed nor read it."""
+"""Headers of every response. The page loads nothing from other servers. Other pages can neither embed nor read it."""
 
 WRITE_TIMEOUT_S = 30.0
-"""Seconds after which a page that reads nothing is disconnected."""
+"""Time, in seconds, after which a client that reads nothing is disconnected."""
 
-ALIVE_S = 15.0
-"""Seconds without events after which a comment is sent to detect broken connections."""
+KEEPALIVE_S = 15.0
+"""Time without events, in seconds, after which a comment is sent to detect broken connections."""
 
 MAX_STREAMS = 64
 
-HEALTH = "/healthz"
+HEALTH_PATH = "/healthz"
 """The only path that needs no token."""
 
 _Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 
 @dataclass
-class View:
-    """Configuration of the server.
+class ViewServer:
+    """The server.
 
     Attributes:
-        source: of the events and pictures.
-        names: what browsers may call the server, besides addresses and localhost.
-        token: who knows it may look; where it changes, who knows the old one may no more, on open pages within `ALIVE_S`.
-        page: the directory of the built page.
+        source: Source of events and pictures.
+        names: Host names by which browsers may address the server, besides IP addresses and localhost.
+        token: Token that clients need. After a change, open pages with the old token are disconnected within `KEEPALIVE_S`.
+        page: Directory of the built page.
     """
 
     source: Source
@@ -65,10 +65,10 @@ class View:
     token: str = field(default_factory=lambda: secrets.token_urlsafe(32))
     page: Path = PAGE
     _streams: set[object] = field(default_factory=set)
-    _answers: Counter = field(
+    _responses: Counter = field(
         default_factory=lambda: Counter(
             "fractus_view_requests_total",
-            "Answered requests by status code, including health checks. 401: without the token.",
+            "Requests by status code of the response, including health checks. 401: without the token.",
             ["code"],
             registry=None,
         )
@@ -79,14 +79,14 @@ class View:
         """Return the aiohttp application.
 
         Raises:
-            OSError: the page was not built.
+            OSError: The page was not built.
         """
-        application = web.Application(middlewares=[self._only_reads, self._only_our_name, self._only_with_token])
-        application.on_response_prepare.extend((_secure, self._count))
+        application = web.Application(middlewares=[self._check_method, self._check_host, self._check_token])
+        application.on_response_prepare.extend((_add_security_headers, self._count))
         files = {path.relative_to(self.page).as_posix(): path.read_bytes() for path in _files(self.page)}
         for name, data in files.items():
             application.router.add_get("/" if name == "index.html" else f"/{name}", _static(name, data))
-        application.router.add_get(HEALTH, self._health)
+        application.router.add_get(HEALTH_PATH, self._health)
         application.router.add_get("/stream", self._stream)
         application.router.add_get("/pictures/{id}", self._picture)
         application.cleanup_ctx.append(self._run)
@@ -94,68 +94,70 @@ class View:
 
     def metrics(self) -> Iterator[Metric]:
         """Yield the metrics of the server."""
-        yield from self._answers.collect()
-        yield gauge("fractus_view_pages", "Open pages, at most 64.", len(self._streams))
+        yield from self._responses.collect()
+        yield gauge("fractus_view_pages", f"Open pages, at most {MAX_STREAMS}.", len(self._streams))
 
     async def _count(self, _request: web.Request, response: web.StreamResponse) -> None:
-        self._answers.labels(str(response.status)).inc()
+        self._responses.labels(str(response.status)).inc()
 
     async def _run(self, _application: web.Application) -> AsyncIterator[None]:
-        """Run the source while the server runs. If it fails, the server stops, because the page would silently stand still."""
+        """Run the source while the server runs. If the source fails, the health check reports it."""
         self._running = task = asyncio.create_task(self.source.run())
-        task.add_done_callback(_ended)
+        task.add_done_callback(_log_failure)
         yield
         task.cancel()
         await asyncio.gather(task, return_exceptions=True)
 
     async def _health(self, _request: web.Request) -> web.Response:
-        """Health check for restarts. It contains no data of flights."""
+        """Health check for restarts. The response contains no data of flights."""
         task = self._running
-        ended = task is None or (task.done() and (task.cancelled() or task.exception() is not None))
-        return web.Response(status=503 if ended else 200, text="nothing new is shown any more\n" if ended else "ok\n")
+        failed = task is None or (task.done() and (task.cancelled() or task.exception() is not None))
+        if failed:
+            return web.Response(status=503, text="the source of events has failed; restart the view\n")
+        return web.Response(text="ok\n")
 
     @web.middleware
-    async def _only_reads(self, request: web.Request, handler: _Handler) -> web.StreamResponse:
+    async def _check_method(self, request: web.Request, handler: _Handler) -> web.StreamResponse:
         if request.method not in {hdrs.METH_GET, hdrs.METH_HEAD}:
-            text = "this server only reads: use GET or HEAD\n"
+            text = "this server is read-only; use GET or HEAD\n"
             return web.Response(status=405, text=text, headers={hdrs.ALLOW: "GET, HEAD"})
         return await handler(request)
 
     @web.middleware
-    async def _only_our_name(self, request: web.Request, handler: _Handler) -> web.StreamResponse:
-        """Refuse foreign host names, which a web site could use to read the page through a user's browser (DNS rebinding)."""
-        if not _ours(request.headers.get(hdrs.HOST, ""), self.names):
+    async def _check_host(self, request: web.Request, handler: _Handler) -> web.StreamResponse:
+        """Reject other host names, by which a web site could read the page through a user's browser (DNS rebinding)."""
+        if not _is_permitted_host(request.headers.get(hdrs.HOST, ""), self.names):
             return web.Response(
-                status=421, text="call this server by its address, by localhost, or as --listen or --hostname says\n"
+                status=421, text="use the IP address of this server, localhost, or a name of --listen or --hostname\n"
             )
         return await handler(request)
 
     @web.middleware
-    async def _only_with_token(self, request: web.Request, handler: _Handler) -> web.StreamResponse:
-        given = request.query.get("token")
-        if request.path == "/" and given is not None and self._right(given):
+    async def _check_token(self, request: web.Request, handler: _Handler) -> web.StreamResponse:
+        token = request.query.get("token")
+        if request.path == "/" and token is not None and self._is_token(token):
             # Redirect, so that the address in histories and logs does not contain the token.
             response = web.Response(status=303, headers={hdrs.LOCATION: "/"})
             response.set_cookie(
-                _cookie(request), self.token, httponly=True, secure=_by_tls(request), samesite="Strict", path="/"
+                _cookie(request), self.token, httponly=True, secure=_uses_tls(request), samesite="Strict", path="/"
             )
             return response
-        if request.path == HEALTH or self._may_look(request):
+        if request.path == HEALTH_PATH or self._is_authorized(request):
             return await handler(request)
-        return web.Response(status=401, text="open the address that `fractus view` printed: it has the token\n")
+        return web.Response(status=401, text="open the address that `fractus view` printed; it contains the token\n")
 
-    def _may_look(self, request: web.Request) -> bool:
+    def _is_authorized(self, request: web.Request) -> bool:
         bearer = request.headers.get(hdrs.AUTHORIZATION, "").removeprefix("Bearer ")
-        return self._right(request.cookies.get(_cookie(request), "")) or self._right(bearer)
+        return self._is_token(request.cookies.get(_cookie(request), "")) or self._is_token(bearer)
 
-    def _right(self, token: str) -> bool:
+    def _is_token(self, token: str) -> bool:
         return hmac.compare_digest(token.encode(errors="replace"), self.token.encode())
 
     async def _picture(self, request: web.Request) -> web.StreamResponse:
         jpeg = await asyncio.to_thread(self.source.picture, request.match_info["id"])
         if jpeg is None:
             return web.Response(
-                status=404, text="there is no such picture, or its recording made room for a newer one\n"
+                status=404, text="picture not found; its recording may have been removed to free space\n"
             )
         return web.Response(body=jpeg, content_type="image/jpeg", headers={hdrs.CACHE_CONTROL: "private, max-age=3600"})
 
@@ -164,19 +166,19 @@ class View:
         if request.method == hdrs.METH_HEAD:
             return web.Response(headers=head)
         if len(self._streams) >= MAX_STREAMS:
-            return web.Response(status=503, text=f"{MAX_STREAMS} pages look already: close one\n")
+            return web.Response(status=503, text=f"{MAX_STREAMS} pages are open, which is the limit; close one\n")
         response = web.StreamResponse(headers=head)
-        place = object()
-        self._streams.add(place)
+        stream = object()
+        self._streams.add(stream)
         try:
             await response.prepare(request)
             await self._send(request, response)
         except (ConnectionError, TimeoutError):
-            # The client is gone or too slow. It reconnects with its last event id.
+            # The client has disconnected or is too slow. It reconnects with the id of its last message.
             if request.transport is not None:
                 request.transport.abort()
         finally:
-            self._streams.discard(place)
+            self._streams.discard(stream)
         return response
 
     async def _send(self, request: web.Request, response: web.StreamResponse) -> None:
@@ -184,19 +186,19 @@ class View:
         pending = asyncio.ensure_future(anext(messages, None))
         try:
             while True:
-                done, _ = await asyncio.wait({pending}, timeout=ALIVE_S)
-                said = pending.result() if done else b":\n\n"
-                if said is None or not self._may_look(request):
+                done, _ = await asyncio.wait({pending}, timeout=KEEPALIVE_S)
+                message = pending.result() if done else b":\n\n"
+                if message is None or not self._is_authorized(request):
                     return
                 if done:
                     pending = asyncio.ensure_future(anext(messages, None))
                 async with asyncio.timeout(WRITE_TIMEOUT_S):
-                    await response.write(said)
+                    await response.write(message)
         finally:
             pending.cancel()
 
 
-def _ended(task: asyncio.Task[None]) -> None:
+def _log_failure(task: asyncio.Task[None]) -> None:
     if not task.cancelled() and task.exception() is not None:
         log.error("view: source failed, restart the view", exc_info=task.exception())
 
@@ -207,12 +209,12 @@ def _cookie(request: web.Request) -> str:
     return f"fractus-view-{port if port.isdecimal() else 80}"
 
 
-def _by_tls(request: web.Request) -> bool:
-    """Return True if the browser uses TLS to the proxy. A client that sets the header wrongly only breaks its own cookie."""
+def _uses_tls(request: web.Request) -> bool:
+    """Return True if the browser uses TLS, directly or to a proxy. A client that forges the header only breaks its own cookie."""
     return request.secure or request.headers.get("X-Forwarded-Proto", "").lower() == "https"
 
 
-def _ours(host: str, names: frozenset[str]) -> bool:
+def _is_permitted_host(host: str, names: frozenset[str]) -> bool:
     """Return True if a Host header contains an IP address, localhost or a permitted name."""
     name = host.rpartition(":")[0] if host.rpartition(":")[2].isdecimal() else host
     name = name.removeprefix("[").removesuffix("]").lower()
@@ -225,7 +227,7 @@ def _ours(host: str, names: frozenset[str]) -> bool:
     return True
 
 
-async def _secure(_request: web.Request, response: web.StreamResponse) -> None:
+async def _add_security_headers(_request: web.Request, response: web.StreamResponse) -> None:
     response.headers.update(HEADERS)
 
 
@@ -235,16 +237,14 @@ def _files(page: Path) -> list[Path]:
 
 
 def _static(name: str, data: bytes) -> _Handler:
-    kind = (
-        "text/javascript"
-        if name.endswith((".js", ".mjs"))
-        else mimetypes.guess_type(name)[0] or "application/octet-stream"
-    )
+    media_type = mimetypes.guess_type(name)[0] or "application/octet-stream"
+    if name.endswith((".js", ".mjs")):
+        media_type = "text/javascript"
     # File names in assets contain a digest of the content.
-    kept = "private, max-age=31536000, immutable" if name.startswith("assets/") else "no-store"
+    caching = "private, max-age=31536000, immutable" if name.startswith("assets/") else "no-store"
 
-    async def answer(_request: web.Request) -> web.Response:
-        charset = "utf-8" if kind.startswith("text/") else None
-        return web.Response(body=data, content_type=kind, charset=charset, headers={hdrs.CACHE_CONTROL: kept})
+    async def respond(_request: web.Request) -> web.Response:
+        charset = "utf-8" if media_type.startswith("text/") else None
+        return web.Response(body=data, content_type=media_type, charset=charset, headers={hdrs.CACHE_CONTROL: caching})
 
-    return answer
+    return respond

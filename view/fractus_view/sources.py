@@ -1,4 +1,4 @@
-"""Sources of events: complete recordings, or recordings that services write now."""
+"""Sources of events: complete recordings, and recordings that services are writing."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from collections.abc import AsyncIterator, Iterator, Sequence
 from pathlib import Path
 from typing import Protocol
 
-from fractus_view.events import END, RESET, Event, Problem, encode, message
+from fractus_view.events import END, RESET, Event, Problem, encode, stream_message
 from fractus_view.hub import Hub
-from fractus_view.mcap_tail import Damaged, Place, Tail, message_at
-from fractus_view.translation import Translation
+from fractus_view.mcap_tail import DamagedFile, MessageLocation, Tail, message_at
+from fractus_view.translation import Translator
 
 log = logging.getLogger(__name__)
 
-POLL_S = 0.5
-"""Seconds between two scans of the directory. Services write every 3 s."""
+POLL_INTERVAL_S = 0.5
+"""Interval between two scans of the directory, in seconds. Services write every 3 s."""
 
-CURRENT_S = 60.0
-"""A file without writes for more seconds belongs to an earlier flight."""
+MAX_CURRENT_AGE_S = 60.0
+"""Time without writes, in seconds, from which a file belongs to an earlier flight."""
 
 _BATCH = 1_000
 
@@ -45,22 +45,22 @@ class Source(Protocol):
         ...
 
 
-class Files:
-    """Files with pictures, by number."""
+class PictureFiles:
+    """Files with pictures. The number of a file is its index in `paths`."""
 
     def __init__(self, paths: Sequence[Path] = ()) -> None:
         self.paths = list(paths)
 
     def picture(self, id_: str) -> bytes | None:
-        """Return a picture by the id that `Translation` assigned, or None if it does not exist."""
+        """Return a picture by the id that `Translator` assigned, or None if it does not exist."""
         parts = id_.split("-")
         if len(parts) != 3 or not all(part.isascii() and part.isdecimal() and len(part) < 16 for part in parts):
             return None
         file, offset, index = map(int, parts)
         try:
-            content = message_at(self.paths[file], Place(offset, index))
+            content = message_at(self.paths[file], MessageLocation(offset, index))
             return b64decode(content["data"], validate=True) if content and content.get("format") == "jpeg" else None
-        except (Damaged, OSError, IndexError, KeyError, ValueError, TypeError):
+        except (DamagedFile, OSError, IndexError, KeyError, ValueError, TypeError):
             return None
 
 
@@ -68,11 +68,11 @@ class Replay:
     """Complete recordings. Each page receives all events in chronological order.
 
     Args:
-        paths: MCAP files, of one or more drones and services.
+        paths: MCAP files of one or several drones and services.
     """
 
     def __init__(self, paths: Sequence[Path]) -> None:
-        self._files = Files(paths)
+        self._files = PictureFiles(paths)
 
     def picture(self, id_: str) -> bytes | None:
         """Return a picture of the recordings."""
@@ -82,46 +82,46 @@ class Replay:
         """Do nothing, because recordings do not change."""
 
     async def stream(self, last_id: str) -> AsyncIterator[bytes]:
-        """Yield all events with numbers, and the end."""
-        told = int(last_id) if last_id.isascii() and last_id.isdecimal() and len(last_id) < 16 else 0
-        events = itertools.islice(self.events(), told, None)
-        first = [] if told else [RESET]
+        """Yield all events, and the end. The id of a message is the number of events up to this message."""
+        sent = int(last_id) if last_id.isascii() and last_id.isdecimal() and len(last_id) < 16 else 0
+        events = itertools.islice(self.events(), sent, None)
+        first = [] if sent else [RESET]
         while batch := await asyncio.to_thread(lambda: [encode(event) for event in itertools.islice(events, _BATCH)]):
-            told += len(batch)
-            yield message(str(told), [*first, *batch])
+            sent += len(batch)
+            yield stream_message(str(sent), [*first, *batch])
             first = []
-        yield message(str(told), [*first, END])
+        yield stream_message(str(sent), [*first, END])
 
     def events(self) -> Iterator[Event]:
         """Yield the events of all files, merged by time."""
-        found = (_events(Tail(path), Translation(number)) for number, path in enumerate(self._files.paths))
-        return heapq.merge(*found, key=lambda event: event.time_ms)
+        per_file = (_events(Tail(path), Translator(number)) for number, path in enumerate(self._files.paths))
+        return heapq.merge(*per_file, key=lambda event: event.time_ms)
 
 
-def _events(tail: Tail, translation: Translation) -> Iterator[Event]:
+def _events(tail: Tail, translator: Translator) -> Iterator[Event]:
     """Yield the events of a file, and one `Problem` if it is damaged."""
     last_ms = 0
     try:
-        for told in tail.read():
-            last_ms = told.time_ms
-            yield from translation.events(told)
-    except (Damaged, OSError) as error:
+        for message in tail.read():
+            last_ms = message.time_ms
+            yield from translator.events(message)
+    except (DamagedFile, OSError) as error:
         tail.finished = True
-        yield Problem(last_ms, f"a recording is damaged and cannot be read further: {error}")
+        yield Problem(last_ms, f"the rest of a recording cannot be read: {error}")
 
 
-class Following:
-    """Recordings below one directory that services write now.
+class GrowingRecordings:
+    """Recordings that services are writing below a directory.
 
     Args:
-        directory: looked through with all directories in it.
+        directory: Directory that is scanned, with its subdirectories.
     """
 
     def __init__(self, directory: Path) -> None:
         self._directory = directory
         self._hub = Hub()
-        self._files = Files()
-        self._open: dict[Path, tuple[Tail, Translation]] = {}
+        self._files = PictureFiles()
+        self._open: dict[Path, tuple[Tail, Translator]] = {}
         self._problem = ""
 
     def picture(self, id_: str) -> bytes | None:
@@ -133,42 +133,42 @@ class Following:
         return self._hub.stream(last_id)
 
     async def run(self) -> None:
-        """Read files as they grow."""
+        """Read the files as they grow, until cancelled."""
         while True:
             events = await asyncio.to_thread(self._read)
             if events:
                 self._hub.publish(events)
-            await asyncio.sleep(POLL_S)
+            await asyncio.sleep(POLL_INTERVAL_S)
 
     def _read(self) -> list[Event]:
         events: list[Event] = []
         try:
-            self._look()
+            self._scan()
             self._problem = ""
         except OSError as error:
-            text = f"recordings cannot be read: {error}"
+            text = f"cannot read recordings: {error}"
             if text != self._problem:
                 self._problem = text
                 log.warning("view: %s", text)
                 events.append(Problem(round(time.time() * 1000), text))
-        for tail, translation in self._open.values():
+        for tail, translator in self._open.values():
             if not tail.finished:
-                events += _events(tail, translation)
+                events += _events(tail, translator)
         return sorted(events, key=lambda event: event.time_ms)
 
-    def _look(self) -> None:
-        """Open new files, and close removed ones."""
-        written = dict(_written(self._directory))
-        for path in self._open.keys() - written.keys():
+    def _scan(self) -> None:
+        """Start to read new files, and forget removed files."""
+        modified = dict(_modification_times(self._directory))
+        for path in self._open.keys() - modified.keys():
             del self._open[path]
-        for path in sorted(written.keys() - self._open.keys()):
-            if time.time() - written[path] < CURRENT_S:
-                self._open[path] = (Tail(path), Translation(len(self._files.paths)))
+        for path in sorted(modified.keys() - self._open.keys()):
+            if time.time() - modified[path] < MAX_CURRENT_AGE_S:
+                self._open[path] = (Tail(path), Translator(len(self._files.paths)))
                 self._files.paths.append(path)
 
 
-def _written(directory: Path) -> Iterator[tuple[Path, float]]:
-    """Return the recordings in a directory with their modification times."""
+def _modification_times(directory: Path) -> Iterator[tuple[Path, float]]:
+    """Yield the recordings below a directory with their modification times."""
     directory.stat()
     for path in directory.rglob("*.mcap"):
         # Services may remove the oldest files at any time.

@@ -5,27 +5,29 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterator, Mapping
-from typing import Any
+from typing import Any, cast
 
-from fractus_view.events import Areas, Event, Fix, Note, Picture, State, Verdict
-from fractus_view.mcap_tail import Told
+from fractus_view.events import Areas, Event, Feature, Fix, Note, Picture, State, Verdict
+from fractus_view.mcap_tail import RecordedMessage
 
-PERIOD_MS = 200
-"""Milliseconds between two published positions. They are recorded at 20 Hz and published at 5 Hz; the page draws lines between them."""
+FIX_INTERVAL_MS = 200
+"""Interval between two published positions of a moving drone. Recordings contain 20 positions per second."""
 
-STILL_MS = 1_000
-"""Milliseconds between two published positions that do not change."""
+STILL_FIX_INTERVAL_MS = 1_000
+"""Interval between two published positions of a drone that stands still."""
 
+_DEFAULT_LEVEL = 2
+"""Level of foxglove.Log of a log line without a level (information)."""
 
-JUDGED = frozenset({"call", "monitor", "takeover"})
+VERDICT_KINDS = frozenset({"call", "monitor", "takeover"})
 """Kinds of audit entries that are verdicts. Other entries become log lines."""
 
 
-class Translation:
-    """Converter of one file's messages.
+class Translator:
+    """Converts the messages of one file.
 
     Args:
-        file: how the server knows the file that pictures are in.
+        file: Number of the file, which the ids of its pictures contain.
     """
 
     def __init__(self, file: int) -> None:
@@ -33,29 +35,32 @@ class Translation:
         self._heading: dict[str, float] = {}
         self._last: dict[str, Fix] = {}
 
-    def events(self, told: Told) -> Iterator[Event]:
-        """Return the events of a message; empty if it is irrelevant or does not match its schema."""
-        _, node, topic = told.topic.split("/") if told.topic.count("/") == 2 else ("", "", "")
-        content = told.content
-        time_ms = told.time_ms
-        match told.schema, topic:
-            case "foxglove.LocationFix", _:
+    def events(self, message: RecordedMessage) -> Iterator[Event]:
+        """Yield the events of a message. Messages that are irrelevant or do not match their schema have no events."""
+        # Topics have the form /NODE/NAME.
+        node = message.topic.split("/")[1] if message.topic.count("/") == 2 else ""
+        content = message.content
+        time_ms = message.time_ms
+        match message.schema:
+            case "foxglove.LocationFix":
                 yield from self._fix(node, time_ms, content)
-            case "fractus.Attitude", _:
+            case "fractus.Attitude":
                 yaw = _number(content.get("yaw_rad"))
                 if yaw is not None:
                     self._heading[node] = round(math.degrees(yaw) % 360, 1)
-            case "fractus.State", _:
+            case "fractus.State":
                 yield _state(node, time_ms, content)
-            case "fractus.Decision", _ if content.get("kind") in JUDGED:
+            case "fractus.Decision" if content.get("kind") in VERDICT_KINDS:
                 yield _verdict(node, time_ms, content)
-            case "foxglove.GeoJSON", _:
+            case "foxglove.GeoJSON":
                 yield from _areas(node, time_ms, content)
-            case "foxglove.CompressedImage", _ if content.get("format") == "jpeg":
-                yield Picture(node, time_ms, f"{self._file}-{told.place.offset}-{told.place.index}")
-            case "foxglove.Log", _:
+            case "foxglove.CompressedImage" if content.get("format") == "jpeg":
+                location = message.location
+                yield Picture(node, time_ms, f"{self._file}-{location.offset}-{location.index}")
+            case "foxglove.Log":
                 level = content.get("level")
-                yield Note(node, time_ms, level if isinstance(level, int) else 2, _text(content.get("message")))
+                text = _text(content.get("message"))
+                yield Note(node, time_ms, level if isinstance(level, int) else _DEFAULT_LEVEL, text)
 
     def _fix(self, node: str, time_ms: int, content: Mapping[str, Any]) -> Iterator[Fix]:
         lat = _number(content.get("latitude"))
@@ -66,7 +71,7 @@ class Translation:
         last = self._last.get(node)
         if last is not None:
             still = (last.lat, last.lon, last.amsl_m, last.heading_deg) == (lat, lon, fix.amsl_m, fix.heading_deg)
-            if 0 <= time_ms - last.time_ms < (STILL_MS if still else PERIOD_MS):
+            if 0 <= time_ms - last.time_ms < (STILL_FIX_INTERVAL_MS if still else FIX_INTERVAL_MS):
                 return
         self._last[node] = fix
         yield fix
@@ -80,7 +85,7 @@ def _state(node: str, time_ms: int, content: Mapping[str, Any]) -> State:
         speed_mps=_number(content.get("speed_mps")),
         battery=_number(content.get("battery")),
         mode=_text(content.get("mode")),
-        controller=who(content.get("controller")),
+        controller=short_name(content.get("controller")),
         phase="in the air" if content.get("in_air") is True else "on the ground",
     )
 
@@ -91,7 +96,7 @@ def _verdict(node: str, time_ms: int, content: Mapping[str, Any]) -> Verdict:
         drone=node,
         time_ms=time_ms,
         kind=_text(content.get("kind")),
-        component=who(content.get("caller")) if content.get("caller") else "",
+        component=short_name(content.get("caller")),
         method=_text(content.get("method")),
         action=_text(content.get("action")),
         code=_text(content.get("code")),
@@ -108,22 +113,22 @@ def _areas(node: str, time_ms: int, content: Mapping[str, Any]) -> Iterator[Area
     except (ValueError, KeyError, TypeError):
         return
     if isinstance(features, list):
-        yield Areas(node, time_ms, [feature for feature in features if isinstance(feature, dict)])
+        yield Areas(node, time_ms, [cast(Feature, feature) for feature in features if isinstance(feature, dict)])
 
 
-def who(identity: object) -> str:
-    """Return a short name of an identity: the component, or the last part."""
+def short_name(identity: object) -> str:
+    """Return the component in a SPIFFE id, or the last part of any other identity."""
     text = _text(identity)
-    _, found, rest = text.partition("/component/")
-    return rest.partition("/")[0] if found else text.rpartition("/")[2]
+    _, separator, rest = text.partition("/component/")
+    return rest.partition("/")[0] if separator else text.rpartition("/")[2]
 
 
-def _text(given: object) -> str:
-    return given if isinstance(given, str) else ""
+def _text(value: object) -> str:
+    return value if isinstance(value, str) else ""
 
 
-def _number(given: object) -> float | None:
+def _number(value: object) -> float | None:
     """Return a finite number, or None for other values."""
-    if isinstance(given, int | float) and not isinstance(given, bool) and math.isfinite(given):
-        return float(given)
+    if isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value):
+        return float(value)
     return None

@@ -9,28 +9,30 @@ function files(path: string): string[] {
   return statSync(path).isDirectory() ? readdirSync(path).sort().flatMap((name) => files(`${path}/${name}`)) : [path];
 }
 
-/** Writes down what the page was built of, so that a test can tell one that is out of date. */
-function remember(): Plugin {
-  const source = () => SOURCES.flatMap(files).map((path) => `${createHash("sha256").update(readFileSync(path)).digest("hex")}  ${path}\n`);
+/** Stores the digests of all source files, so that a test can detect an outdated page. */
+function storeDigests(): Plugin {
+  const lines = () => SOURCES.flatMap(files).map((path) => `${createHash("sha256").update(readFileSync(path)).digest("hex")}  ${path}\n`);
   return {
-    name: "remember",
+    name: "store-digests",
     generateBundle() {
-      this.emitFile({ type: "asset", fileName: "sources.sha256", source: source().join("") });
+      this.emitFile({ type: "asset", fileName: "sources.sha256", source: lines().join("") });
     },
   };
 }
 
-/** Lets the browser fetch and compile the map while it reads the rest, though the page does without where there is no WebGL. */
-function early(): Plugin {
+/** Preloads the map, which is a separate chunk because the page works without it if the browser has no WebGL. */
+function preloadMap(): Plugin {
   return {
-    name: "early",
+    name: "preload-map",
     transformIndexHtml: {
       order: "post",
       handler: (html, context) => {
-        const files = Object.values(context.bundle ?? {}).filter((one) => !html.includes(one.fileName));
-        const chunks = files.filter((one) => one.type === "chunk").map((one) => ({ rel: "modulepreload", href: `/${one.fileName}` }));
-        // A module waits for its style sheet.
-        const styles = files.filter((one) => one.fileName.endsWith(".css")).map((one) => ({ rel: "stylesheet", href: `/${one.fileName}` }));
+        const files = Object.values(context.bundle ?? {}).filter((file) => !html.includes(file.fileName));
+        const chunks = files.filter((file) => file.type === "chunk").map((file) => ({ rel: "modulepreload", href: `/${file.fileName}` }));
+        // Preload style sheets too, because a module waits for its style sheet.
+        const styles = files
+          .filter((file) => file.fileName.endsWith(".css"))
+          .map((file) => ({ rel: "stylesheet", href: `/${file.fileName}` }));
         return [...styles, ...chunks].map((attrs) => ({ tag: "link", attrs, injectTo: "head" }));
       },
     },
@@ -38,14 +40,14 @@ function early(): Plugin {
 }
 
 export default defineConfig({
-  plugins: [remember(), early()],
+  plugins: [storeDigests(), preloadMap()],
   build: {
     outDir: "../fractus_view/page",
     emptyOutDir: true,
-    // The policy of the page lets no inlined file in.
+    // The page's Content-Security-Policy forbids inlined files.
     assetsInlineLimit: 0,
     modulePreload: { polyfill: false },
-    // MapLibre changes seldom: its file keeps its name when ours change.
+    // Keep MapLibre in its own file, so that browsers can cache it when other files change.
     rollupOptions: { output: { manualChunks: (id: string) => (id.includes("maplibre-gl") ? "maplibre" : null) } },
     chunkSizeWarningLimit: 2000,
   },

@@ -1,5 +1,16 @@
-// What the server tells; `view/fractus_view/events.py` declares the same fields. Times are Unix milliseconds.
+// Generated from view/fractus_view/events.py by `make generate`. Do not edit.
 
+/**
+ * Position of a drone.
+ *
+ * Attributes:
+ *     drone: Name of the drone's node, as in all events.
+ *     time_ms: Time in Unix milliseconds, as in all events.
+ *     lat: Latitude in degrees.
+ *     lon: Longitude in degrees.
+ *     amsl_m: Altitude above mean sea level in metres, or null if it is unknown.
+ *     heading_deg: Heading in degrees clockwise from north, or null if it is unknown.
+ */
 export interface Fix {
   type: "fix";
   drone: string;
@@ -10,6 +21,18 @@ export interface Fix {
   heading_deg: number | null;
 }
 
+/**
+ * State of a drone.
+ *
+ * Attributes:
+ *     altitude_m: Altitude above home in metres.
+ *     speed_mps: Ground speed in metres per second.
+ *     battery: Remaining charge from 0 to 1.
+ *     mode: Flight mode of the autopilot, or an empty string.
+ *     controller: Control authority, or an empty string.
+ *     phase: Phase of the flight, for people.
+ *     seen_ms: Time of the drone's report in Unix milliseconds, or null if it equals `time_ms`.
+ */
 export interface State {
   type: "state";
   drone: string;
@@ -23,12 +46,27 @@ export interface State {
   seen_ms: number | null;
 }
 
+/** A drone was removed. Its earlier events are void. */
 export interface Gone {
   type: "gone";
   drone: string;
   time_ms: number;
 }
 
+/**
+ * Verdict on a call or on the flight.
+ *
+ * Attributes:
+ *     kind: Kind of the audit entry: `call`, `monitor` or `takeover`.
+ *     component: Component that called, or an empty string.
+ *     method: Called method, or an empty string.
+ *     action: Verdict on a call: `allow`, `correct`, `deny` or `takeover`.
+ *     code: Reason for programs.
+ *     reason: Reason for people.
+ *     policies: Names of the policies that decided.
+ *     lat: Latitude of the drone in degrees, or null if it is unknown.
+ *     lon: Longitude of the drone in degrees, or null if it is unknown.
+ */
 export interface Verdict {
   type: "verdict";
   drone: string;
@@ -44,6 +82,7 @@ export interface Verdict {
   lon: number | null;
 }
 
+/** Log line. Levels are those of foxglove.Log, from 1 (debug) to 5 (fatal). */
 export interface Note {
   type: "note";
   drone: string;
@@ -52,26 +91,38 @@ export interface Note {
   text: string;
 }
 
-export interface Band {
+/** Altitude limits of an area in metres. A missing limit is unlimited. */
+export interface AltitudeBand {
   lower?: number;
   upper?: number;
   reference?: string;
 }
 
-export interface Feature {
-  type: "Feature";
-  properties: {
-    kind: string;
-    name: string;
-    application?: string;
-    component?: string;
-    altitude?: Band;
-    description?: string;
-    state?: string;
-  };
-  geometry: GeoJSON.Polygon | GeoJSON.MultiPolygon | GeoJSON.LineString | GeoJSON.MultiLineString | GeoJSON.Point;
+/** Properties of an area or place. `kind` is zone, operationArea, corridor, path, depot or edgeNode. */
+export interface FeatureProperties {
+  kind: string;
+  name: string;
+  application?: string;
+  component?: string;
+  altitude?: AltitudeBand;
+  description?: string;
+  state?: string;
 }
 
+/** GeoJSON geometry. */
+export interface Geometry {
+  type: "Polygon" | "MultiPolygon" | "LineString" | "MultiLineString" | "Point";
+  coordinates: any[];
+}
+
+/** GeoJSON feature: a zone, area, planned path or place. */
+export interface Feature {
+  type: "Feature";
+  properties: FeatureProperties;
+  geometry: Geometry;
+}
+
+/** Zones, areas, planned paths and places of one origin. They replace the earlier ones of this origin. */
 export interface Areas {
   type: "areas";
   origin: string;
@@ -79,6 +130,7 @@ export interface Areas {
   features: Feature[];
 }
 
+/** State of an application. `reason` is for programs, `text` for people. */
 export interface Application {
   name: string;
   drone: string;
@@ -87,12 +139,21 @@ export interface Application {
   text: string;
 }
 
+/** All current applications. */
 export interface Applications {
   type: "applications";
   time_ms: number;
   applications: Application[];
 }
 
+/**
+ * Possible direct link between a drone and a node.
+ *
+ * Attributes:
+ *     lat: Latitude of the node in degrees.
+ *     lon: Longitude of the node in degrees.
+ *     traffic: Current path of the traffic, `cloud` or `direct`, or an empty string if it is unknown.
+ */
 export interface Link {
   name: string;
   drone: string;
@@ -105,25 +166,34 @@ export interface Link {
   text: string;
 }
 
+/** All currently possible direct links. */
 export interface Links {
   type: "links";
   time_ms: number;
   links: Link[];
 }
 
+/** Summary of a policy and its zones. Without zones, the policy applies everywhere. */
 export interface Policy {
   name: string;
   text: string;
   zones: string[];
 }
 
+/** All current policies. */
 export interface Policies {
   type: "policies";
   time_ms: number;
   policies: Policy[];
 }
 
-/** Whether what is shown is so now; told every second or so by sources that can lose sight of it. */
+/**
+ * Staleness of the shown state. Sent about once per second, even without changes.
+ *
+ * Attributes:
+ *     stale_since_ms: Time of the last contact in Unix milliseconds, or null if the state is current.
+ *     text: Reason in one sentence, or an empty string.
+ */
 export interface Contact {
   type: "contact";
   time_ms: number;
@@ -131,6 +201,7 @@ export interface Contact {
   text: string;
 }
 
+/** Picture after privacy filters. The page requests it by `id`. */
 export interface Picture {
   type: "picture";
   drone: string;
@@ -138,6 +209,7 @@ export interface Picture {
   id: string;
 }
 
+/** Problem with the shown data, in one sentence. */
 export interface Problem {
   type: "problem";
   time_ms: number;
@@ -158,5 +230,5 @@ export type Event =
   | Picture
   | Problem;
 
-/** What was told before is void; all up to now was told; a recording has no more. */
-export type Sign = { type: "reset" } | { type: "live" } | { type: "end" };
+/** Markers of the stream: the complete current state follows, later events happen now, the recording has ended. */
+export type Marker = { type: "reset" } | { type: "live" } | { type: "end" };

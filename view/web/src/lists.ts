@@ -1,8 +1,8 @@
-// What the map shows, and more, as lists.
+// Lists of drones, verdicts, areas and other objects. They contain everything that the map shows.
 
 import type { Application, Feature, Link, Note, Policy, Verdict } from "./events";
 import type { Drone, Model } from "./model";
-import { actionOf, clock, decided, facts, kindName, quantity, sentence } from "./words";
+import { actionOf, callOf, clock, facts, isIntervention, kindName, quantity, sentence } from "./text";
 
 const MAX_VERDICTS = 200;
 const MAX_NOTES = 200;
@@ -13,11 +13,11 @@ export interface Actions {
   seek(time: number): void;
 }
 
-function element<K extends keyof HTMLElementTagNameMap>(tag: K, kind = "", text = ""): HTMLElementTagNameMap[K] {
-  const made = document.createElement(tag);
-  if (kind) made.className = kind;
-  if (text) made.textContent = text;
-  return made;
+function element<K extends keyof HTMLElementTagNameMap>(tag: K, className = "", text = ""): HTMLElementTagNameMap[K] {
+  const created = document.createElement(tag);
+  if (className) created.className = className;
+  if (text) created.textContent = text;
+  return created;
 }
 
 export function byId<T extends HTMLElement>(id: string): T {
@@ -28,31 +28,33 @@ function setText(target: HTMLElement, text: string): void {
   if (target.textContent !== text) target.textContent = text;
 }
 
-function applicationItem(one: Application): HTMLLIElement {
+function phaseBadge(phase: string): HTMLSpanElement {
+  const badge = element("span", "badge", phase);
+  badge.dataset["phase"] = phase;
+  return badge;
+}
+
+function applicationItem(application: Application): HTMLLIElement {
   const item = element("li");
   const head = element("p", "head");
-  const phase = element("span", "badge", one.phase);
-  phase.dataset["phase"] = one.phase;
-  head.append(element("span", "name", one.name), phase, element("span", "facts", one.drone));
-  item.append(head, element("p", "facts", [one.reason, one.text].filter(Boolean).join(": ")));
+  head.append(element("span", "name", application.name), phaseBadge(application.phase), element("span", "facts", application.drone));
+  item.append(head, element("p", "facts", [application.reason, application.text].filter(Boolean).join(": ")));
   return item;
 }
 
-function linkItem(one: Link): HTMLLIElement {
+function linkItem(link: Link): HTMLLIElement {
   const item = element("li");
   const head = element("p", "head");
-  const phase = element("span", "badge", one.phase);
-  phase.dataset["phase"] = one.phase;
-  head.append(element("span", "name", `${one.drone} – ${one.node}`), phase);
-  const traffic = one.traffic ? `traffic ${one.traffic === "direct" ? "over the link" : "by the cloud"}` : "";
-  item.append(head, element("p", "facts", [traffic, one.text || one.reason].filter(Boolean).join(" · ")));
+  head.append(element("span", "name", `${link.drone} – ${link.node}`), phaseBadge(link.phase));
+  const route = link.traffic === "direct" ? "traffic over the link" : "traffic through the cloud";
+  item.append(head, element("p", "facts", [link.traffic ? route : "", link.text || link.reason].filter(Boolean).join(" · ")));
   return item;
 }
 
-function policyItem(one: Policy): HTMLLIElement {
+function policyItem(policy: Policy): HTMLLIElement {
   const item = element("li");
-  const where = one.zones.length > 0 ? `in ${one.zones.join(", ")}` : "everywhere";
-  item.append(element("span", "name", one.name), element("span", "facts", ` ${one.text}; ${where}`));
+  const scope = policy.zones.length > 0 ? `in ${policy.zones.join(", ")}` : "everywhere";
+  item.append(element("span", "name", policy.name), element("span", "facts", ` ${policy.text}; ${scope}`));
   return item;
 }
 
@@ -90,12 +92,12 @@ export class Lists {
     this.showVerdicts(time);
     this.showZones(time);
     const model = this.model;
-    // A cluster tells of no calls, pictures or logs: an empty list would say that there were none.
-    const silent = model.contact !== undefined && model.verdicts.values.length === 0;
-    for (const id of ["verdicts", "pictures", "log"]) byId(`${id}-section`).hidden = silent;
-    this.showSection("applications", model.applications.at(time)?.applications, applicationItem, "No application.");
-    this.showSection("links", model.linksAt(time), linkItem, "No direct link.");
-    this.showSection("policies", model.policies.at(time)?.policies, policyItem, "No policy: without one nothing is allowed.");
+    // Hide these lists for a cluster, which reports no calls, pictures or logs. Empty lists would suggest that there were none.
+    const fromCluster = model.contact !== undefined && model.verdicts.values.length === 0;
+    for (const id of ["verdicts", "pictures", "log"]) byId(`${id}-section`).hidden = fromCluster;
+    this.showSection("applications", model.applications.at(time)?.applications, applicationItem, "No applications.");
+    this.showSection("links", model.linksAt(time), linkItem, "No direct links.");
+    this.showSection("policies", model.policies.at(time)?.policies, policyItem, "No policies. All calls are refused without a policy.");
     this.showPictures(time);
     this.showLog(time);
   }
@@ -107,7 +109,7 @@ export class Lists {
       this.rows.delete(name);
     }
     for (const drone of this.model.drones.values()) this.showDrone(drone, time, selected);
-    if (this.rows.size === 0) this.empty(this.drones, "No drone was heard of yet.");
+    if (this.rows.size === 0) this.empty(this.drones, "No drones yet.");
     else this.drones.querySelector(".empty")?.remove();
   }
 
@@ -115,18 +117,19 @@ export class Lists {
     const row = this.rows.get(drone.name) ?? this.makeRow(drone.name);
     const state = drone.states.at(time);
     const battery = state?.battery;
-    const said = [
+    const isStale = drone.isStale(time);
+    const values = [
       `battery ${quantity(battery === null || battery === undefined ? null : battery * 100, 0, "%")}`,
       `altitude ${quantity(state?.altitude_m, 1, "m")}`,
       `speed ${quantity(state?.speed_mps, 1, "m/s")}`,
       `controller ${state?.controller || "–"}`,
       ...(state?.mode ? [`mode ${state.mode}`] : []),
-      ...(drone.stale(time) ? [`last heard of at ${state?.seen_ms ? clock(state.seen_ms) : "–"}`] : []),
+      ...(isStale ? [`last report at ${state?.seen_ms ? clock(state.seen_ms) : "–"}`] : []),
     ];
-    setText(row.phase, state?.phase ?? "not heard of");
+    setText(row.phase, state?.phase ?? "not reporting");
     row.phase.dataset["phase"] = state?.phase ?? "";
-    setText(row.facts, said.join(" · "));
-    row.item.classList.toggle("stale", drone.stale(time));
+    setText(row.facts, values.join(" · "));
+    row.item.classList.toggle("stale", isStale);
     const pressed = String(drone.name === selected);
     if (row.button.getAttribute("aria-pressed") !== pressed) row.button.setAttribute("aria-pressed", pressed);
   }
@@ -143,33 +146,32 @@ export class Lists {
     row.button.addEventListener("click", () => this.actions.select(name));
     row.item.append(row.button, row.phase, row.facts);
     this.rows.set(name, row);
-    // By name, however they come.
-    const later = [...this.rows.keys()].filter((other) => other > name).sort()[0];
-    this.drones.insertBefore(row.item, later === undefined ? null : this.rows.get(later)!.item);
+    // Keep the rows sorted by name.
+    const next = [...this.rows.keys()].filter((other) => other > name).sort()[0];
+    this.drones.insertBefore(row.item, next === undefined ? null : this.rows.get(next)!.item);
     return row;
   }
 
   private showVerdicts(time: number): void {
     const all = this.filter.value === "all";
-    const until = this.model.verdicts.values.slice(0, this.model.verdicts.count(time));
-    const found = (all ? until : until.filter(decided)).slice(-MAX_VERDICTS);
-    this.announce(found.filter(decided));
-    const key = `${this.filter.value} ${found.length} ${found[0]?.time_ms} ${found.at(-1)?.time_ms}`;
+    const past = this.model.verdicts.values.slice(0, this.model.verdicts.count(time));
+    const verdicts = (all ? past : past.filter(isIntervention)).slice(-MAX_VERDICTS);
+    this.announce(verdicts.filter(isIntervention));
+    const key = `${this.filter.value} ${verdicts.length} ${verdicts[0]?.time_ms} ${verdicts.at(-1)?.time_ms}`;
     if (key === this.shown.verdicts) return;
     this.shown.verdicts = key;
-    this.verdicts.replaceChildren(...found.reverse().map((verdict) => this.verdictItem(verdict)));
-    if (found.length === 0) this.empty(this.verdicts, all ? "No call yet." : "Policies changed nothing yet.");
+    this.verdicts.replaceChildren(...verdicts.reverse().map((verdict) => this.verdictItem(verdict)));
+    if (verdicts.length === 0) this.empty(this.verdicts, all ? "No calls yet." : "No interventions by policies yet.");
   }
 
   private verdictItem(verdict: Verdict): HTMLLIElement {
     const item = element("li", `verdict ${verdict.action || verdict.kind}`);
     const at = element("button", "time", clock(verdict.time_ms));
     at.type = "button";
-    at.setAttribute("aria-label", `${clock(verdict.time_ms)}: show this moment`);
+    at.setAttribute("aria-label", `${clock(verdict.time_ms)}: show this time`);
     at.addEventListener("click", () => this.actions.seek(verdict.time_ms));
-    const asked = [verdict.component, verdict.method].filter(Boolean).join(" ");
     const head = element("p", "head");
-    head.append(at, element("span", "badge", actionOf(verdict)), element("span", "", `${verdict.drone} ${asked}`));
+    head.append(at, element("span", "badge", actionOf(verdict)), element("span", "", `${verdict.drone} ${callOf(verdict)}`));
     item.append(head);
     if (verdict.reason || verdict.code) item.append(element("p", "facts", verdict.reason || verdict.code));
     if (verdict.policies.length > 0) {
@@ -178,53 +180,54 @@ export class Lists {
     return item;
   }
 
-  /** Say what is new to who does not see it; going back in time says nothing. */
-  private announce(found: Verdict[]): void {
-    const latest = found.at(-1);
+  /** Announces new verdicts to screen readers. Going back in time announces nothing. */
+  private announce(verdicts: Verdict[]): void {
+    const latest = verdicts.at(-1);
     const before = this.announced;
     this.announced = latest?.time_ms ?? -Infinity;
     if (latest === undefined || latest.time_ms <= before) return;
-    const count = found.filter((one) => one.time_ms > before).length;
+    const count = verdicts.filter((verdict) => verdict.time_ms > before).length;
     setText(this.announcer, count === 1 ? sentence(latest) : `${count} new verdicts, the latest: ${sentence(latest)}`);
   }
 
   private showZones(time: number): void {
-    const lines = new Map<string, Feature>();
-    for (const one of this.model.features(time)) {
-      const owner = one.properties.component ? ` of ${one.properties.component}` : "";
-      const name = one.properties.name === one.properties.kind ? kindName(one) : one.properties.name;
-      lines.set(`${name}${owner}`, one);
+    const features = new Map<string, Feature>();
+    for (const feature of this.model.features(time)) {
+      const properties = feature.properties;
+      const owner = properties.component ? ` of ${properties.component}` : "";
+      const name = properties.name === properties.kind ? kindName(feature) : properties.name;
+      features.set(`${name}${owner}`, feature);
     }
-    const key = [...lines].map(([name, one]) => `${name} ${facts(one)}`).join("\n");
+    const key = [...features].map(([name, feature]) => `${name} ${facts(feature)}`).join("\n");
     if (key === this.shown.zones) return;
     this.shown.zones = key;
-    const items = [...lines].map(([name, one]) => {
+    const items = [...features].map(([name, feature]) => {
       const item = element("li");
-      const swatch = element("span", `swatch ${one.properties.kind}`);
-      item.append(swatch, element("span", "name", name), element("span", "facts", ` ${facts(one)}`));
+      const swatch = element("span", `swatch ${feature.properties.kind}`);
+      item.append(swatch, element("span", "name", name), element("span", "facts", ` ${facts(feature)}`));
       return item;
     });
     this.zones.replaceChildren(...items);
-    if (items.length === 0) this.empty(this.zones, "No zone or area is known.");
+    if (items.length === 0) this.empty(this.zones, "No zones or areas.");
   }
 
-  /** A list that is only there where something tells of such things. */
-  private showSection<T>(id: string, found: T[] | undefined, item: (one: T) => HTMLLIElement, empty: string): void {
-    const key = found === undefined ? "" : JSON.stringify(found);
-    if (key === this.shown[id] || found === undefined) return;
+  /** Shows the section of a list. The section stays hidden until the source has sent such a list. */
+  private showSection<T>(id: string, values: T[] | undefined, createItem: (value: T) => HTMLLIElement, empty: string): void {
+    const key = values === undefined ? "" : JSON.stringify(values);
+    if (key === this.shown[id] || values === undefined) return;
     this.shown[id] = key;
     byId(`${id}-section`).hidden = false;
-    if (found.length > 0) byId(id).replaceChildren(...found.map(item));
+    if (values.length > 0) byId(id).replaceChildren(...values.map(createItem));
     else this.empty(byId(id), empty);
   }
 
   private showPictures(time: number): void {
-    const found = this.model.pictures(time, MAX_PICTURES);
-    const key = found.map((picture) => picture.id).join(" ");
+    const pictures = this.model.pictures(time, MAX_PICTURES);
+    const key = pictures.map((picture) => picture.id).join(" ");
     if (key === this.shown.pictures && key) return;
     this.shown.pictures = key;
-    if (found.length === 0) return this.empty(this.pictures, "No picture was taken yet.");
-    const items = found.map((picture) => {
+    if (pictures.length === 0) return this.empty(this.pictures, "No pictures yet.");
+    const items = pictures.map((picture) => {
       const item = element("li");
       const link = element("a");
       link.href = `/pictures/${picture.id}`;
@@ -243,11 +246,11 @@ export class Lists {
 
   private showLog(time: number): void {
     if (!this.log.closest("details")?.open) return;
-    const found = this.model.notes.values.slice(0, this.model.notes.count(time)).slice(-MAX_NOTES);
-    const key = `${found.length} ${found[0]?.time_ms} ${found.at(-1)?.time_ms}`;
+    const notes = this.model.notes.values.slice(0, this.model.notes.count(time)).slice(-MAX_NOTES);
+    const key = `${notes.length} ${notes[0]?.time_ms} ${notes.at(-1)?.time_ms}`;
     if (key === this.shown.log) return;
     this.shown.log = key;
-    this.log.replaceChildren(...found.reverse().map((note: Note) => element("li", "", `${clock(note.time_ms)} ${note.drone}: ${note.text}`)));
+    this.log.replaceChildren(...notes.reverse().map((note: Note) => element("li", "", `${clock(note.time_ms)} ${note.drone}: ${note.text}`)));
   }
 
   private empty(list: HTMLElement, text: string): void {

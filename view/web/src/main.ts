@@ -1,36 +1,48 @@
-// Wires the page: events into the model, the moment into map and lists.
+// Connects the parts of the page: events update the model, and the shown time updates map and lists.
 
 import "./style.css";
 
-import type { Event, Sign } from "./events";
+import type { Event, Marker } from "./events";
 import { Lists, byId } from "./lists";
 import type { Colours, FlightMap } from "./map";
 import { Model } from "./model";
 import { Playback } from "./playback";
 import { listen } from "./stream";
-import { clock, decided, duration, moment, sentence } from "./words";
+import { clock, dateAndTime, duration, isIntervention, sentence } from "./text";
 
-const LISTS_PERIOD_MS = 250;
-/** A source that says every second that it is there, and has not for so long, is not. */
-const SILENCE_MS = 10_000;
+const LISTS_INTERVAL_MS = 250;
+/** Time without a contact event after which the state is stale. Sources of a cluster send one every second. */
+const CONTACT_TIMEOUT_MS = 10_000;
+/** Maximum delay of the map. Without it, the map would be drawn twice: without and with the areas of the first events. */
+const FIRST_EVENTS_TIMEOUT_MS = 1_000;
+const SECOND_MS = 1_000;
 
-const still = window.matchMedia("(prefers-reduced-motion: reduce)").matches;
+interface Staleness {
+  /** Unix milliseconds. */
+  since: number;
+  text: string;
+}
+
+const reducedMotion = window.matchMedia("(prefers-reduced-motion: reduce)").matches;
 let model = new Model();
 let map: FlightMap | undefined;
 const playback = new Playback();
 const actions = { select, seek };
 let lists = new Lists(model, actions);
 let selected = "";
+/** True once a live source has sent the current state. */
 let live = false;
+/** True once a recording was received completely. */
 let complete = false;
-/** Since when the server does not answer, and what is said of it. */
-let lost: { since: number; text: string } | undefined;
-let heard = performance.now();
-let empty = "";
+/** Lost connection to the server. */
+let lost: Staleness | undefined;
+/** Time of the last contact event, on the clock of `performance.now`. */
+let lastContact = performance.now();
+let emptyText = "";
 
 const play = byId<HTMLButtonElement>("play");
 const liveButton = byId<HTMLButtonElement>("live");
-const slider = byId<HTMLInputElement>("moment");
+const slider = byId<HTMLInputElement>("shown-time");
 const output = byId<HTMLOutputElement>("clock");
 const connection = byId("connection");
 const mode = byId("mode");
@@ -43,7 +55,7 @@ function colours(): Colours {
     text: colour("text"),
     flown: colour("flown"),
     link: colour("link"),
-    place: colour("quiet"),
+    edgeNode: colour("quiet"),
     zone: colour("zone"),
     operationArea: colour("operation-area"),
     corridor: colour("corridor"),
@@ -52,25 +64,23 @@ function colours(): Colours {
   };
 }
 
-/** Once the first events are here, or none come: a map that begins elsewhere would be drawn twice. */
-let tell: () => void;
-const told = new Promise<void>((resolve) => (tell = resolve));
-const FIRST_TIMEOUT_MS = 1_000;
+let resolveFirstEvents: () => void;
+const firstEvents = new Promise<void>((resolve) => (resolveFirstEvents = resolve));
 
 async function openMap(): Promise<void> {
   try {
-    const [module] = await Promise.all([import("./map"), told]);
+    const [module] = await Promise.all([import("./map"), firstEvents]);
     const time = complete ? model.begin : playback.time;
-    map = new module.FlightMap(byId("map"), model, colours(), still, select, time);
+    map = new module.FlightMap(byId("map"), model, colours(), reducedMotion, select, time);
     window.matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => map?.paint(colours()));
     if (complete) map?.showWhole();
   } catch (error) {
     byId("map").hidden = true;
     byId("legend").hidden = true;
-    const sentence = byId("no-map");
-    sentence.textContent = "This browser has no WebGL, which the map needs: the lists say what happens.";
-    sentence.hidden = false;
-    console.info("the map cannot be shown:", error);
+    const notice = byId("no-map");
+    notice.textContent = "This browser has no WebGL, which the map requires. The lists show the same data.";
+    notice.hidden = false;
+    console.info("cannot show the map:", error);
   }
 }
 
@@ -85,9 +95,9 @@ function seek(time: number): void {
   show();
 }
 
-function take(all: (Event | Sign)[]): void {
-  for (const one of all) {
-    switch (one.type) {
+function handle(batch: (Event | Marker)[]): void {
+  for (const event of batch) {
+    switch (event.type) {
       case "reset":
         restart();
         break;
@@ -99,34 +109,40 @@ function take(all: (Event | Sign)[]): void {
         finish();
         break;
       default:
-        if (one.type === "contact") heard = performance.now();
-        model.take(one);
+        if (event.type === "contact") lastContact = performance.now();
+        model.add(event);
     }
   }
 }
 
-/** Since when what is shown may not be so any more, and why; undefined: it is so. */
-function stale(): { since: number; text: string } | undefined {
+/** Returns since when and why the shown state is stale, or undefined if it is current. */
+function staleness(): Staleness | undefined {
   if (complete) return undefined;
   if (lost !== undefined) return lost;
   const contact = model.contact;
   if (contact === undefined) return undefined;
   if (contact.stale_since_ms !== null) return { since: contact.stale_since_ms, text: contact.text };
-  const silence = performance.now() - heard;
-  return silence > SILENCE_MS ? { since: Date.now() - silence, text: "The server says nothing." } : undefined;
+  const silenceMs = performance.now() - lastContact;
+  if (silenceMs <= CONTACT_TIMEOUT_MS) return undefined;
+  return { since: Date.now() - silenceMs, text: "the server sends no events" };
 }
 
-/** What the user should know of what they see. */
 function showConnection(): void {
-  const found = stale();
-  const text = found ? `Stale since ${clock(found.since)} UTC: ${found.text}` : (model.problems.at(-1)?.text ?? empty);
+  const stale = staleness();
+  const text = stale ? `Stale since ${clock(stale.since)} UTC: ${stale.text}` : (model.problems.at(-1)?.text ?? emptyText);
   if (connection.textContent !== text) connection.textContent = text;
-  document.body.classList.toggle("stale", found !== undefined);
-  const now = playback.following ? "live" : "paused";
-  mode.textContent = complete ? "replay" : found ? "stale" : live ? now : "connecting";
+  document.body.classList.toggle("stale", stale !== undefined);
+  mode.textContent = modeText(stale !== undefined);
 }
 
-/** Everything is told again: the moment that is shown stays. */
+function modeText(isStale: boolean): string {
+  if (complete) return "replay";
+  if (isStale) return "stale";
+  if (!live) return "connecting";
+  return playback.following ? "live" : "paused";
+}
+
+/** Starts with an empty model, because the server sends the complete state again. The shown time stays. */
 function restart(): void {
   model = new Model();
   lists.clear();
@@ -134,24 +150,24 @@ function restart(): void {
   map?.follow(model);
 }
 
-/** A recording is all there. */
+/** Starts the replay of a recording that was received completely. */
 function finish(): void {
   complete = true;
   if (!Number.isFinite(model.begin)) {
-    empty = "The recording is empty.";
+    emptyText = "The recording is empty.";
     return;
   }
   playback.seek(model.begin);
-  playback.playing = !still;
+  playback.playing = !reducedMotion;
   map?.showWhole();
   map?.fit(model.begin);
   showTicks();
 }
 
-/** Where on the timeline policies decided something. */
+/** Marks interventions of policies on the timeline. */
 function showTicks(): void {
   const span = Math.max(model.end - model.begin, 1);
-  const marks = model.verdicts.values.filter(decided).map((verdict) => {
+  const marks = model.verdicts.values.filter(isIntervention).map((verdict) => {
     const mark = document.createElement("span");
     mark.style.left = `${((verdict.time_ms - model.begin) / span) * 100}%`;
     mark.title = sentence(verdict);
@@ -170,9 +186,9 @@ function show(): void {
   slider.min = String(model.begin);
   slider.max = String(model.end);
   slider.value = String(playback.time);
-  const passed = `${duration(playback.time - model.begin)} of ${duration(model.end - model.begin)}`;
-  slider.setAttribute("aria-valuetext", `${moment(playback.time)}, ${passed}`);
-  output.textContent = `${clock(playback.time)} UTC · ${passed}`;
+  const progress = `${duration(playback.time - model.begin)} of ${duration(model.end - model.begin)}`;
+  slider.setAttribute("aria-valuetext", `${dateAndTime(playback.time)}, ${progress}`);
+  output.textContent = `${clock(playback.time)} UTC · ${progress}`;
 }
 
 play.addEventListener("click", () => {
@@ -190,43 +206,43 @@ byId<HTMLSelectElement>("speed").addEventListener("change", (event) => {
 byId("verdict-filter").addEventListener("change", show);
 slider.addEventListener("input", () => seek(Number(slider.value)));
 slider.addEventListener("keydown", (event) => {
-  // The browser's own steps would be a tenth of a second.
+  // Steps in seconds. The default steps of the browser are a tenth of a second.
   const steps: Record<string, number> = { ArrowLeft: -1, ArrowDown: -1, ArrowRight: 1, ArrowUp: 1, PageDown: -10, PageUp: 10 };
   const step = steps[event.key];
   if (step === undefined) return;
   event.preventDefault();
-  seek(Math.min(Math.max(playback.time + step * 1000, model.begin), model.end));
+  seek(Math.min(Math.max(playback.time + step * SECOND_MS, model.begin), model.end));
 });
 
-let before = performance.now();
-let listed = 0;
+let lastFrame = performance.now();
+let lastLists = 0;
 
 function frame(now: number): void {
-  playback.tick(now - before, model.begin, model.end);
-  before = now;
+  playback.tick(now - lastFrame, model.begin, model.end);
+  lastFrame = now;
   map?.draw(playback.time, selected, now);
-  if (now - listed > LISTS_PERIOD_MS) {
-    listed = now;
+  if (now - lastLists > LISTS_INTERVAL_MS) {
+    lastLists = now;
     show();
   }
   requestAnimationFrame(frame);
 }
 
 void openMap();
-setTimeout(() => tell(), FIRST_TIMEOUT_MS);
+setTimeout(() => resolveFirstEvents(), FIRST_EVENTS_TIMEOUT_MS);
 listen({
-  events: (all) => {
-    take(all);
-    if (live || complete) tell();
+  events: (batch) => {
+    handle(batch);
+    if (live || complete) resolveFirstEvents();
   },
   connected: () => {
     lost = undefined;
-    heard = performance.now();
+    lastContact = performance.now();
   },
-  lost: (forGood) => {
-    const text = forGood
-      ? "the server refused the page: open the address that `fractus view` printed again."
-      : "the server does not answer; trying again.";
+  lost: (refused) => {
+    const text = refused
+      ? "the server refused the connection; open the address that `fractus view` printed"
+      : "the server does not respond, reconnecting";
     lost = { since: lost?.since ?? Date.now(), text };
   },
 });

@@ -1,26 +1,32 @@
-// The map: areas and paths by MapLibre on a plain background, drones on a canvas of their own above it.
+// Map of a flight. MapLibre draws areas and flown paths on a plain background. Drones, links and labels are drawn on a canvas above
+// it, because they move in every frame, and MapLibre would render the whole map again for each of them.
 
 import { type GeoJSONSource, LngLatBounds, Map as MapLibre, NavigationControl, Popup, ScaleControl, type StyleSpecification, prewarm, setWorkerUrl } from "maplibre-gl";
 import "maplibre-gl/dist/maplibre-gl.css";
 import workerUrl from "maplibre-gl/dist/maplibre-gl-worker.mjs?url";
 
 import type { Feature, Link } from "./events";
-import { GAP_MS, type Drone, type Model } from "./model";
-import { band, facts } from "./words";
+import { type Drone, MAX_GAP_MS, type Model } from "./model";
+import { altitudeLimits, facts } from "./text";
 
 setWorkerUrl(new URL(workerUrl, window.location.href).href);
-// It takes as long to start as the first events take to come.
+// Start the workers while the first events are being received.
 prewarm();
 
-const PERIOD_MS = 400;
-/** MapLibre cuts paths into tiles and draws the whole map again: what was flown since is drawn above it. */
-const PATH_PERIOD_MS = 5_000;
+const AREAS_INTERVAL_MS = 400;
+/** Interval of updates of flown paths in MapLibre, which are expensive. The latest part of each path is drawn on the canvas. */
+const PATHS_INTERVAL_MS = 5_000;
+/** If the shown time is further ahead of MapLibre's paths, the user has moved it, and the paths are updated sooner. */
 const MAX_TAIL_MS = 60_000;
-const REACH_PX = 18;
-const PATH_PX = 3;
+/** Maximum distance between a click and the drone that it selects. */
+const CLICK_RADIUS_PX = 18;
+const OFFSCREEN_MARGIN_PX = 50;
+const PATH_WIDTH_PX = 3;
 const FIT = { padding: 40, maxZoom: 18 };
-/** A zone that is drawn smaller has its name in the list alone. */
-const MIN_NAMED_PX = 40;
+/** Minimum width and height of a zone that is labelled. Smaller zones are named only in the list. */
+const MIN_LABELLED_PX = 40;
+const STALE_OPACITY = 0.45;
+const NOT_READY_OPACITY = 0.55;
 
 const KINDS = ["operationArea", "corridor", "depot", "zone"] as const;
 
@@ -34,48 +40,49 @@ export interface Colours {
   path: string;
   depot: string;
   link: string;
-  place: string;
+  edgeNode: string;
 }
-
-type Lines = GeoJSON.Feature<GeoJSON.MultiLineString>[];
 
 export class FlightMap {
   private readonly map: MapLibre;
   private readonly overlay: HTMLCanvasElement;
   private readonly popup = new Popup({ closeButton: false, maxWidth: "320px" });
-  private lookedAt = -Infinity;
-  private pathsAt = -Infinity;
-  /** Up to which moment MapLibre draws what was flown. */
-  private drawn = -Infinity;
+  /** Time of the latest update of the areas and paths, on the clock of animation frames. */
+  private areasUpdated = -Infinity;
+  private pathsUpdated = -Infinity;
+  /** Time up to which MapLibre draws flown paths. The canvas draws the tail of each path after this time. */
+  private pathsEnd = -Infinity;
   private features: Feature[];
   private ready = false;
-  private whole = false;
+  /** True to draw the complete paths of a recording. */
+  private showsWhole = false;
+  /** True if the user has moved the map. */
   private moved = false;
-  private shown: { x: number; y: number; name: string }[] = [];
+  private drawnDrones: { x: number; y: number; name: string }[] = [];
 
   constructor(
     private readonly element: HTMLElement,
     private model: Model,
     private colours: Colours,
-    private readonly still: boolean,
-    private readonly pick: (drone: string) => void,
+    private readonly reducedMotion: boolean,
+    private readonly select: (drone: string) => void,
     time: number,
   ) {
     this.features = model.features(time);
     const bounds = this.bounds(time);
-    const place = bounds.isEmpty() ? { center: [0, 20] as [number, number], zoom: 1 } : { bounds, fitBoundsOptions: FIT };
+    const world = { center: [0, 20] as [number, number], zoom: 1 };
     this.map = new MapLibre({
       container: element,
       style: this.style(),
       validateStyle: false,
-      ...place,
+      ...(bounds.isEmpty() ? world : { bounds, fitBoundsOptions: FIT }),
       attributionControl: false,
       fadeDuration: 0,
       maxPitch: 0,
       dragRotate: false,
-      locale: { "Map.Title": "Map of zones, areas and drones; the lists say the same" },
+      locale: { "Map.Title": "Map of zones, areas and drones. The lists contain the same data" },
     });
-    // Where there is no graphics processor, each frame that is seen is copied: none is before there is something to see.
+    // Hide the map until it has content. Without a GPU, every visible frame is copied, which is slow.
     this.map.getCanvasContainer().style.visibility = "hidden";
     this.map.addControl(new NavigationControl({ showCompass: false }), "top-right");
     this.map.addControl(new ScaleControl({}), "bottom-left");
@@ -86,12 +93,12 @@ export class FlightMap {
     this.map.touchZoomRotate.disableRotation();
     this.map.keyboard.disableRotation();
     this.map.on("style.load", () => this.map.on("render", this.rendered));
-    for (const what of ["dragstart", "wheel", "dblclick"] as const) this.map.on(what, () => (this.moved = true));
+    for (const gesture of ["dragstart", "wheel", "dblclick"] as const) this.map.on(gesture, () => (this.moved = true));
     element.addEventListener("keydown", () => (this.moved = true));
     this.map.on("click", (event) => this.clicked(event.point, event.lngLat));
   }
 
-  /** Sources with what is known by now, so that the first thing drawn is the map. */
+  /** Returns a style that already contains the known areas, so that the first frame shows them. */
   private style(): StyleSpecification {
     const source = (features: GeoJSON.Feature[]) =>
       ({ type: "geojson", data: { type: "FeatureCollection", features }, buffer: 32, tolerance: 0.2 }) as const;
@@ -99,7 +106,7 @@ export class FlightMap {
     const colours = this.colours;
     const layers: StyleSpecification["layers"] = [{ id: "background", type: "background", paint: { "background-color": colours.background } }];
     for (const kind of KINDS) {
-      // Each has a line of its own around it.
+      // Line layers draw the outlines.
       const paint = { "fill-antialias": false, "fill-color": colours[kind], "fill-opacity": kind === "zone" ? 0.22 : 0.06 };
       layers.push({ id: `${kind}-fill`, type: "fill", source: "areas", filter: filter(kind), paint });
     }
@@ -107,20 +114,20 @@ export class FlightMap {
       const paint = { "line-color": colours[kind], "line-width": 2, ...(kind === "zone" ? {} : { "line-dasharray": [3, 2] }) };
       layers.push({ id: `${kind}-line`, type: "line", source: "areas", filter: filter(kind), paint });
     }
-    for (const [id, width, opacity] of [["whole", 2, 0.3], ["flown", PATH_PX, 1]] as const) {
+    for (const [id, width, opacity] of [["whole", 2, 0.3], ["flown", PATH_WIDTH_PX, 1]] as const) {
       const paint = { "line-color": colours.flown, "line-width": width, "line-opacity": opacity };
       layers.push({ id: `${id}-line`, type: "line", source: id, layout: { "line-join": "round", "line-cap": "round" }, paint });
     }
     return { version: 8, sources: { areas: source(this.shapes()), whole: source([]), flown: source([]) }, layers };
   }
 
-  /** The first picture that is seen has all areas in it. */
+  /** Makes the map visible after the first frame that contains all areas. */
   private readonly rendered = (): void => {
     if (!this.map.isSourceLoaded("areas")) return;
     if (!this.ready) {
       this.ready = true;
       this.map.getCanvasContainer().style.visibility = "";
-      if (this.whole) this.showWhole();
+      if (this.showsWhole) this.showWhole();
     }
     if (this.features.length === 0) return;
     this.map.off("render", this.rendered);
@@ -128,13 +135,14 @@ export class FlightMap {
     performance.mark("map shown");
   };
 
-  /** Show what another model knows. */
+  /** Shows another model. */
   follow(model: Model): void {
     this.model = model;
-    this.lookedAt = this.pathsAt = this.drawn = -Infinity;
+    this.areasUpdated = -Infinity;
+    this.pathsUpdated = -Infinity;
+    this.pathsEnd = -Infinity;
   }
 
-  /** Take other colours. */
   paint(colours: Colours): void {
     this.colours = colours;
     this.map.setPaintProperty("background", "background-color", colours.background);
@@ -144,29 +152,30 @@ export class FlightMap {
     for (const id of ["whole", "flown"]) this.map.setPaintProperty(`${id}-line`, "line-color", colours.flown);
   }
 
-  /** Show a moment. */
+  /** Draws the state at a time. `now` is the time of the animation frame. */
   draw(time: number, selected: string, now: number): void {
     if (!this.ready || !Number.isFinite(this.model.begin)) return;
-    if (now - this.lookedAt > PERIOD_MS) {
-      this.lookedAt = now;
+    if (now - this.areasUpdated > AREAS_INTERVAL_MS) {
+      this.areasUpdated = now;
       this.showAreas(time);
     }
-    const jumped = time < this.drawn || time - this.drawn > MAX_TAIL_MS;
-    if (time !== this.drawn && now - this.pathsAt > (jumped ? PERIOD_MS : PATH_PERIOD_MS)) {
-      this.pathsAt = now;
-      this.drawn = time;
-      this.setLines("flown", [...this.model.drones.values()].map((drone) => line(drone, time)));
+    const jumped = time < this.pathsEnd || time - this.pathsEnd > MAX_TAIL_MS;
+    const interval = jumped ? AREAS_INTERVAL_MS : PATHS_INTERVAL_MS;
+    if (time !== this.pathsEnd && now - this.pathsUpdated > interval) {
+      this.pathsUpdated = now;
+      this.pathsEnd = time;
+      this.setPaths("flown", time);
     }
-    this.drawAbove(time, selected);
+    this.drawOverlay(time, selected);
   }
 
-  /** Draw the whole of a recording's paths. */
+  /** Draws the complete paths of a recording. */
   showWhole(): void {
-    this.whole = true;
-    if (this.ready) this.setLines("whole", [...this.model.drones.values()].map((drone) => line(drone, Infinity)));
+    this.showsWhole = true;
+    if (this.ready) this.setPaths("whole", Infinity);
   }
 
-  /** Let all that is known be seen, unless the user chose what to look at. */
+  /** Fits the map to all areas and drones, unless the user has moved it. */
   fit(time: number): void {
     if (!this.ready || this.moved) return;
     const bounds = this.bounds(time);
@@ -180,26 +189,26 @@ export class FlightMap {
     return bounds;
   }
 
-  /** Bring a drone to the middle. */
+  /** Centres the map on a drone. */
   centre(name: string, time: number): void {
     const position = this.model.drones.get(name)?.position(time);
     if (position === undefined) return;
     this.moved = true;
     const center: [number, number] = [position.lon, position.lat];
-    if (this.still) this.map.jumpTo({ center });
+    if (this.reducedMotion) this.map.jumpTo({ center });
     else this.map.easeTo({ center, duration: 400 });
   }
 
   private showAreas(time: number): void {
     const features = this.model.features(time);
-    if (features.length === this.features.length && features.every((one, index) => one === this.features[index])) return;
+    if (features.length === this.features.length && features.every((feature, index) => feature === this.features[index])) return;
     const first = this.features.length === 0;
     this.features = features;
     this.source("areas").setData({ type: "FeatureCollection", features: this.shapes() });
     if (first) this.fit(time);
   }
 
-  /** Components share areas: what lies on itself would be drawn darker. */
+  /** Features without duplicates. Components share areas, and an area drawn twice would be darker. */
   private shapes(): GeoJSON.Feature[] {
     const drawn = new Set<string>();
     return this.features
@@ -207,18 +216,21 @@ export class FlightMap {
       .filter(({ geometry }) => drawn.size < drawn.add(JSON.stringify(geometry)).size);
   }
 
-  private setLines(name: string, lines: Lines[]): void {
-    this.source(name).setData({ type: "FeatureCollection", features: lines.flat() });
+  /** Sets the data of a source to the paths of all drones up to a time. */
+  private setPaths(source: string, time: number): void {
+    const features = [...this.model.drones.values()].flatMap((drone) => flownPath(drone, time));
+    this.source(source).setData({ type: "FeatureCollection", features });
   }
 
   private source(name: string): GeoJSONSource {
     return this.map.getSource(name) as GeoJSONSource;
   }
 
-  private drawAbove(time: number, selected: string): void {
+  private drawOverlay(time: number, selected: string): void {
     const canvas = this.map.getCanvas();
     const ratio = window.devicePixelRatio;
-    const [width, height] = [canvas.clientWidth, canvas.clientHeight];
+    const width = canvas.clientWidth;
+    const height = canvas.clientHeight;
     if (this.overlay.width !== Math.round(width * ratio) || this.overlay.height !== Math.round(height * ratio)) {
       this.overlay.width = Math.round(width * ratio);
       this.overlay.height = Math.round(height * ratio);
@@ -229,49 +241,51 @@ export class FlightMap {
     context.font = "600 12px system-ui, sans-serif";
     context.lineJoin = "round";
     for (const feature of this.features) {
-      if (feature.properties.kind === "zone") this.name(context, feature);
-      else if (feature.geometry.type === "Point") this.place(context, feature);
+      if (feature.properties.kind === "zone") this.drawZoneLabel(context, feature);
+      else if (feature.geometry.type === "Point") this.drawEdgeNode(context, feature);
     }
-    for (const link of this.model.linksAt(time)) this.link(context, link, time);
-    this.shown = [];
-    for (const drone of this.model.drones.values()) this.tail(context, drone, time);
+    for (const link of this.model.linksAt(time)) this.drawLink(context, link, time);
+    this.drawnDrones = [];
+    for (const drone of this.model.drones.values()) this.drawTail(context, drone, time);
     for (const drone of this.model.drones.values()) {
       const position = drone.position(time);
       if (position === undefined) continue;
       const { x, y } = this.map.project([position.lon, position.lat]);
-      if (x < -50 || y < -50 || x > width + 50 || y > height + 50) continue;
-      this.shown.push({ x, y, name: drone.name });
-      context.globalAlpha = drone.stale(time) ? 0.45 : 1;
-      this.marker(context, x, y, position.heading, drone.name === selected);
-      this.label(context, x, y, drone.name);
+      const margin = OFFSCREEN_MARGIN_PX;
+      if (x < -margin || y < -margin || x > width + margin || y > height + margin) continue;
+      this.drawnDrones.push({ x, y, name: drone.name });
+      context.globalAlpha = drone.isStale(time) ? STALE_OPACITY : 1;
+      this.drawDrone(context, x, y, position.heading, drone.name === selected);
+      this.drawText(context, x + 14, y + 4, drone.name, "left");
     }
     context.globalAlpha = 1;
   }
 
-  /** What a drone flew since MapLibre was told. */
-  private tail(context: CanvasRenderingContext2D, drone: Drone, time: number): void {
-    const fixes = drone.fixes.values.slice(drone.fixes.count(this.drawn), drone.fixes.count(time));
-    // It may have been seen first after MapLibre was told.
-    const before = drone.position(this.drawn);
-    const begin = before === undefined ? fixes[0] : { ...before, time_ms: before.seen };
+  /** Draws the path of a drone after `pathsEnd`. */
+  private drawTail(context: CanvasRenderingContext2D, drone: Drone, time: number): void {
+    const fixes = drone.fixes.values.slice(drone.fixes.count(this.pathsEnd), drone.fixes.count(time));
+    // A drone that appeared after `pathsEnd` has no position at that time.
+    const before = drone.position(this.pathsEnd);
+    const begin = before === undefined ? fixes[0] : { ...before, time_ms: before.reported };
     const end = drone.position(time);
-    if (begin === undefined || end === undefined || time <= this.drawn || time - end.seen > GAP_MS) return;
+    if (begin === undefined || end === undefined || time <= this.pathsEnd || time - end.reported > MAX_GAP_MS) return;
     let last = begin.time_ms;
     context.beginPath();
     let { x, y } = this.map.project([begin.lon, begin.lat]);
     context.moveTo(x, y);
     for (const fix of [...fixes, { ...end, time_ms: time }]) {
       ({ x, y } = this.map.project([fix.lon, fix.lat]));
-      if (fix.time_ms - last > GAP_MS) context.moveTo(x, y);
+      if (fix.time_ms - last > MAX_GAP_MS) context.moveTo(x, y);
       else context.lineTo(x, y);
       last = fix.time_ms;
     }
     context.strokeStyle = this.colours.flown;
-    context.lineWidth = PATH_PX;
+    context.lineWidth = PATH_WIDTH_PX;
     context.stroke();
   }
 
-  private marker(context: CanvasRenderingContext2D, x: number, y: number, heading: number | null, selected: boolean): void {
+  /** Draws an arrow in the direction of the heading, or a dot if the heading is unknown. */
+  private drawDrone(context: CanvasRenderingContext2D, x: number, y: number, heading: number | null, selected: boolean): void {
     context.save();
     context.translate(x, y);
     context.beginPath();
@@ -292,23 +306,22 @@ export class FlightMap {
     context.restore();
   }
 
-  /** An edge node: a square. */
-  private place(context: CanvasRenderingContext2D, feature: Feature): void {
+  private drawEdgeNode(context: CanvasRenderingContext2D, feature: Feature): void {
     const [lon, lat] = (feature.geometry as GeoJSON.Point).coordinates as [number, number];
     const { x, y } = this.map.project([lon, lat]);
-    context.globalAlpha = feature.properties.state === "ready" ? 1 : 0.55;
-    context.fillStyle = this.colours.place;
+    context.globalAlpha = feature.properties.state === "ready" ? 1 : NOT_READY_OPACITY;
+    context.fillStyle = this.colours.edgeNode;
     context.fillRect(x - 5, y - 5, 10, 10);
-    context.textAlign = "left";
-    this.write(context, x + 9, y + 4, feature.properties.name);
+    this.drawText(context, x + 9, y + 4, feature.properties.name, "left");
     context.globalAlpha = 1;
   }
 
-  /** A direct link from drone to node: dashed until it is up, thick while traffic takes it. */
-  private link(context: CanvasRenderingContext2D, link: Link, time: number): void {
+  /** Draws a direct link: dashed unless it is up, thick if it carries traffic. */
+  private drawLink(context: CanvasRenderingContext2D, link: Link, time: number): void {
     const drone = this.model.drones.get(link.drone)?.position(time);
     if (drone === undefined || link.phase === "Idle") return;
-    const [from, to] = [this.map.project([drone.lon, drone.lat]), this.map.project([link.lon, link.lat])];
+    const from = this.map.project([drone.lon, drone.lat]);
+    const to = this.map.project([link.lon, link.lat]);
     context.save();
     context.beginPath();
     context.moveTo(from.x, from.y);
@@ -320,24 +333,21 @@ export class FlightMap {
     context.restore();
   }
 
-  private label(context: CanvasRenderingContext2D, x: number, y: number, name: string): void {
-    context.textAlign = "left";
-    this.write(context, x + 14, y + 4, name);
-  }
-
-  /** A zone's name and heights, in the middle of it, where there is room. */
-  private name(context: CanvasRenderingContext2D, feature: Feature): void {
+  /** Draws the name and altitude limits of a zone at its centre, if the zone is large enough on the screen. */
+  private drawZoneLabel(context: CanvasRenderingContext2D, feature: Feature): void {
     const bounds = new LngLatBounds();
     extend(bounds, feature.geometry.coordinates);
-    const [west, east] = [this.map.project(bounds.getSouthWest()), this.map.project(bounds.getNorthEast())];
-    const [x, y] = [(west.x + east.x) / 2, (west.y + east.y) / 2];
-    if (east.x - west.x < MIN_NAMED_PX || west.y - east.y < MIN_NAMED_PX) return;
-    context.textAlign = "center";
-    this.write(context, x, y - 4, feature.properties.name);
-    if (feature.properties.altitude !== undefined) this.write(context, x, y + 12, band(feature));
+    const southWest = this.map.project(bounds.getSouthWest());
+    const northEast = this.map.project(bounds.getNorthEast());
+    if (northEast.x - southWest.x < MIN_LABELLED_PX || southWest.y - northEast.y < MIN_LABELLED_PX) return;
+    const x = (southWest.x + northEast.x) / 2;
+    const y = (southWest.y + northEast.y) / 2;
+    this.drawText(context, x, y - 4, feature.properties.name, "center");
+    if (feature.properties.altitude !== undefined) this.drawText(context, x, y + 12, altitudeLimits(feature), "center");
   }
 
-  private write(context: CanvasRenderingContext2D, x: number, y: number, text: string): void {
+  private drawText(context: CanvasRenderingContext2D, x: number, y: number, text: string, align: CanvasTextAlign): void {
+    context.textAlign = align;
     context.strokeStyle = this.colours.background;
     context.lineWidth = 3;
     context.strokeText(text, x, y);
@@ -345,34 +355,37 @@ export class FlightMap {
     context.fillText(text, x, y);
   }
 
-  private clicked(point: { x: number; y: number }, place: { lng: number; lat: number }): void {
-    const near = this.shown.find((one) => Math.hypot(one.x - point.x, one.y - point.y) < REACH_PX);
-    if (near !== undefined) return this.pick(near.name);
+  /** Selects the drone at a clicked point, or shows the areas there. */
+  private clicked(point: { x: number; y: number }, position: { lng: number; lat: number }): void {
+    const clickedDrone = this.drawnDrones.find((drone) => Math.hypot(drone.x - point.x, drone.y - point.y) < CLICK_RADIUS_PX);
+    if (clickedDrone !== undefined) return this.select(clickedDrone.name);
     const layers = KINDS.map((kind) => `${kind}-fill`);
-    const found = this.map.queryRenderedFeatures([point.x, point.y], { layers }).map((one) => this.features[Number(one.id)]);
-    const lines = new Set(found.filter((one) => one !== undefined).map((one) => `${one.properties.name}: ${facts(one)}`));
+    const rendered = this.map.queryRenderedFeatures([point.x, point.y], { layers });
+    const areas = rendered.map((shape) => this.features[Number(shape.id)]).filter((area) => area !== undefined);
+    const lines = new Set(areas.map((area) => `${area.properties.name}: ${facts(area)}`));
     if (lines.size === 0) return void this.popup.remove();
-    this.popup.setLngLat(place).setText([...lines].join("\n")).addTo(this.map);
+    this.popup.setLngLat(position).setText([...lines].join("\n")).addTo(this.map);
   }
 }
 
-/** Where a drone flew up to a moment; broken where it was not seen. */
-function line(drone: Drone, time: number): Lines {
+/** Returns the path of a drone up to a time. It is interrupted if the drone has reported no position for `MAX_GAP_MS`. */
+function flownPath(drone: Drone, time: number): GeoJSON.Feature<GeoJSON.MultiLineString>[] {
   const parts: [number, number][][] = [];
   let last = -Infinity;
   const count = Number.isFinite(time) ? drone.fixes.count(time) : drone.fixes.values.length;
   for (const fix of drone.fixes.values.slice(0, count)) {
-    if (fix.time_ms - last > GAP_MS) parts.push([]);
+    if (fix.time_ms - last > MAX_GAP_MS) parts.push([]);
     parts.at(-1)!.push([fix.lon, fix.lat]);
     last = fix.time_ms;
   }
   const position = drone.position(time);
-  if (position !== undefined && time - position.seen < GAP_MS) parts.at(-1)?.push([position.lon, position.lat]);
+  if (position !== undefined && time - position.reported < MAX_GAP_MS) parts.at(-1)?.push([position.lon, position.lat]);
   const coordinates = parts.filter((part) => part.length > 1);
   if (coordinates.length === 0) return [];
   return [{ type: "Feature", properties: { drone: drone.name }, geometry: { type: "MultiLineString", coordinates } }];
 }
 
+/** Extends bounds by nested GeoJSON coordinates. */
 function extend(bounds: LngLatBounds, coordinates: unknown): void {
   if (!Array.isArray(coordinates)) return;
   if (typeof coordinates[0] === "number") bounds.extend([coordinates[0], coordinates[1] as number]);

@@ -1,31 +1,34 @@
-// All that was told, in the order of time, so that any moment of it can be shown.
+// Stores all received events in order of time, so that the page can show any past time.
 
 import type { Applications, Areas, Contact, Event, Feature, Fix, Link, Links, Note, Picture, Policies, Problem, State, Verdict } from "./events";
 
 const MAX_FIXES = 20_000;
-const MAX_OTHERS = 5_000;
-/** Between two positions further apart in time the drone was not seen: no line is drawn. */
-export const GAP_MS = 10_000;
-/** A drone that was not heard of for so long is drawn pale: on the ground it may report every 30 s. */
-const STALE_MS = 45_000;
+const MAX_EVENTS = 5_000;
+const MAX_PICTURES = 200;
+const MAX_LISTS = 1_000;
+const MAX_VERSIONS = 100;
+/** Maximum time between two positions that a line connects. */
+export const MAX_GAP_MS = 10_000;
+/** Time without a report after which a drone is drawn pale. On the ground, a drone may report only every 30 s. */
+const STALE_AFTER_MS = 45_000;
 
-/** Values in the order of their times; when there are too many, the oldest go, or every second one of the older half. */
+/** Values in order of time. A full series drops every second value of its older half (`thin`), or its older half. */
 export class Series<T extends { time_ms: number }> {
   readonly values: T[] = [];
 
   constructor(
-    private readonly bound: number,
+    private readonly capacity: number,
     private readonly thin = false,
   ) {}
 
   add(value: T): void {
-    let place = this.values.length;
-    while (place > 0 && this.values[place - 1]!.time_ms > value.time_ms) place--;
-    this.values.splice(place, 0, value);
-    if (this.values.length > this.bound) this.shrink();
+    let index = this.values.length;
+    while (index > 0 && this.values[index - 1]!.time_ms > value.time_ms) index--;
+    this.values.splice(index, 0, value);
+    if (this.values.length > this.capacity) this.shrink();
   }
 
-  /** How many are no later than a moment. */
+  /** Number of values up to a time. */
   count(time: number): number {
     let low = 0;
     let high = this.values.length;
@@ -37,7 +40,7 @@ export class Series<T extends { time_ms: number }> {
     return low;
   }
 
-  /** The last one that is no later than a moment. */
+  /** Latest value up to a time. */
   at(time: number): T | undefined {
     return this.values[this.count(time) - 1];
   }
@@ -49,59 +52,64 @@ export class Series<T extends { time_ms: number }> {
   }
 }
 
-/** One drone. */
+export interface DronePosition {
+  lat: number;
+  lon: number;
+  heading: number | null;
+  /** Time of the latest reported position. */
+  reported: number;
+}
+
 export class Drone {
   readonly fixes = new Series<Fix>(MAX_FIXES, true);
-  readonly states = new Series<State>(MAX_OTHERS, true);
-  readonly pictures = new Series<Picture>(200);
+  readonly states = new Series<State>(MAX_EVENTS, true);
+  readonly pictures = new Series<Picture>(MAX_PICTURES);
 
   constructor(readonly name: string) {}
 
-  /** Whether nothing was heard of it for long. */
-  stale(time: number): boolean {
+  /** Returns true if the drone had not reported for `STALE_AFTER_MS` at a time. */
+  isStale(time: number): boolean {
     const state = this.states.at(time);
-    const heard = Math.max(state?.seen_ms ?? state?.time_ms ?? -Infinity, this.fixes.at(time)?.time_ms ?? -Infinity);
-    return time - (state?.seen_ms ?? heard) > STALE_MS;
+    if (state?.seen_ms != null) return time - state.seen_ms > STALE_AFTER_MS;
+    const reported = Math.max(state?.time_ms ?? -Infinity, this.fixes.at(time)?.time_ms ?? -Infinity);
+    return time - reported > STALE_AFTER_MS;
   }
 
-  /** Where it was at a moment, between the two positions around it. */
-  position(time: number): { lat: number; lon: number; heading: number | null; seen: number } | undefined {
+  /** Position at a time, interpolated between the positions before and after it. */
+  position(time: number): DronePosition | undefined {
     const count = this.fixes.count(time);
     const before = this.fixes.values[count - 1];
     if (before === undefined) return undefined;
     const after = this.fixes.values[count];
-    const found = { lat: before.lat, lon: before.lon, heading: before.heading_deg, seen: before.time_ms };
-    if (after !== undefined && after.time_ms - before.time_ms < GAP_MS && after.time_ms > before.time_ms) {
+    const position = { lat: before.lat, lon: before.lon, heading: before.heading_deg, reported: before.time_ms };
+    if (after !== undefined && after.time_ms - before.time_ms < MAX_GAP_MS && after.time_ms > before.time_ms) {
       const share = (time - before.time_ms) / (after.time_ms - before.time_ms);
-      found.lat += (after.lat - before.lat) * share;
-      found.lon += (after.lon - before.lon) * share;
+      position.lat += (after.lat - before.lat) * share;
+      position.lon += (after.lon - before.lon) * share;
       if (before.heading_deg !== null && after.heading_deg !== null) {
         const turn = ((after.heading_deg - before.heading_deg + 540) % 360) - 180;
-        found.heading = before.heading_deg + turn * share;
+        position.heading = before.heading_deg + turn * share;
       }
     }
-    return found;
+    return position;
   }
 }
 
-/** Everything that was told. */
 export class Model {
   readonly drones = new Map<string, Drone>();
-  readonly verdicts = new Series<Verdict>(MAX_OTHERS);
-  readonly notes = new Series<Note>(MAX_OTHERS);
+  readonly verdicts = new Series<Verdict>(MAX_EVENTS);
+  readonly notes = new Series<Note>(MAX_EVENTS);
   readonly problems: Problem[] = [];
-  readonly applications = new Series<Applications>(1_000);
-  readonly policies = new Series<Policies>(100);
-  private readonly links = new Series<Links>(1_000);
+  readonly applications = new Series<Applications>(MAX_LISTS);
+  readonly policies = new Series<Policies>(MAX_VERSIONS);
+  private readonly links = new Series<Links>(MAX_LISTS);
   contact: Contact | undefined;
   private readonly areas = new Map<string, Series<Areas>>();
+  /** Time of the first and of the last event. */
   begin = Infinity;
   end = -Infinity;
-  /** Changes with everything that is told. */
-  version = 0;
 
-  take(event: Event): void {
-    this.version++;
+  add(event: Event): void {
     if (event.time_ms > 0) {
       this.begin = Math.min(this.begin, event.time_ms);
       this.end = Math.max(this.end, event.time_ms);
@@ -129,28 +137,28 @@ export class Model {
       case "note":
         return this.notes.add(event);
       case "areas": {
-        const known = this.areas.get(event.origin) ?? new Series<Areas>(100);
-        this.areas.set(event.origin, known);
-        return known.add(event);
+        const versions = this.areas.get(event.origin) ?? new Series<Areas>(MAX_VERSIONS);
+        this.areas.set(event.origin, versions);
+        return versions.add(event);
       }
       case "problem":
         this.problems.push(event);
     }
   }
 
-  /** The zones and areas that hold at a moment; before the first were told, those. */
+  /** Zones and areas at a time. Before the first version was received, the first version is returned. */
   features(time: number): Feature[] {
-    return [...this.areas.values()].flatMap((known) => (known.at(time) ?? known.values[0])?.features ?? []);
+    return [...this.areas.values()].flatMap((versions) => (versions.at(time) ?? versions.values[0])?.features ?? []);
   }
 
   linksAt(time: number): Link[] {
     return this.links.at(time)?.links ?? [];
   }
 
-  /** All pictures taken by a moment, the newest first. */
-  pictures(time: number, most: number): Picture[] {
-    const found = [...this.drones.values()].flatMap((drone) => drone.pictures.values.slice(0, drone.pictures.count(time)));
-    return found.sort((a, b) => b.time_ms - a.time_ms).slice(0, most);
+  /** Pictures taken up to a time, newest first. */
+  pictures(time: number, limit: number): Picture[] {
+    const pictures = [...this.drones.values()].flatMap((drone) => drone.pictures.values.slice(0, drone.pictures.count(time)));
+    return pictures.sort((a, b) => b.time_ms - a.time_ms).slice(0, limit);
   }
 
   private drone(name: string): Drone {

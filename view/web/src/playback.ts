@@ -1,26 +1,30 @@
-// Which moment is shown.
+// Selects the time that the page shows.
 
-/** Further behind what happens than this, the page jumps instead of catching up. */
-const JUMP_MS = 15_000;
-const BEHIND_MS = 1_000;
+/** The page jumps to the latest event if it is further behind than this. Otherwise it catches up. */
+const MAX_CATCH_UP_MS = 15_000;
+/** Usual delay of a live page. */
+const LIVE_DELAY_MS = 1_000;
+const CATCH_UP_RATE = 1.25;
 
 export class Playback {
+  /** Shown time in Unix milliseconds. */
   time = 0;
   playing = false;
   speed = 1;
-  /** Whether the page follows what happens now. */
+  /** True if the page follows live events. */
   following = false;
 
-  /** Let some milliseconds pass. What is told comes in pieces: the moment moves on evenly all the same. */
-  tick(passed: number, begin: number, end: number): void {
+  /** Advances the shown time. It advances evenly, although events arrive in batches. */
+  tick(elapsedMs: number, begin: number, end: number): void {
     if (!Number.isFinite(begin)) return;
     if (this.following) {
-      const behind = end - this.time;
-      const rate = behind > 2 * BEHIND_MS ? 1.25 : 1;
-      this.time = behind > JUMP_MS || behind < 0 ? end : Math.min(this.time + passed * rate, end);
+      const behindMs = end - this.time;
+      const rate = behindMs > 2 * LIVE_DELAY_MS ? CATCH_UP_RATE : 1;
+      const jumps = behindMs > MAX_CATCH_UP_MS || behindMs < 0;
+      this.time = jumps ? end : Math.min(this.time + elapsedMs * rate, end);
       return;
     }
-    if (this.playing) this.time += passed * this.speed;
+    if (this.playing) this.time += elapsedMs * this.speed;
     this.time = Math.max(this.time, begin);
     if (this.time >= end) {
       this.time = end;
@@ -28,13 +32,12 @@ export class Playback {
     }
   }
 
-  /** Show another moment. */
   seek(time: number): void {
     this.following = false;
     this.time = time;
   }
 
-  /** Begin to play, again from the beginning if it is at the end. */
+  /** Plays from the shown time, or from the beginning if the shown time is the end. */
   play(begin: number, end: number): void {
     if (this.time >= end) this.time = begin;
     this.following = false;

@@ -1,11 +1,12 @@
-// Events from the server; the browser comes back by itself, and says what it heard last.
+// Receives events from the server. The browser reconnects automatically, with the id of the last message that it received.
 
-import type { Event, Sign } from "./events";
+import type { Event, Marker } from "./events";
 
 export interface Listener {
-  events(all: (Event | Sign)[]): void;
+  events(batch: (Event | Marker)[]): void;
   connected(): void;
-  lost(forGood: boolean): void;
+  /** The connection is lost. If `refused`, the browser does not reconnect. */
+  lost(refused: boolean): void;
 }
 
 export function listen(listener: Listener): void {
@@ -13,8 +14,8 @@ export function listen(listener: Listener): void {
   source.onopen = () => listener.connected();
   source.onerror = () => listener.lost(source.readyState === EventSource.CLOSED);
   source.onmessage = (message: MessageEvent<string>) => {
-    const all = JSON.parse(message.data) as (Event | Sign)[];
-    listener.events(all);
-    if (all.some((one) => one.type === "end")) source.close();
+    const batch = JSON.parse(message.data) as (Event | Marker)[];
+    listener.events(batch);
+    if (batch.some((event) => event.type === "end")) source.close();
   };
 }

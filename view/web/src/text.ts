@@ -1,4 +1,4 @@
-// Values as people read them.
+// Converts values to text for people.
 
 import type { Feature, Verdict } from "./events";
 
@@ -11,8 +11,8 @@ const KIND_NAMES: Record<string, string> = {
   edgeNode: "edge node",
 };
 
-/** What has heights. */
-const TALL = new Set(["zone", "operationArea", "corridor"]);
+/** Kinds of areas with altitude limits. */
+const KINDS_WITH_ALTITUDE = new Set(["zone", "operationArea", "corridor"]);
 
 const REFERENCES: Record<string, string> = { home: "above home", amsl: "above sea level", terrain: "above ground" };
 
@@ -27,19 +27,18 @@ export function kindName(feature: Feature): string {
   return KIND_NAMES[feature.properties.kind] ?? feature.properties.kind;
 }
 
-/** What is said of something on the map beside its name. */
+/** Kind, altitude limits and state of an area or place. */
 export function facts(feature: Feature): string {
   const { kind, state } = feature.properties;
-  return [kindName(feature), TALL.has(kind) ? band(feature) : "", state ?? ""].filter(Boolean).join(", ");
+  return [kindName(feature), KINDS_WITH_ALTITUDE.has(kind) ? altitudeLimits(feature) : "", state ?? ""].filter(Boolean).join(", ");
 }
 
-/** The heights that an area has. */
-export function band(feature: Feature): string {
-  const found = feature.properties.altitude;
-  if (found === undefined || (found.lower === undefined && found.upper === undefined)) return "all heights";
-  const reference = REFERENCES[found.reference ?? "home"] ?? found.reference;
-  if (found.upper === undefined) return `from ${found.lower} m ${reference}`;
-  return `${found.lower ?? "ground"} to ${found.upper} m ${reference}`;
+export function altitudeLimits(feature: Feature): string {
+  const band = feature.properties.altitude;
+  if (band === undefined || (band.lower === undefined && band.upper === undefined)) return "all altitudes";
+  const reference = REFERENCES[band.reference ?? "home"] ?? band.reference;
+  if (band.upper === undefined) return `from ${band.lower} m ${reference}`;
+  return `${band.lower ?? "ground"} to ${band.upper} m ${reference}`;
 }
 
 export function actionOf(verdict: Verdict): string {
@@ -47,23 +46,28 @@ export function actionOf(verdict: Verdict): string {
   return ACTIONS[action] ?? action;
 }
 
-/** Whether policies changed what was asked, or took over. */
-export function decided(verdict: Verdict): boolean {
+/** Returns true if policies changed or refused a call, or took the drone over. */
+export function isIntervention(verdict: Verdict): boolean {
   return verdict.kind !== "call" || verdict.action !== "allow";
 }
 
-export function sentence(verdict: Verdict): string {
-  const asked = [verdict.component, verdict.method].filter(Boolean).join(" ");
-  const why = verdict.reason || verdict.code;
-  return `${verdict.drone}: ${asked ? `${asked} ` : ""}${actionOf(verdict)}${why ? `, ${why}` : ""}`;
+/** Component and method of a call. */
+export function callOf(verdict: Verdict): string {
+  return [verdict.component, verdict.method].filter(Boolean).join(" ");
 }
 
-/** Time of day, UTC. */
+export function sentence(verdict: Verdict): string {
+  const call = callOf(verdict);
+  const reason = verdict.reason || verdict.code;
+  return `${verdict.drone}: ${call ? `${call} ` : ""}${actionOf(verdict)}${reason ? `, ${reason}` : ""}`;
+}
+
+/** Time of day in UTC. */
 export function clock(time: number): string {
   return new Date(time).toISOString().slice(11, 19);
 }
 
-export function moment(time: number): string {
+export function dateAndTime(time: number): string {
   return `${new Date(time).toISOString().slice(0, 10)} ${clock(time)} UTC`;
 }
 
@@ -72,7 +76,7 @@ export function duration(milliseconds: number): string {
   return seconds < 60 ? `${seconds} s` : `${Math.floor(seconds / 60)} min ${seconds % 60} s`;
 }
 
-/** A number with its unit, or a dash. */
+/** A number with its unit, or a dash if the number is unknown. */
 export function quantity(value: number | null | undefined, digits: number, unit: string): string {
   return value === null || value === undefined ? "–" : `${value.toFixed(digits)} ${unit}`;
 }

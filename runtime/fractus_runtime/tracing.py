@@ -100,11 +100,6 @@ def _provider(
     return provider, provider.shutdown
 
 
-def call_span() -> Span:
-    """Return the span of the call that this code runs for."""
-    return trace.get_current_span()
-
-
 @contextmanager
 def server_span(
     method: str, metadata: Iterable[tuple[str, str | bytes]], abort_error: type[BaseException]

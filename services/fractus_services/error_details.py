@@ -12,6 +12,7 @@ from fractus_runtime import tracing
 from google.protobuf import any_pb2
 from google.rpc import code_pb2, error_details_pb2, status_pb2
 from grpc_status import rpc_status
+from opentelemetry import trace
 
 from fractus_services.errors import (
     Aborted,
@@ -55,7 +56,7 @@ STATUS: dict[type[Refused], grpc.StatusCode] = {
 
 def decision(verdict: Verdict) -> types_pb2.Decision:
     """Convert a verdict to its message."""
-    tracing.set_verdict(tracing.call_span(), verdict.action, verdict.code, verdict.policies)
+    tracing.set_verdict(trace.get_current_span(), verdict.action, verdict.code, verdict.policies)
     return types_pb2.Decision(
         action=_ACTIONS[verdict.action], reason=verdict.reason, code=verdict.code, policies=verdict.policies
     )
@@ -70,7 +71,7 @@ async def abort(context: Any, refusal: Refused) -> NoReturn:
         details.append(retry)
     status = next(STATUS[kind] for kind in type(refusal).__mro__ if kind in STATUS)
     number = code_pb2.Code.Value(status.name)
-    tracing.set_status(tracing.call_span(), number)
+    tracing.set_status(trace.get_current_span(), number)
     rich = rpc_status.to_status(
         status_pb2.Status(code=number, message=refusal.verdict.reason, details=map(_packed, details))
     )

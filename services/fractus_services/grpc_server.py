@@ -15,6 +15,7 @@ import grpc
 from fractus_core.policy.decision_types import Verdict
 from fractus_runtime import tracing
 from google.protobuf.message import DecodeError
+from opentelemetry import trace
 
 from fractus_services.auth import SERVER_OPTIONS, Caller, Callers, TlsFiles
 from fractus_services.error_details import abort
@@ -123,7 +124,7 @@ class CallAdmission(grpc.aio.ServerInterceptor):  # type: ignore[misc]  # grpc h
         admitted = ""
         try:
             caller = self._callers.of(context.auth_context(), urgent)
-            tracing.call_span().set_attribute("fractus.caller", caller.identity)
+            trace.get_current_span().set_attribute("fractus.caller", caller.identity)
             limiter = self._urgent_limiter if urgent else self._limiter
             limiter.take(caller.identity, time.monotonic())
             if not urgent and self._open[caller.identity] >= MAX_OPEN_CALLS:

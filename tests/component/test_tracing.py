@@ -108,7 +108,7 @@ def test_spans_are_no_ops_without_a_collector() -> None:
     ):
         tracing.set_verdict(part, "deny", "Code", ("policy",))
         assert not part.is_recording()
-        assert not tracing.call_span().is_recording()
+        assert not trace.get_current_span().is_recording()
 
 
 async def test_child_spans_belong_to_the_call_in_its_tasks_too(close: Callable[[], None], collector: Collector) -> None:
@@ -138,7 +138,7 @@ def test_call_span_has_the_status_of_a_failed_call(
     error: BaseException, status: int, close: Callable[[], None], collector: Collector
 ) -> None:
     with pytest.raises(type(error)), tracing.server_span(METHOD, (), grpc.aio.AbortError):
-        tracing.set_status(tracing.call_span(), 7)
+        tracing.set_status(trace.get_current_span(), 7)
         raise error
     close()
     (call,) = collector.spans

@@ -73,7 +73,14 @@ def judge(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
 
 def _judge_once(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
     """Judge a call without judging its correction again."""
-    problem = _check_arguments(call) or judge_access(call, now, grant)
+    expected = _ARGUMENT_TYPES.get(call.method)
+    if expected is not None and not isinstance(call.args, expected):
+        return deny("InvalidArgument", f"{call.method} needs its arguments")
+    for field, name, lower, upper, unit in _ARGUMENT_BOUNDS.get(type(call.args), ()):
+        value = getattr(call.args, field)
+        if value is not None and not (math.isfinite(value) and lower <= value <= upper):
+            return deny("InvalidArgument", f"{name} must be {lower:g} to {upper:g} {unit}, not {value:g}")
+    problem = judge_access(call, now, grant)
     if problem is not None:
         return problem
     if call.method not in _RULES:
@@ -186,17 +193,6 @@ def _rules_here(
 
 
 # Arguments
-
-
-def _check_arguments(call: Call) -> Verdict | None:
-    expected = _ARGUMENT_TYPES.get(call.method)
-    if expected is not None and not isinstance(call.args, expected):
-        return deny("InvalidArgument", f"{call.method} needs its arguments")
-    for field, name, lower, upper, unit in _ARGUMENT_BOUNDS.get(type(call.args), ()):
-        value = getattr(call.args, field)
-        if value is not None and not (math.isfinite(value) and lower <= value <= upper):
-            return deny("InvalidArgument", f"{name} must be {lower:g} to {upper:g} {unit}, not {value:g}")
-    return None
 
 
 _ARGUMENT_BOUNDS: dict[type, tuple[tuple[str, str, float, float, str], ...]] = {

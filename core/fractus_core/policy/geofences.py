@@ -82,11 +82,12 @@ def find_breaches(
 ) -> list[Breach]:
     """Return every fence that a leg breaks, most restrictive first."""
     air = AirVolume(leg.ground, margin_m, leg.lower_m - height_margin_m, leg.upper_m + height_margin_m)
-    breaches = [
-        *_check_operation_area(leg, now, grant, margin_m),
-        *_check_exclusions(leg, now, grant, air),
-        *_check_inclusions(leg, now, grant, air),
-    ]
+    breaches = list(_check_operation_area(leg, now, grant, margin_m))
+    for zone in grant.exclusions.near(air, now, grant.flat_terrain):
+        breaches += _check_exclusion(zone, leg, now, grant, air)
+    for fence in grant.inclusions:
+        if fence.rule.in_force(now.time_s):
+            breaches += _check_inclusion(fence, leg, now, grant, air)
     return sorted(breaches, key=lambda b: (-b.severity, -b.priority, b.policy))
 
 
@@ -175,29 +176,29 @@ def _area_breach(reason: str, enters: bool) -> Breach:
     return Breach(OPERATION_AREA, 0, "ignore", "OutsideOperationArea", reason, enters, lambda _part: False)
 
 
-def _check_exclusions(leg: Leg, now: Situation, grant: CompiledGrant, air: AirVolume) -> Iterator[Breach]:
-    if not grant.exclusions.zones:
-        return
+def _check_exclusion(
+    zone: PolicyZone, leg: Leg, now: Situation, grant: CompiledGrant, air: AirVolume
+) -> Iterator[Breach]:
+    """Check a zone within the margin of a leg. A drone that is already inside or too close may leave the zone."""
     margin_m = air.margin_m
+    shape = zone.shape
     certain = _certain_path(leg, now)
-    for zone in grant.exclusions.near(air, now, grant.flat_terrain):
-        shape = zone.shape
-        clearance_m = _clearance_outside(shape, leg.braking_path)
-        level = _is_level_with(zone, now, grant)
-        height_margin_m = leg.lower_m - air.lower_m
-        if shape.dwithin(certain, margin_m):
-            if not level and _leaves_height(zone, leg, now, grant, height_margin_m):
-                continue
-            if (
-                (level or not _comes_level(zone, leg, now, grant, height_margin_m))
-                and _leads_out(shape, leg, margin_m, clearance_m)
-                and _leads_away(shape, leg, certain)
-            ):
-                continue
-        # A drone that is already inside, or cannot stop outside, does not enter by this request. Only the request is
-        # denied.
-        enters = (clearance_m > 0 or not level) and shape.intersects(air.ground)
-        yield _exclusion_breach(zone, leg, margin_m, enters)
+    clearance_m = _clearance_outside(shape, leg.braking_path)
+    level = _is_level_with(zone, now, grant)
+    height_margin_m = leg.lower_m - air.lower_m
+    if shape.dwithin(certain, margin_m):
+        if not level and _leaves_height(zone, leg, now, grant, height_margin_m):
+            return
+        if (
+            (level or not _comes_level(zone, leg, now, grant, height_margin_m))
+            and _leads_out(shape, leg, margin_m, clearance_m)
+            and _leads_away(shape, leg, certain)
+        ):
+            return
+    # A drone that is already inside, or cannot stop outside, does not enter because of this request. Only the request is
+    # denied.
+    enters = (clearance_m > 0 or not level) and shape.intersects(air.ground)
+    yield _exclusion_breach(zone, leg, margin_m, enters)
 
 
 def _certain_path(leg: Leg, now: Situation) -> BaseGeometry:
@@ -285,15 +286,14 @@ def _crossing_reason(zone: PolicyZone, leg: Leg) -> str:
     return f"the {'leg' if zone.shape.intersects(leg.line) else 'turn onto the leg'} touches zone {zone.name}"
 
 
-def _check_inclusions(leg: Leg, now: Situation, grant: CompiledGrant, air: AirVolume) -> Iterator[Breach]:
-    for fence in grant.inclusions:
-        if not fence.rule.in_force(now.time_s):
-            continue
-        shape, border = fence.at(air.lower_m, air.upper_m, now, grant.flat_terrain)
-        if not _stays_inside(shape, border, leg, now, air.margin_m) or (
-            fence.banded and _leaves_by_height(fence, shape, leg, now, grant)
-        ):
-            yield _inclusion_breach(fence, shape, border, leg, air.margin_m)
+def _check_inclusion(
+    fence: Inclusion, leg: Leg, now: Situation, grant: CompiledGrant, air: AirVolume
+) -> Iterator[Breach]:
+    shape, border = fence.at(air.lower_m, air.upper_m, now, grant.flat_terrain)
+    if not _stays_inside(shape, border, leg, now, air.margin_m) or (
+        fence.banded and _leaves_by_height(fence, shape, leg, now, grant)
+    ):
+        yield _inclusion_breach(fence, shape, border, leg, air.margin_m)
 
 
 def _leaves_by_height(fence: Inclusion, shape: BaseGeometry, leg: Leg, now: Situation, grant: CompiledGrant) -> bool:

@@ -62,7 +62,7 @@ COMMANDS: dict[str, Entry] = {
     "cluster": Entry("fractus_cluster.cli:cluster", "Run a Kubernetes cluster of several nodes on this machine.", "sim"),
     "completion": Entry("fractus_cli.completion:completion", "Print the completion script of a shell."),
     "doctor": Entry("fractus_cli.doctor:doctor", "Check a cluster and print a remedy for each problem.", "operator"),
-    "experiment": Entry("fractus_sim.experiment.cli:experiment", "Run experiments with faults, checks and a report.", "sim"),
+    "experiment": Entry("fractus_sim.experiment_command:experiment", "Run experiments with faults, checks and a report.", "sim"),
     "explain": Entry("fractus_cli.explain:explain", "Explain the plan of an Application.", "kube"),
     "grants": Entry("fractus_cli.grants:grants", "Sign Grants and issue certificates, without Kubernetes.", "operator"),
     "images": Entry("fractus_cluster.images.cli:images", "Build the container images of Fractus with buildah.", "sim"),

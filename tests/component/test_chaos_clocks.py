@@ -13,10 +13,10 @@ from types import SimpleNamespace
 from typing import cast
 
 import pytest
-from fractus_sim.chaos.clocks import can_step, furnish, loaded, step
-from fractus_sim.chaos.faults import FAULTS, broken
-from fractus_sim.chaos.stage import Stage
-from fractus_sim.demo.kube import DemoError
+from fractus_sim.chaos.chaos_cluster import Stage
+from fractus_sim.chaos.chaos_faults import FAULTS, broken
+from fractus_sim.chaos.clock_faults import can_step, furnish, loaded, step
+from fractus_sim.errors import ExperimentError
 
 DAY_S = 86_400.0
 
@@ -106,5 +106,5 @@ def test_clock_fault_steps_clocks_and_resets_them(clocked: dict[str, ClockProces
 
 def test_clock_fault_is_refused_if_no_service_loads_the_library(tmp_path: Path) -> None:
     stage = cast("Stage", SimpleNamespace(state=tmp_path, drone="drone-1"))
-    with pytest.raises(DemoError, match="cannot be stepped"), broken(FAULTS["clock-jump"], stage, Random(1)):
+    with pytest.raises(ExperimentError, match="cannot be stepped"), broken(FAULTS["clock-jump"], stage, Random(1)):
         pass

@@ -6,13 +6,13 @@ import subprocess
 import sys
 
 PROGRAM = """
-from fractus_sim.chaos import run
+from fractus_sim.chaos import chaos_run
 
 def interrupted(*_, **__):
     raise KeyboardInterrupt
 
-run.Missions.step = interrupted
-run.fly(None, None, run.Task(1, 1800.0, ["etcd-restart"]), print)
+chaos_run.Missions.step = interrupted
+chaos_run.fly(None, None, chaos_run.Task(1, 1800.0, ["etcd-restart"]), print)
 """
 
 

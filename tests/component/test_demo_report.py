@@ -13,9 +13,7 @@ import pytest
 import yaml
 from fractus_core.api import DeploymentPlan
 from fractus_sim.report import Record, write_report
-from fractus_sim.report.features import features
-from fractus_sim.report.mission import scene_of
-from fractus_sim.report.summary import figures, summary
+from fractus_sim.report.mission_report import features, figures, scene_of, summary
 
 PNG = b"\x89PNG\r\n\x1a\n"
 

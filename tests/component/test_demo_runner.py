@@ -15,14 +15,15 @@ import yaml
 from click.testing import CliRunner
 from fractus_services.recording import messages
 from fractus_services.recording.segment_writer import SegmentWriter
-from fractus_sim.demo import collect, watch
-from fractus_sim.demo import view as demo_view
+from fractus_sim.demo import live_view, mission_data
 from fractus_sim.demo.__main__ import demo
-from fractus_sim.demo.clusters import ROOT, assign
-from fractus_sim.demo.collect import fetch_logs, spread
-from fractus_sim.demo.kube import DemoError, Kube
-from fractus_sim.demo.watch import Mission
-from fractus_sim.report.record import Record, of_mission, taken_s
+from fractus_sim.demo.demo_clusters import ROOT, assign
+from fractus_sim.demo.mission_data import fetch_logs, spread
+from fractus_sim.errors import ExperimentError
+from fractus_sim.report.flight_record import Record, of_mission, taken_s
+from fractus_sim.testbeds import mission_watch
+from fractus_sim.testbeds.kube_commands import Kube
+from fractus_sim.testbeds.mission_watch import Mission
 
 
 def node(name: str, label: str | None = None) -> dict[str, Any]:
@@ -95,17 +96,17 @@ class Silent:
 
 def test_mission_fails_after_the_timeout(tmp_path: Path) -> None:
     mission = Mission("traffic-monitoring", {"applied": 0.0})
-    with pytest.raises(DemoError, match="did not end within 5 s: no drone is free"):
-        watch.follow(Silent(), mission, tmp_path / "log", timeout_s=5.0, say=print, show=print)  # type: ignore[arg-type]
+    with pytest.raises(ExperimentError, match="did not end within 5 s: no drone is free"):
+        mission_watch.follow(Silent(), mission, tmp_path / "log", timeout_s=5.0, say=print, show=print)  # type: ignore[arg-type]
 
 
 def test_driver_log_lines_are_reported_complete_and_once(tmp_path: Path) -> None:
     log = tmp_path / "log"
     said = list[str]()
     log.write_bytes(b"[pod/x-navigator-1/navigator] 08:00 armed\n[pod/y/data-store] 08:00 kept 1\n[pod/x-navi")
-    at = watch._tell(log, 0, said.append)
+    at = mission_watch._tell(log, 0, said.append)
     log.write_bytes(log.read_bytes() + b"gator-1/navigator] 08:01 waypoint 1/5\n")
-    watch._tell(log, at, said.append)
+    mission_watch._tell(log, at, said.append)
     assert said == ["navigator: 08:00 armed", "navigator: 08:01 waypoint 1/5"]
 
 
@@ -123,10 +124,10 @@ def test_nodes_are_assigned_explicitly_then_by_name_then_by_class() -> None:
 def test_missing_node_is_reported_with_a_remedy() -> None:
     nodes = [node("a", "drone"), node("b", "edge"), node("c", "cloud")]
     with pytest.raises(
-        DemoError, match=r"can be used as edge-2; assign one with --assign edge-2=NODE \(nodes: a, b, c\)"
+        ExperimentError, match=r"can be used as edge-2; assign one with --assign edge-2=NODE \(nodes: a, b, c\)"
     ):
         assign(nodes, {})
-    with pytest.raises(DemoError, match="the cluster has no node z"):
+    with pytest.raises(ExperimentError, match="the cluster has no node z"):
         assign(nodes, {"edge-2": "z"})
     assert "edge-3" not in assign([*nodes, node("d", "edge")], {})
 
@@ -172,7 +173,7 @@ def test_incomplete_file_is_removed_after_a_failed_fetch(tmp_path: Path) -> None
     kubectl.chmod(0o755)
     kube = Kube(kubectl, kubectl, tmp_path)
     to = tmp_path / "out.jpg"
-    with pytest.raises(DemoError, match="broken"):
+    with pytest.raises(ExperimentError, match="broken"):
         kube.fetch("pod", "/bad", to)
     assert [path.name for path in tmp_path.iterdir()] == ["kubectl"]
     kube.fetch("pod", "/good", to)
@@ -199,7 +200,7 @@ def test_pictures_are_extracted_from_the_camera_recording(tmp_path: Path, whole:
     if whole:
         writer.close()
     paths[1].write_bytes(b"not read")
-    collect.keep_pictures(paths, record, tmp_path / "out")
+    mission_data.keep_pictures(paths, record, tmp_path / "out")
     kept = sorted((tmp_path / "out" / "pictures").iterdir())
     assert [round(taken_s(path.name) - demo_flight.TAKEOFF_S) for path in kept] == [25, 50, 80]
     assert [path.read_bytes() for path in kept] == [b"\xff\xd825", b"\xff\xd850", b"\xff\xd880"]
@@ -255,21 +256,21 @@ def test_traffic_path_change_is_reported_once() -> None:
 def test_mission_recordings_are_kept_and_the_replay_command_is_printed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, began: str
 ) -> None:
-    assert demo_view.replay_command(tmp_path) is None
+    assert live_view.replay_command(tmp_path) is None
     kubectl = tmp_path / "kubectl"
     kubectl.write_text('#!/bin/sh\nif [ "$1" = get ]; then echo fractus-mobility-x; else shift 5; exec "$@"; fi\n')
     kubectl.chmod(0o755)
-    monkeypatch.setattr(demo_view, "_ON_NODE", str(tmp_path / "node"))
+    monkeypatch.setattr(live_view, "_ON_NODE", str(tmp_path / "node"))
     applied_s = datetime(2026, 6, 1, 12, tzinfo=UTC).timestamp()
     for name, written_s in (("000001-20260531T120000Z", applied_s - 1), (f"000002-{began}", applied_s + 60)):
         path = tmp_path / "node" / "mobility" / f"{name}.mcap"
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(name)
         os.utime(path, (written_s, written_s))
-    found = demo_view.fetch_recordings(Kube(kubectl, kubectl, tmp_path), "drone-1", applied_s, tmp_path)
+    found = live_view.fetch_recordings(Kube(kubectl, kubectl, tmp_path), "drone-1", applied_s, tmp_path)
     assert [path.name for path in found] == [f"mobility-000002-{began}.mcap"]
     assert found[0].read_text() == f"000002-{began}"
-    assert demo_view.replay_command(tmp_path) == f"fractus view {tmp_path}/recordings/*.mcap"
+    assert live_view.replay_command(tmp_path) == f"fractus view {tmp_path}/recordings/*.mcap"
 
 
 def test_demo_continues_without_live_view(tmp_path: Path) -> None:
@@ -281,7 +282,7 @@ def test_demo_continues_without_live_view(tmp_path: Path) -> None:
         said.append(line)
         told.set()
 
-    with demo_view.shown(tmp_path / "config", say):
+    with live_view.shown(tmp_path / "config", say):
         assert told.wait(200)
     assert len(said) == 1
     assert said[0].startswith("live view not available: fractus: the kubeconfig")

@@ -7,12 +7,12 @@ from typing import Any
 
 import pytest
 from fractus_sim.experiment import parse
-from fractus_sim.experiment.detections import Score, Seen, read_detections, score
-from fractus_sim.experiment.findings import Findings
-from fractus_sim.experiment.injection import Occurrence
-from fractus_sim.experiment.judging import Evidence, judge
-from fractus_sim.experiment.recording import Flight, Text
 from fractus_sim.report.track import Place, Sample
+from fractus_sim.runner.check_evaluation import Evidence, judge
+from fractus_sim.runner.fault_injection import Occurrence
+from fractus_sim.runner.telemetry_recording import Flight, Text
+from fractus_sim.testbeds.detections import Score, Seen, read_detections, score
+from fractus_sim.testbeds.testbed import Findings
 from fractus_vehicle import earth
 
 HOME = earth.Place.from_degrees(50.0, 4.0, 0.0)

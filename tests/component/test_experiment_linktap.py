@@ -7,8 +7,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from fractus_sim.experiment.errors import ExperimentError
-from fractus_sim.experiment.linktap import LinkTap
+from fractus_sim.errors import ExperimentError
+from fractus_sim.testbeds.link_tap import LinkTap
 
 TIMEOUT_S = 10.0
 

@@ -11,14 +11,15 @@ from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
-from fractus_sim.experiment import cli, reaper, reporting, runner
-from fractus_sim.experiment.findings import Findings
-from fractus_sim.experiment.model import Experiment, parse
-from fractus_sim.experiment.recording import Flight
-from fractus_sim.experiment.testbed import Moment, Testbed
+from fractus_sim import experiment_command
+from fractus_sim.experiment.definition import Experiment, parse
 from fractus_sim.interruption import uninterrupted
-from fractus_sim.report.page import write_page
+from fractus_sim.report.report_files import write_page
 from fractus_sim.report.track import Place, Sample
+from fractus_sim.runner import experiment_report, experiment_runner
+from fractus_sim.runner.telemetry_recording import Flight
+from fractus_sim.testbeds import process_guard
+from fractus_sim.testbeds.testbed import Findings, Moment, Testbed
 
 
 class Thing:
@@ -86,11 +87,11 @@ def test_testbed_is_closed_and_old_report_removed_if_the_disk_is_full_at_start(
     def no_log(_path: Path) -> None:
         raise full()
 
-    monkeypatch.setattr(runner, "_testbed", lambda *_: testbed)
-    monkeypatch.setattr(runner, "McapLog", no_log)
+    monkeypatch.setattr(experiment_runner, "_testbed", lambda *_: testbed)
+    monkeypatch.setattr(experiment_runner, "McapLog", no_log)
     (tmp_path / "summary.md").write_text("All checks hold.")
     with pytest.raises(OSError, match="No space left"):
-        runner.run(experiment, tmp_path)
+        experiment_runner.run(experiment, tmp_path)
     assert thing.closed
     assert not (tmp_path / "summary.md").exists()
 
@@ -99,11 +100,11 @@ def test_testbed_is_closed_if_the_disk_is_full_at_the_end(
     experiment: Experiment, testbed: Empty, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     thing = testbed.keep(Thing())
-    monkeypatch.setattr(runner, "_testbed", lambda *_: testbed)
-    monkeypatch.setattr(runner, "_run_session", lambda _: "")
-    monkeypatch.setattr(runner, "McapLog", lambda _: Thing(full()))
+    monkeypatch.setattr(experiment_runner, "_testbed", lambda *_: testbed)
+    monkeypatch.setattr(experiment_runner, "_run_session", lambda _: "")
+    monkeypatch.setattr(experiment_runner, "McapLog", lambda _: Thing(full()))
     with pytest.raises(OSError, match="No space left"):
-        runner.run(experiment, tmp_path)
+        experiment_runner.run(experiment, tmp_path)
     assert thing.closed
 
 
@@ -129,8 +130,8 @@ def test_signals_are_deferred_until_the_end_of_an_uninterrupted_block() -> None:
 
 def test_guard_kills_the_groups_that_were_not_released(monkeypatch: pytest.MonkeyPatch) -> None:
     killed: list[int] = []
-    monkeypatch.setattr(reaper.os, "killpg", lambda group, _signal: killed.append(group))
-    reaper.guard(io.StringIO("41\n42\n43\n-42\n"))
+    monkeypatch.setattr(process_guard.os, "killpg", lambda group, _signal: killed.append(group))
+    process_guard.guard(io.StringIO("41\n42\n43\n-42\n"))
     assert killed == [41, 43]
 
 
@@ -156,10 +157,10 @@ def test_report_is_written_before_figures_and_the_page_after_them(
 
     samples = [Sample(float(t), Place(50.0, 4.0, float(t)), 5.0, "GUIDED", t > 0, 0.8) for t in range(3)]
     flights = {"d": Flight("d", samples)}
-    outcome = runner.Outcome(experiment, tmp_path, flights, (), (), Findings(), (), (), 2.0, 2.0)
-    monkeypatch.setattr(reporting, "draw_map", undrawn)
+    outcome = experiment_runner.Outcome(experiment, tmp_path, flights, (), (), Findings(), (), (), 2.0, 2.0)
+    monkeypatch.setattr(experiment_report, "draw_map", undrawn)
     with pytest.raises(OSError, match="No space left"):
-        reporting.write_outcome(outcome)
+        experiment_report.write_outcome(outcome)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["report.json", "tracks.geojson"]
 
 
@@ -178,10 +179,10 @@ def test_experiment_command_reports_a_write_error_only_if_the_error_names_a_file
     def broken(*_: object, **_more: object) -> None:
         raise error
 
-    monkeypatch.setattr(cli, "break_off_on_signals", lambda: None)
-    monkeypatch.setattr(cli, "load", lambda _file: experiment)
-    monkeypatch.setattr(cli, "run", broken)
-    result = CliRunner().invoke(cli.experiment, ["run", "x.yaml", "--out", "out"])
+    monkeypatch.setattr(experiment_command, "break_off_on_signals", lambda: None)
+    monkeypatch.setattr(experiment_command, "load", lambda _file: experiment)
+    monkeypatch.setattr(experiment_command, "run", broken)
+    result = CliRunner().invoke(experiment_command.experiment, ["run", "x.yaml", "--out", "out"])
     assert result.exit_code == 1
     assert expected in result.output
     assert "None" not in result.output

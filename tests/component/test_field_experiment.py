@@ -5,10 +5,10 @@ from __future__ import annotations
 import shapely
 from fractus_core.geo import LocalFrame
 from fractus_sim.report.track import Place, Sample, Track
-from fractus_sim.scenarios.field.drawing import draw_ground
-from fractus_sim.scenarios.field.evidence import Call, Evidence
-from fractus_sim.scenarios.field.flight import PERIOD_S, RUNS, STAY_S, Run, _environment
-from fractus_sim.scenarios.field.place import ABOVE_STRIPE, EXAMPLE, VIEWER, Field
+from fractus_sim.scenarios.field.field_evidence import Call, Evidence
+from fractus_sim.scenarios.field.field_flight import PERIOD_S, RUNS, STAY_S, Run, _environment
+from fractus_sim.scenarios.field.field_report import draw_ground
+from fractus_sim.scenarios.field.field_site import ABOVE_STRIPE, EXAMPLE, VIEWER, Field
 
 FIELD = Field.read(EXAMPLE)
 DEVIATION_M = 3.0

@@ -12,14 +12,13 @@ from pathlib import Path
 import pytest
 from fractus_core.api.geometry import Point
 from fractus_core.geo import geodesic_m
-from fractus_sim.experiment.errors import ExperimentError
+from fractus_sim.errors import ExperimentError
 from fractus_sim.report.track import Place, Sample, Track
-from fractus_sim.scenarios.field.drawing import draw_altitudes, draw_ground
-from fractus_sim.scenarios.field.evidence import Call, Evidence, read_evidence
-from fractus_sim.scenarios.field.expectations import Check, Judge
-from fractus_sim.scenarios.field.page import figures, summary
-from fractus_sim.scenarios.field.place import Field, as_text
-from fractus_sim.scenarios.field.probe import parse_link
+from fractus_sim.scenarios.field.field_evidence import Call, Evidence, read_evidence
+from fractus_sim.scenarios.field.field_expectations import Check, Judge
+from fractus_sim.scenarios.field.field_flight import parse_link
+from fractus_sim.scenarios.field.field_report import draw_altitudes, draw_ground, figures, summary
+from fractus_sim.scenarios.field.field_site import Field, as_text
 from vehicle_world import alone
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "field"

@@ -7,14 +7,12 @@ import math
 from pathlib import Path
 
 import pytest
-from fractus_sim.report.drawing import save
-from fractus_sim.scenarios.links.drawing import draw_bandwidth, draw_map
-from fractus_sim.scenarios.links.evidence import AGENT, CHECKER, VIEWER, Evidence, read
-from fractus_sim.scenarios.links.page import summary
-from fractus_sim.scenarios.links.place import DRONE, Site, read_site
-from fractus_sim.scenarios.links.podlogs import Line, PodLogs, parse
-from fractus_sim.scenarios.links.results import expectations, gains, report
-from fractus_sim.scenarios.links.rules import along
+from fractus_sim.report.figure_style import save
+from fractus_sim.scenarios.links.link_rules import along
+from fractus_sim.scenarios.links.links_evidence import AGENT, CHECKER, VIEWER, Evidence, Line, PodLogs, parse, read
+from fractus_sim.scenarios.links.links_report import draw_bandwidth, draw_map, summary
+from fractus_sim.scenarios.links.links_results import expectations, gains, report
+from fractus_sim.scenarios.links.links_site import DRONE, Site, read_site
 
 BEGIN_S = 1_000_000.0
 

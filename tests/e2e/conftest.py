@@ -19,8 +19,8 @@ import yaml
 from fractus_cluster.binaries import ensure_binaries
 from fractus_cluster.cluster import Cluster
 from fractus_cluster.images.build import build_images
-from fractus_sim.chaos.missions import flight
-from fractus_sim.demo.clusters import EXAMPLE_NODES, assign
+from fractus_sim.chaos.chaos_run import flight
+from fractus_sim.demo.demo_clusters import EXAMPLE_NODES, assign
 from kubectl import Kube, Object, condition
 
 ROOT = pathlib.Path(__file__).parents[2]

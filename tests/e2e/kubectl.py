@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import yaml
-from fractus_sim.chaos import processes
+from fractus_sim.chaos import process_lookup
 
 Object = dict[str, Any]
 
@@ -111,7 +111,7 @@ class Kube:
 
     def kill_pod(self, pod: Object) -> None:
         """SIGKILL every process of a pod's containers, as a crash would; the sandbox stays."""
-        if not processes.send_signal(processes.of_pod(pod["metadata"]["uid"]), signal.SIGKILL):
+        if not process_lookup.send_signal(process_lookup.of_pod(pod["metadata"]["uid"]), signal.SIGKILL):
             raise CommandFailed(f"pod {pod['metadata']['name']} has no processes to kill")
 
 

@@ -6,10 +6,9 @@ import pytest
 from conftest import DRONE
 from fractus_cluster.binaries import ensure_binaries
 from fractus_cluster.cluster import Cluster
-from fractus_sim.chaos.run import Task, fly
-from fractus_sim.chaos.stage import Stage
-from fractus_sim.chaos.watching import Watch
-from fractus_sim.demo.kube import Kube as Programs
+from fractus_sim.chaos.chaos_cluster import Stage, Watch
+from fractus_sim.chaos.chaos_run import Task, fly
+from fractus_sim.testbeds.kube_commands import Kube as Programs
 from kubectl import Kube
 
 pytestmark = pytest.mark.slow

@@ -10,8 +10,8 @@ from chart import path_of
 from control_plane import ControlPlane, wait_for
 from fractus_cluster.binaries import ensure_binaries
 from fractus_runtime.kubernetes import BlockingClient, KubeError
-from fractus_sim.chaos.apiserver import no_room, occupied
-from fractus_sim.demo.kube import Kube
+from fractus_sim.chaos.api_server_faults import no_room, occupied
+from fractus_sim.testbeds.kube_commands import Kube
 
 pytestmark = pytest.mark.slow
 

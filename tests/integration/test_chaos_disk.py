@@ -13,9 +13,9 @@ from typing import cast
 import pytest
 from control_plane import wait_for
 from fractus_cluster.disk import mount_disk, unmount_below
-from fractus_sim.chaos.faults import FAULTS, broken
-from fractus_sim.chaos.stage import Stage
-from fractus_sim.demo.kube import DemoError
+from fractus_sim.chaos.chaos_cluster import Stage
+from fractus_sim.chaos.chaos_faults import FAULTS, broken
+from fractus_sim.errors import ExperimentError
 
 pytestmark = [pytest.mark.slow, pytest.mark.root]
 
@@ -75,7 +75,7 @@ def test_a_disk_that_is_mounted_keeps_what_is_on_it(disk: Path, tmp_path: Path) 
 
 def test_the_machine_s_own_disk_is_never_filled(tmp_path: Path) -> None:
     with (
-        pytest.raises(DemoError, match="no disk of its own"),
+        pytest.raises(ExperimentError, match="no disk of its own"),
         broken(FAULTS["disk-full"], stage_on(tmp_path), Random(1)),
     ):
         pass

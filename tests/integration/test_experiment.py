@@ -14,9 +14,10 @@ from typing import Any
 import pytest
 from click.testing import CliRunner, Result
 from fractus_cluster.ports import free_port
-from fractus_sim.experiment import parse, run
-from fractus_sim.experiment.cli import experiment as command
-from fractus_sim.experiment.processes import Processes, listening
+from fractus_sim.experiment import parse
+from fractus_sim.experiment_command import experiment as command
+from fractus_sim.runner import run
+from fractus_sim.testbeds.local_processes import Processes, listening
 from mcap.reader import make_reader
 from pymavlink import mavutil
 
@@ -150,9 +151,7 @@ def test_interrupted_experiment_leaves_no_process(tmp_path: Path) -> None:
     program = {"name": "wait", "command": ["python", "wait.py"], "vehicle": "d"}
     file = tmp_path / "long.yaml"
     file.write_text(json.dumps(content(programs=[program], vehicles=[{"name": "d", "home": HOME, "readyAfter": 1}])))
-    code = (
-        f"from fractus_sim.experiment.cli import experiment as e; e(['run', {str(file)!r}, '--out', {str(tmp_path)!r}])"
-    )
+    code = f"from fractus_sim.experiment_command import experiment as e; e(['run', {str(file)!r}, '--out', {str(tmp_path)!r}])"
     runner = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:
         deadline = time.monotonic() + 60
@@ -170,7 +169,7 @@ def test_interrupted_experiment_leaves_no_process(tmp_path: Path) -> None:
 
 
 def test_processes_are_killed_if_they_ignore_sigterm(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("fractus_sim.experiment.processes.GRACE_S", 1.0)
+    monkeypatch.setattr("fractus_sim.testbeds.local_processes.GRACE_S", 1.0)
     stubborn = (
         "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print('up', flush=True); time.sleep(60)"
     )
@@ -193,7 +192,7 @@ def test_child_processes_end_with_their_program(tmp_path: Path) -> None:
 RUNNER = """
 import sys, time
 from pathlib import Path
-from fractus_sim.experiment import processes as room
+from fractus_sim.testbeds import local_processes as room
 from fractus_sim.interruption import break_off_on_signals
 room.GRACE_S = 600.0
 break_off_on_signals()

@@ -11,8 +11,7 @@ from typing import Any
 import pytest
 from fractus_core.api.model import InvalidObject
 from fractus_sim.experiment import ExperimentError
-from fractus_sim.experiment.standalone import Standalone
-from fractus_sim.experiment.standalone_drone import DroneSetup
+from fractus_sim.testbeds.standalone_drones import DroneSetup, Standalone
 from mobility_rig import HOME, grant
 from pymavlink import mavutil
 

@@ -15,7 +15,9 @@ from fractus_core.api import Grant
 from fractus_core.api.grants import GrantSpec, pack
 from fractus_core.policy.decision_types import Home
 from fractus_sim.chaos.__main__ import with_disk
-from fractus_sim.chaos.faults import FAULTS, broken
+from fractus_sim.chaos.chaos_cluster import Stage
+from fractus_sim.chaos.chaos_faults import FAULTS, broken
+from fractus_sim.chaos.chaos_run import Missions, schedule
 from fractus_sim.chaos.invariants import (
     Seen,
     forbidden_calls,
@@ -26,10 +28,7 @@ from fractus_sim.chaos.invariants import (
     steadily_timed,
     without_authority,
 )
-from fractus_sim.chaos.missions import Missions
-from fractus_sim.chaos.schedule import schedule
-from fractus_sim.chaos.stage import Stage
-from fractus_sim.demo.kube import DemoError
+from fractus_sim.errors import ExperimentError
 
 ROOT = Path(__file__).parents[2]
 HOME = Home(50.8637, 4.6785, 25.0)
@@ -227,7 +226,7 @@ def test_orphan_invariant_includes_grants_stored_on_nodes(tmp_path: Path) -> Non
 
 
 def test_drained_node_is_uncordoned_after_a_rejected_request(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("fractus_sim.chaos.faults._RETRY_S", 0.0)
+    monkeypatch.setattr("fractus_sim.chaos.chaos_faults._RETRY_S", 0.0)
     cordoned = False
     refusals = 1
 
@@ -239,7 +238,7 @@ def test_drained_node_is_uncordoned_after_a_rejected_request(monkeypatch: pytest
         elif refusals:
             refusals -= 1
             if command != "uncordon":
-                raise DemoError("the server was unable to return a response in the time allotted")
+                raise ExperimentError("the server was unable to return a response in the time allotted")
         elif command == "uncordon" or '{"spec": {"unschedulable": null}}' in arguments:
             cordoned = False
         return ""
@@ -254,7 +253,7 @@ def test_drained_node_is_uncordoned_after_a_rejected_request(monkeypatch: pytest
 
 
 def test_label_fault_waits_for_the_drone_but_not_for_an_edge_node(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("fractus_sim.chaos.faults._RETRY_S", 0.0)
+    monkeypatch.setattr("fractus_sim.chaos.chaos_faults._RETRY_S", 0.0)
     labels: dict[str, str] = {}
     refusals = 0
 
@@ -263,7 +262,7 @@ def test_label_fault_waits_for_the_drone_but_not_for_an_edge_node(monkeypatch: p
         if label.endswith("-"):
             if node == "drone-1" and refusals < 3:
                 refusals += 1
-                raise DemoError("drone-1 is in the air")
+                raise ExperimentError("drone-1 is in the air")
             del labels[node]
         else:
             labels[node] = label.partition("=")[2]

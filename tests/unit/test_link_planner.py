@@ -37,7 +37,7 @@ from fractus_core.linking.range_model import (
     with_loss,
 )
 from fractus_core.linking.values import LocalPosition
-from fractus_sim.scenarios.links.rules import Rule, Scene, along, carried, oracle, ours, thesis
+from fractus_sim.scenarios.links.link_rules import Rule, Scene, along, carried, oracle, ours, thesis
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 

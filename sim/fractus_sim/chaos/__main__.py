@@ -13,18 +13,16 @@ from fractus_cluster.errors import ClusterError
 from fractus_cluster.images.build import build_images
 from fractus_cluster.spec import ClusterSpec, DiskHardware, NodeSpec, load_spec
 
-from fractus_sim.chaos import clocks
-from fractus_sim.chaos.faults import BALLAST, FAULTS
-from fractus_sim.chaos.report import page
-from fractus_sim.chaos.run import Run, Task, fly
-from fractus_sim.chaos.stage import Stage
-from fractus_sim.chaos.watching import Watch
-from fractus_sim.demo.clusters import ROOT, TARGETS, install_fractus, kube_of, surroundings
-from fractus_sim.demo.kube import DemoError
-from fractus_sim.demo.watch import wait_ready
-from fractus_sim.experiment.errors import ExperimentError
+from fractus_sim.chaos import clock_faults
+from fractus_sim.chaos.chaos_cluster import Stage, Watch
+from fractus_sim.chaos.chaos_faults import BALLAST, FAULTS
+from fractus_sim.chaos.chaos_report import page
+from fractus_sim.chaos.chaos_run import Run, Task, fly
+from fractus_sim.demo.demo_clusters import ROOT, TARGETS, install_fractus, kube_of, surroundings
+from fractus_sim.errors import ExperimentError
 from fractus_sim.interruption import break_off_on_signals, uninterrupted
-from fractus_sim.report.page import write_page
+from fractus_sim.report.report_files import write_page
+from fractus_sim.testbeds.mission_watch import wait_ready
 
 CLUSTER = "chaos"
 DRONE = "drone-1"
@@ -56,7 +54,7 @@ def embedded(keep: bool) -> Iterator[Stage]:
 
     Raises:
         ClusterError: The cluster did not start.
-        DemoError: Fractus did not start.
+        ExperimentError: Fractus did not start.
     """
     images = build_images(ROOT, targets=TARGETS, report=say)
     cluster = Cluster.load(with_disk(load_spec(ROOT / "examples" / "clusters" / "demo.yaml")), name=CLUSTER, report=say)
@@ -66,8 +64,8 @@ def embedded(keep: bool) -> Iterator[Stage]:
         stage = Stage(cluster, kube, DRONE)
         # Remove the ballast file of a run that was killed.
         (stage.state / BALLAST).unlink(missing_ok=True)
-        clocks.furnish(node.own_state for node in cluster.nodes if node.spec.node_class != "cloud")
-        install_fractus(kube, clocks.chart_values())
+        clock_faults.furnish(node.own_state for node in cluster.nodes if node.spec.node_class != "cloud")
+        install_fractus(kube, clock_faults.chart_values())
         kube.apply(surroundings())
         wait_ready(kube, READY_TIMEOUT_S, lambda _line: None)
         yield stage
@@ -104,7 +102,7 @@ def chaos(*, seeds: int, first_seed: int, minutes: float, kinds: tuple[str, ...]
                 for seed in range(first_seed, first_seed + seeds):
                     runs.append(fly(stage, watch, Task(seed, minutes * 60, kinds or sorted(FAULTS)), say))
                     write_page(out, page(runs, minutes * 60))
-    except (ClusterError, DemoError, ExperimentError) as error:
+    except (ClusterError, ExperimentError) as error:
         click.echo(f"chaos: {error}", err=True)
         sys.exit(1)
     broken = [(run.seed, each) for run in runs for each in run.broken]

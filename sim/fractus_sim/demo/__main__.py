@@ -11,10 +11,10 @@ from fractus_cluster.errors import ClusterError
 from rich.console import Console
 from rich.markdown import Markdown
 
-from fractus_sim.demo.clusters import CurrentCluster, EmbeddedCluster
-from fractus_sim.demo.kube import DemoError
-from fractus_sim.demo.runner import Demo, Teller, report_again
-from fractus_sim.demo.view import replay_command
+from fractus_sim.demo.demo_clusters import CurrentCluster, EmbeddedCluster
+from fractus_sim.demo.demo_run import Demo, Teller, report_again
+from fractus_sim.demo.live_view import replay_command
+from fractus_sim.errors import ExperimentError
 from fractus_sim.interruption import break_off_on_signals
 
 
@@ -63,7 +63,7 @@ def demo(
             tell = Teller(console)
             chosen = EmbeddedCluster(tell) if cluster == "embedded" else CurrentCluster(tell, assign)
             fine = Demo(chosen, out, keep, timeout_s, tell).run()
-    except (DemoError, ClusterError) as error:
+    except (ExperimentError, ClusterError) as error:
         click.echo(f"demo: {error}", err=True)
         sys.exit(1)
     except KeyboardInterrupt:

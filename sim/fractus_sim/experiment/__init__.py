@@ -1,14 +1,6 @@
-"""Experiments: simulated vehicles with timed faults, checks and a report.
+"""Data model of experiment files. It starts nothing: `fractus_sim.runner` runs an experiment."""
 
-Run an experiment file and require that all its checks hold:
+from fractus_sim.errors import ExperimentError
+from fractus_sim.experiment.definition import Experiment, load, parse
 
-    outcome = run(load(Path("hello.yaml")), Path("out/hello"))
-    assert outcome.holds
-"""
-
-from fractus_sim.experiment.errors import ExperimentError
-from fractus_sim.experiment.model import Experiment, load, parse
-from fractus_sim.experiment.outcome import Outcome
-from fractus_sim.experiment.runner import Progress, run
-
-__all__ = ["Experiment", "ExperimentError", "Outcome", "Progress", "load", "parse", "run"]
+__all__ = ["Experiment", "ExperimentError", "load", "parse"]

@@ -9,7 +9,7 @@ from fractus_core.api.model import InvalidObject, Model
 from fractus_core.api.names import Name
 from pydantic import AfterValidator, Field
 
-from fractus_sim.experiment.tasks import Altitude, ModeName, Place
+from fractus_sim.experiment.task_steps import Altitude, ModeName, Place
 
 
 def _regular(text: str) -> str:

@@ -7,17 +7,15 @@ from pathlib import Path
 
 import click
 
-from fractus_sim.experiment.errors import ExperimentError
+from fractus_sim.errors import ExperimentError
 from fractus_sim.interruption import break_off_on_signals
-from fractus_sim.report.drawing import save
-from fractus_sim.report.page import PAGE, write_page
-from fractus_sim.scenarios.field.drawing import draw_altitudes, draw_ground
-from fractus_sim.scenarios.field.evidence import Evidence
-from fractus_sim.scenarios.field.expectations import Check, Judge
-from fractus_sim.scenarios.field.flight import RUNS, Autopilot, fly
-from fractus_sim.scenarios.field.page import figures, summary
-from fractus_sim.scenarios.field.place import EXAMPLE, Field, dump
-from fractus_sim.scenarios.field.probe import look
+from fractus_sim.report.figure_style import save
+from fractus_sim.report.report_files import PAGE, write_page
+from fractus_sim.scenarios.field.field_evidence import Evidence
+from fractus_sim.scenarios.field.field_expectations import Check, Judge
+from fractus_sim.scenarios.field.field_flight import RUNS, Autopilot, fly, look
+from fractus_sim.scenarios.field.field_report import draw_altitudes, draw_ground, figures, summary
+from fractus_sim.scenarios.field.field_site import EXAMPLE, Field, dump
 
 FAILED_EXPECTATIONS = 2
 

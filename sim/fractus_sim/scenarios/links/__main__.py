@@ -8,17 +8,15 @@ from pathlib import Path
 
 import click
 
-from fractus_sim.experiment.errors import ExperimentError
+from fractus_sim.errors import ExperimentError
 from fractus_sim.interruption import break_off_on_signals
-from fractus_sim.report.drawing import save
-from fractus_sim.report.page import PAGE, write_page
-from fractus_sim.scenarios.links.drawing import draw_bandwidth, draw_map
-from fractus_sim.scenarios.links.evidence import Evidence, read
-from fractus_sim.scenarios.links.flight import LOG, fly
-from fractus_sim.scenarios.links.page import summary
-from fractus_sim.scenarios.links.place import DRONE, Site, read_site
-from fractus_sim.scenarios.links.podlogs import Line
-from fractus_sim.scenarios.links.results import Expectation, expectations, gains, report
+from fractus_sim.report.figure_style import save
+from fractus_sim.report.report_files import PAGE, write_page
+from fractus_sim.scenarios.links.links_evidence import Evidence, Line, read
+from fractus_sim.scenarios.links.links_flight import LOG, fly
+from fractus_sim.scenarios.links.links_report import draw_bandwidth, draw_map, summary
+from fractus_sim.scenarios.links.links_results import Expectation, expectations, gains, report
+from fractus_sim.scenarios.links.links_site import DRONE, Site, read_site
 
 FAILED_EXPECTATIONS = 2
 

@@ -1,0 +1,347 @@
+"""Data model of experiment files: vehicles, environment, tasks, programs, timed faults and checks."""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal, Self
+
+from fractus_core.api.geometry import AltitudeBand, Area, Home
+from fractus_core.api.model import InvalidObject, Model
+from fractus_core.api.names import Name
+from fractus_core.documents import BadDocument, parse_document
+from fractus_vehicle.earth import Place
+from pydantic import Field, ValidationError, model_validator
+
+from fractus_sim.experiment.checks import (
+    ApplicationPhase,
+    CallJudged,
+    Check,
+    Detections,
+    InsideZone,
+    OutsideZone,
+    ProgramEnded,
+    TaskDone,
+    VehicleCheck,
+)
+from fractus_sim.experiment.task_steps import Step
+from fractus_sim.experiment.timed_faults import LINK_OF_MODE, Fault, LinkLoss, NodePowerOff
+
+Mode = Literal["vehicles", "standalone", "cluster"]
+ParameterName = Annotated[str, Field(pattern=r"^[A-Z][A-Z0-9_]{0,15}$")]
+MAX_VEHICLES = 50
+
+
+class Wind(Model):
+    """Wind at the start."""
+
+    speed: float = Field(default=0, ge=0, lt=60, description="Metres per second.")
+    direction: float = Field(default=270, ge=0, lt=360, description="Direction that the wind comes from, degrees.")
+    turbulence: float = Field(default=0, ge=0, lt=30, description="Standard deviation, metres per second.")
+
+
+class CameraWorld(Model):
+    """World that cameras see (mode standalone)."""
+
+    seed: int = Field(default=1, description="Seed of the generated ground.")
+    arguments: tuple[str, ...] = Field(default=(), description="Additional arguments of `fractus camera-world`.")
+
+
+class VehicleEntry(Model):
+    """A vehicle, or a row of identical vehicles."""
+
+    name: Name = Field(description="If `count` is above 1, -1, -2, ... is appended.")
+    count: int = Field(default=1, ge=1, le=MAX_VEHICLES)
+    spacing: float = Field(default=10, gt=0, le=1000, description="Metres between the vehicles of a row.")
+    bearing: float = Field(default=90, ge=0, lt=360, description="Direction in which the row extends, degrees.")
+    home: Home | None = None
+    heading: float = Field(default=0, ge=0, lt=360, description="Degrees.")
+    parameters: dict[ParameterName, float] = Field(default_factory=dict, description="Autopilot parameters.")
+    ready_after: float = Field(default=5, ge=1, le=120, description="Seconds until the autopilot is ready to arm.")
+    connection: str | None = Field(
+        default=None,
+        pattern=r"^tcp:[^:\s]+:\d{1,5}$",
+        description="tcp:HOST:PORT of a running autopilot, such as ArduPilot SITL (mode vehicles).",
+    )
+    camera: bool = Field(default=False, description="Add a camera and the camera service (mode standalone).")
+    task: tuple[Step, ...] = Field(
+        default=(), max_length=500, description="Steps that the ground station of the experiment flies."
+    )
+
+    @model_validator(mode="after")
+    def _stands_somewhere(self) -> Self:
+        if self.connection is not None and (self.count > 1 or self.home is not None or self.parameters):
+            raise InvalidObject(
+                "connection", "count, home and parameters cannot be set for a running autopilot; remove them"
+            )
+        return self
+
+    def names(self) -> tuple[str, ...]:
+        """Names of the vehicles of this entry."""
+        return (self.name,) if self.count == 1 else tuple(f"{self.name}-{at + 1}" for at in range(self.count))
+
+
+class NamedZone(Model):
+    """An airspace volume that checks and figures refer to."""
+
+    name: Name
+    kind: Literal["exclusion", "inclusion", "other"] = "other"
+    area: Area
+    altitude: AltitudeBand | None = None
+
+
+class Program(Model):
+    """A program that runs during the experiment.
+
+    In mode vehicles, the environment variable FRACTUS_VEHICLE contains the MAVLink connection of the vehicle. In mode
+    standalone, the program runs as a component of the application, with the environment of the component's pod.
+    """
+
+    name: Name
+    command: tuple[str, ...] = Field(min_length=1, description="Relative paths are relative to the experiment file.")
+    vehicle: Name | None = Field(default=None, description="Vehicle that the program flies (mode vehicles).")
+    component: str | None = Field(default=None, description="Component that the program implements (mode standalone).")
+    port: int | None = Field(
+        default=None,
+        ge=1024,
+        le=65535,
+        description="Port where the program listens; other programs find it by its component (mode standalone).",
+    )
+    environment: dict[str, str] = Field(default_factory=dict)
+    background: bool = Field(default=False, description="Do not wait for the program; stop it at the end.")
+
+
+class ClusterPart(Model):
+    """The embedded cluster and its manifests."""
+
+    file: str = Field(description="Cluster file, relative to the experiment file.")
+    images: tuple[str, ...] = Field(default=(), description="Additional targets of the Dockerfile to build.")
+    apply: tuple[str, ...] = Field(min_length=1, description="Manifests. The Applications among them are applied last.")
+
+
+@dataclass(frozen=True, slots=True)
+class VehicleSetup:
+    """One vehicle and its entry."""
+
+    name: str
+    system_id: int
+    entry: VehicleEntry
+    home: Home | None
+
+
+class Experiment(Model):
+    """An experiment."""
+
+    name: Name
+    description: str = ""
+    mode: Mode = Field(
+        default="vehicles",
+        description="vehicles: autopilots only; standalone: with the services of Fractus as local processes; cluster: on the"
+        " embedded Kubernetes cluster.",
+    )
+    seed: int = Field(default=1, ge=0, description="Seed of all noise.")
+    speedup: float | None = Field(
+        default=None,
+        ge=0,
+        le=100,
+        description="Factor of real time. 0 (mode vehicles, default without programs): lockstep, as fast as possible and"
+        " exactly repeatable.",
+    )
+    timeout: float = Field(default=300, gt=0, le=7200, description="Maximum duration, seconds of the experiment.")
+    settle: float = Field(default=3, ge=0, le=600, description="Seconds to continue after everything has ended.")
+    wind: Wind = Wind()
+    world: CameraWorld = CameraWorld()
+    vehicles: tuple[VehicleEntry, ...] = Field(min_length=1, max_length=MAX_VEHICLES)
+    zones: tuple[NamedZone, ...] = ()
+    manifests: tuple[str, ...] = Field(
+        default=(),
+        description="Files or directories with Application, Policy, Zone, Depot and Drone manifests (mode standalone).",
+    )
+    programs: tuple[Program, ...] = ()
+    cluster: ClusterPart | None = None
+    faults: tuple[Fault, ...] = ()
+    checks: tuple[Check, ...] = ()
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        _check_vehicles(self)
+        _check_mode(self)
+        _check_faults(self)
+        _check_checks(self)
+        return self
+
+    @property
+    def pace(self) -> float:
+        """Factor of real time. 0 means lockstep."""
+        if self.speedup is not None:
+            return self.speedup
+        return 0.0 if self.mode == "vehicles" and not self.programs and not self.external else 1.0
+
+    @property
+    def external(self) -> bool:
+        """True if a vehicle is a running autopilot outside of the experiment."""
+        return any(entry.connection is not None for entry in self.vehicles)
+
+    def setups(self) -> tuple[VehicleSetup, ...]:
+        """Return all vehicles with consecutive system ids. Rows are expanded."""
+        found: list[VehicleSetup] = []
+        for entry in self.vehicles:
+            for at, name in enumerate(entry.names()):
+                found.append(VehicleSetup(name, len(found) + 1, entry, _spread(entry, at)))
+        return tuple(found)
+
+    def zone(self, name: str) -> NamedZone:
+        """Return a zone by name."""
+        return next(zone for zone in self.zones if zone.name == name)
+
+
+def load(path: Path) -> Experiment:
+    """Read an experiment file.
+
+    Raises:
+        InvalidObject: The file is missing, is not YAML, or has an invalid field that the message names.
+    """
+    try:
+        content, found = parse_document(path.read_bytes(), str(path))
+    except OSError as error:
+        raise InvalidObject("", f"cannot read {path}: {error.strerror}") from None
+    except BadDocument as error:
+        raise InvalidObject("", str(error)) from None
+    try:
+        return parse(content)
+    except InvalidObject as error:
+        raise InvalidObject("", f"{found.where(content, error.field)}: {error}") from None
+
+
+def parse(content: object) -> Experiment:
+    """Create an experiment from parsed YAML.
+
+    Raises:
+        InvalidObject: A field is invalid. The message names the field.
+    """
+    try:
+        return Experiment.model_validate(content)
+    except ValidationError as error:
+        raise _unknown_tag(error) or InvalidObject.from_pydantic(error) from None
+
+
+def _unknown_tag(error: ValidationError) -> InvalidObject | None:
+    """Return the error for an unknown fault, check or step. Return None for other validation errors."""
+    finding = error.errors(include_url=False)[0]
+    context = finding.get("ctx", {})
+    field = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in finding["loc"]).lstrip(".")
+    name = str(context.get("discriminator", "")).strip("'")
+    if finding["type"] == "union_tag_not_found":
+        return InvalidObject(f"{field}.{name}", "is missing; `fractus experiment schema` lists the possible values")
+    if finding["type"] != "union_tag_invalid":
+        return None
+    known = [tag.strip(" '") for tag in str(context["expected_tags"]).split(",")]
+    near = difflib.get_close_matches(str(context["tag"]), known, n=1)
+    hint = f"did you mean {near[0]}?" if near else f"possible values: {', '.join(known)}"
+    return InvalidObject(f"{field}.{name}", f"unknown value {context['tag']}; {hint}")
+
+
+def _spread(entry: VehicleEntry, at: int) -> Home | None:
+    if entry.home is None or at == 0:
+        return entry.home
+    bearing = math.radians(entry.bearing)
+    start = Place.from_degrees(entry.home.lat, entry.home.lon, entry.home.alt)
+    there = start.offset(at * entry.spacing * math.cos(bearing), at * entry.spacing * math.sin(bearing))
+    return Home(lat=there.lat_e7 / 1e7, lon=there.lon_e7 / 1e7, alt=entry.home.alt)
+
+
+def _check_vehicles(experiment: Experiment) -> None:
+    names = [name for entry in experiment.vehicles for name in entry.names()]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise InvalidObject("vehicles", f"the name {twice[0]} is used twice; names must be unique")
+    if len(names) > MAX_VEHICLES:
+        raise InvalidObject("vehicles", f"{len(names)} vehicles; the maximum is {MAX_VEHICLES}")
+    for index, entry in enumerate(experiment.vehicles):
+        if entry.home is None and entry.connection is None and experiment.mode != "cluster":
+            raise InvalidObject(
+                f"vehicles[{index}].home", f"is required in mode {experiment.mode}: the start position of {entry.name}"
+            )
+        if entry.connection is not None and experiment.mode != "vehicles":
+            raise InvalidObject(f"vehicles[{index}].connection", "is only supported in mode vehicles")
+        if entry.task and experiment.mode != "vehicles":
+            raise InvalidObject(
+                f"vehicles[{index}].task",
+                f"is only supported in mode vehicles; in mode {experiment.mode} applications fly the drone",
+            )
+        if entry.camera and experiment.mode != "standalone":
+            raise InvalidObject(f"vehicles[{index}].camera", "is only supported in mode standalone")
+
+
+def _check_mode(experiment: Experiment) -> None:
+    mode = experiment.mode
+    if (experiment.cluster is not None) != (mode == "cluster"):
+        raise InvalidObject("cluster", "is required in mode cluster and not supported in other modes")
+    if bool(experiment.manifests) != (mode == "standalone"):
+        raise InvalidObject("manifests", "are required in mode standalone and not supported in other modes")
+    if mode == "cluster" and (experiment.speedup not in {None, 1.0} or experiment.programs):
+        raise InvalidObject("", "mode cluster runs in real time and programs are pods; remove speedup and programs")
+    if experiment.speedup == 0 and (mode != "vehicles" or experiment.programs or experiment.external):
+        raise InvalidObject(
+            "speedup", "0 (lockstep) is only supported in mode vehicles without programs and connections"
+        )
+    names = {name for entry in experiment.vehicles for name in entry.names()}
+    for index, program in enumerate(experiment.programs):
+        wanted, field = (program.vehicle, "vehicle") if mode == "vehicles" else (program.component, "component")
+        if wanted is None:
+            raise InvalidObject(f"programs[{index}].{field}", f"is required in mode {mode}")
+        if mode == "vehicles":
+            _known(f"programs[{index}].vehicle", [wanted], names, "vehicle")
+
+
+def _check_faults(experiment: Experiment) -> None:
+    names = {name for entry in experiment.vehicles for name in entry.names()}
+    for index, fault in enumerate(experiment.faults):
+        where = f"faults[{index}]"
+        _known(f"{where}.vehicles", fault.vehicles, names, "vehicle")
+        if isinstance(fault, LinkLoss) and fault.link not in {None, LINK_OF_MODE[experiment.mode]}:
+            raise InvalidObject(
+                f"{where}.link",
+                f"{fault.link} does not exist in mode {experiment.mode}; use {LINK_OF_MODE[experiment.mode]}",
+            )
+        if isinstance(fault, NodePowerOff):
+            if experiment.mode == "vehicles":
+                raise InvalidObject(f"{where}.fault", "nodePowerOff needs a node; use mode standalone or cluster")
+            if fault.node is not None and experiment.mode != "cluster":
+                raise InvalidObject(f"{where}.node", "is only supported in mode cluster; use `vehicles`")
+
+
+def _check_checks(experiment: Experiment) -> None:
+    names = {name for entry in experiment.vehicles for name in entry.names()}
+    zones = {zone.name for zone in experiment.zones}
+    programs = {program.name for program in experiment.programs}
+    kinds = {fault.fault for fault in experiment.faults}
+    for index, check in enumerate(experiment.checks):
+        where = f"checks[{index}]"
+        if isinstance(check, VehicleCheck):
+            _known(f"{where}.vehicles", check.vehicles, names, "vehicle")
+        if isinstance(check, OutsideZone | InsideZone):
+            _known(f"{where}.zone", [check.zone], zones, "zone")
+        if isinstance(check, ProgramEnded):
+            _known(f"{where}.program", [check.program], programs, "program")
+        if isinstance(check, CallJudged) and experiment.mode == "vehicles":
+            raise InvalidObject(f"{where}.check", "call is only supported in modes standalone and cluster")
+        if isinstance(check, ApplicationPhase) and experiment.mode != "cluster":
+            raise InvalidObject(f"{where}.check", "phase is only supported in mode cluster")
+        if isinstance(check, TaskDone) and not any(entry.task for entry in experiment.vehicles):
+            raise InvalidObject(f"{where}.check", "task: no vehicle has a task")
+        if isinstance(check, Detections) and not any(entry.camera for entry in experiment.vehicles):
+            raise InvalidObject(f"{where}.check", "detections needs a vehicle with a camera (mode standalone)")
+        after = getattr(check, "after", None)
+        if after is not None:
+            _known(f"{where}.after", [after], kinds, "fault")
+
+
+def _known(field: str, given: Iterable[str], there: Iterable[str], what: str) -> None:
+    for name in given:
+        if name not in there:
+            known = ", ".join(sorted(there)) or "none"
+            raise InvalidObject(field, f"unknown {what} {name}; known: {known}")

@@ -1,0 +1,11 @@
+"""Runner of experiments: simulated vehicles with timed faults, checks and a report.
+
+Run an experiment file and require that all its checks hold:
+
+    outcome = run(load(Path("hello.yaml")), Path("out/hello"))
+    assert outcome.holds
+"""
+
+from fractus_sim.runner.experiment_runner import Outcome, Progress, run
+
+__all__ = ["Outcome", "Progress", "run"]

@@ -1,0 +1,155 @@
+"""Injection of faults into a running experiment."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+from fractus_sim.errors import ExperimentError
+from fractus_sim.experiment.timed_faults import Fault, LinkLoss, NodePowerOff
+from fractus_sim.testbeds.ground_station import Station
+from fractus_sim.testbeds.testbed import Testbed
+
+ANSWER_S = 1.0
+ATTEMPTS = 5
+
+
+@dataclass(frozen=True, slots=True)
+class Occurrence:
+    """A fault that was injected. Times are seconds of the experiment.
+
+    Attributes:
+        vehicle: Name of the vehicle. Empty for a node without a vehicle.
+        end_s: End of the fault. None while it lasts.
+    """
+
+    kind: str
+    title: str
+    vehicle: str
+    begin_s: float
+    end_s: float | None = None
+
+
+@dataclass(slots=True)
+class _Running:
+    fault: Fault
+    vehicle: str
+    steps: Iterator[None]
+    index: int | None = None
+    over: bool = False
+
+
+class Injector:
+    """Injects all faults of an experiment.
+
+    Args:
+        faults: Faults of the experiment file.
+        testbed: Provides links and power to cut, and observers that no fault disconnects.
+        tell: Called with a message when a fault begins or ends.
+    """
+
+    def __init__(self, faults: Sequence[Fault], testbed: Testbed, tell: Callable[[str], None]) -> None:
+        self.occurrences: list[Occurrence] = []
+        self.takeoffs_s: dict[str, float] = {}
+        self._testbed = testbed
+        self._observers = testbed.observers
+        self._tell = tell
+        self._now_s = 0.0
+        self._running = [self._prepare(fault, vehicle) for fault in faults for vehicle in self._victims(fault)]
+
+    def step(self, now_s: float) -> None:
+        """Advance all faults. Call this after each poll of the observers.
+
+        Raises:
+            ExperimentError: A vehicle rejected a parameter.
+        """
+        self._now_s = now_s
+        for name, observer in self._observers.items():
+            if observer.state.flying and name not in self.takeoffs_s:
+                self.takeoffs_s[name] = now_s
+        for running in self._running:
+            if not running.over:
+                running.over = next(running.steps, StopIteration) is StopIteration
+
+    @property
+    def pending(self) -> bool:
+        """True while a fault has begun and not ended."""
+        return any(not running.over and running.index is not None for running in self._running)
+
+    @property
+    def missed(self) -> list[tuple[str, str]]:
+        """Vehicle and title of the faults that have not begun."""
+        return [(running.vehicle, running.fault.title) for running in self._running if running.index is None]
+
+    def _victims(self, fault: Fault) -> Sequence[str]:
+        if isinstance(fault, NodePowerOff) and fault.node is not None:
+            return [""]
+        return fault.vehicles or tuple(self._observers)
+
+    def _prepare(self, fault: Fault, vehicle: str) -> _Running:
+        running = _Running(fault, vehicle, iter(()))
+        running.steps = self._happen(running)
+        return running
+
+    def _begin_s(self, running: _Running) -> float | None:
+        if running.fault.since == "start":
+            return running.fault.at
+        takeoffs = self.takeoffs_s
+        first = takeoffs.get(running.vehicle) if running.vehicle else min(takeoffs.values(), default=None)
+        return None if first is None else first + running.fault.at
+
+    def _happen(self, running: _Running) -> Generator[None, None, None]:
+        fault = running.fault
+        while (begin_s := self._begin_s(running)) is None or self._now_s < begin_s:
+            yield
+        running.index = len(self.occurrences)
+        self.occurrences.append(Occurrence(fault.fault, fault.title, running.vehicle, self._now_s))
+        self._tell(f"{running.vehicle or 'cluster'}: {fault.title}")
+        before: dict[str, float] = {}
+        if isinstance(fault, LinkLoss):
+            self._testbed.cut_link(running.vehicle)
+        elif isinstance(fault, NodePowerOff):
+            self._testbed.power_off(fault.node or running.vehicle)
+        for after_s, values in fault.steps():
+            while self._now_s < begin_s + after_s:
+                yield
+            for name, value in values.items():
+                if name not in before and fault.duration is not None:
+                    before[name] = yield from self._read(running.vehicle, name)
+                yield from self._set(running.vehicle, name, value)
+        if fault.duration is None:
+            return
+        while self._now_s < begin_s + fault.duration:
+            yield
+        if isinstance(fault, LinkLoss):
+            self._testbed.heal_link(running.vehicle)
+        elif isinstance(fault, NodePowerOff):
+            self._testbed.power_on(fault.node or running.vehicle)
+        for name, value in before.items():
+            yield from self._set(running.vehicle, name, value)
+        self.occurrences[running.index] = replace(self.occurrences[running.index], end_s=self._now_s)
+        self._tell(f"{running.vehicle or 'cluster'}: {fault.title} ended")
+
+    def _read(self, vehicle: str, name: str) -> Generator[None, None, float]:
+        observer = self._observers[vehicle]
+        for _ in range(ATTEMPTS):
+            observer.read_parameter(name)
+            if (yield from self._answered(observer, name)):
+                return observer.parameters[name]
+        raise ExperimentError(f"{vehicle}: the autopilot has no parameter {name}, which a fault needs")
+
+    def _set(self, vehicle: str, name: str, value: float) -> Generator[None, None, None]:
+        observer = self._observers[vehicle]
+        for _ in range(ATTEMPTS):
+            observer.set_parameter(name, value)
+            if (yield from self._answered(observer, name)):
+                return
+        raise ExperimentError(f"{vehicle}: the autopilot rejected {name} = {value:g}, which a fault needs")
+
+    def _answered(self, observer: Station, name: str) -> Generator[None, None, bool]:
+        deadline_s = self._now_s + ANSWER_S
+        while self._now_s < deadline_s:
+            yield
+            if name in observer.parameters:
+                return True
+        return False

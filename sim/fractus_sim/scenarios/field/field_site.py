@@ -1,0 +1,201 @@
+"""Site of the experiment: manifests moved to the position of the drone, named positions, and Grants."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import shapely
+from fractus_core.api import Application, Drone, Policy, Zone
+from fractus_core.api.grants import GrantSpec
+from fractus_core.documents import BadDocument, dump_documents, parse_documents
+from fractus_core.geo import LocalFrame, area_polygon
+
+from fractus_sim.errors import ExperimentError
+from fractus_sim.testbeds.standalone_testbed import grant_manifest, granted, read
+
+EXAMPLE = Path("examples/field")
+NAVIGATOR = "Navigator"
+VIEWER = "AerialViewer"
+DRONE = "drone-1"
+ZIGZAG = "ZIGZAG"
+# Extent of Grants without policies, metres from home. No run flies that far.
+EVERYWHERE_M = 1000.0
+# Positions requested by the violating program, metres east and north of home.
+ASKED_OUTSIDE = {"WP-E1": (62.0, 130.0), "WP-E2": (226.0, 60.0)}
+ABOVE_STRIPE = "WP-S"
+"""Hover position. Each run hovers longer than the picture interval, so one picture is requested above the stripe."""
+
+ALTITUDE_M = 10.0
+Place = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Field:
+    """The experiment at its site.
+
+    Attributes:
+        documents: Manifests as applied.
+        home: Latitude, longitude, and ground altitude above mean sea level.
+    """
+
+    documents: tuple[Mapping[str, Any], ...]
+    home: Place
+
+    @classmethod
+    def read(cls, folder: Path, home: Place | None = None) -> Field:
+        """Read the manifests, and move them so that the depot is at `home`.
+
+        Raises:
+            ExperimentError: A file cannot be read, or the manifests contain no depot.
+        """
+        documents: list[Any] = []
+        for path in sorted(folder.glob("*.yaml")):
+            try:
+                documents += parse_documents(path.read_bytes(), str(path)).values
+            except (OSError, BadDocument) as error:
+                raise ExperimentError(f"{path}: {error}") from None
+        depot = next((d["spec"]["location"] for d in documents if d["kind"] == "Depot"), None)
+        if depot is None:
+            raise ExperimentError(f"{folder} contains no Depot, which defines the home position; add one")
+        if home is None:
+            return cls(tuple(documents), (depot["lat"], depot["lon"], 25.0))
+        moved = _Shift((depot["lat"], depot["lon"]), home[:2])
+        return cls(tuple(moved.apply(d) for d in documents), home)
+
+    def write(self, folder: Path) -> Path:
+        """Write the moved manifests. Return the path of the file."""
+        folder.mkdir(parents=True, exist_ok=True)
+        path = folder / "manifests.yaml"
+        path.write_text(dump_documents(self.documents))
+        return path
+
+    def objects(self, kind: str) -> list[Mapping[str, Any]]:
+        """Return the manifests of a kind."""
+        return [d for d in self.documents if d["kind"] == kind]
+
+    @cached_property
+    def application(self) -> Application:
+        """Return the application."""
+        return Application.from_body(self.objects("Application")[0])
+
+    @cached_property
+    def drone(self) -> Drone:
+        """Return the drone."""
+        return Drone.from_body(self.objects("Drone")[0])
+
+    @cached_property
+    def policies(self) -> tuple[Policy, ...]:
+        """Return the policies."""
+        return tuple(Policy.from_body(d) for d in self.objects("Policy"))
+
+    @cached_property
+    def frame(self) -> LocalFrame:
+        """Return the local frame in metres east and north of home."""
+        return LocalFrame(self.home[0], self.home[1])
+
+    def zone(self, name: str) -> Any:
+        """Return the shape of a zone in metres."""
+        body = next(d for d in self.objects("Zone") if d["metadata"]["name"] == name)
+        return area_polygon(self.frame, Zone.from_body(body).spec.area)
+
+    @cached_property
+    def environment(self) -> dict[str, str]:
+        """Return the environment of the Navigator's container."""
+        component = next(c for c in self.objects("Application")[0]["spec"]["components"] if c["name"] == NAVIGATOR)
+        return {variable["name"]: variable["value"] for variable in component["container"]["env"]}
+
+    @cached_property
+    def places(self) -> dict[str, Place]:
+        """Return CTRL1, WP1 to WP9, CTRL2, WP-E1, WP-E2 and WP-S in degrees and metres above home."""
+        component = next(c for c in self.application.spec.components if c.name == NAVIGATOR)
+        found: dict[str, Place] = {}
+        waypoints: list[Place] = []
+        for number, point in enumerate(component.control_points, start=1):
+            start = point.point.position if point.point is not None else None
+            if start is not None:
+                found[f"CTRL{number}"] = (start.lat, start.lon, start.alt or ALTITUDE_M)
+            waypoints += [(p.lat, p.lon, p.alt or ALTITUDE_M) for p in point.path or ()]
+        for part in self.environment[ZIGZAG].split(";"):
+            lat, lon, alt = (float(value) for value in part.split(","))
+            waypoints.append((lat, lon, alt))
+        found |= {f"WP{number}": place for number, place in enumerate(waypoints, start=1)}
+        for name, (east, north) in ASKED_OUTSIDE.items():
+            lat, lon = self.frame.latlon(east, north)
+            found[name] = (lat, lon, ALTITUDE_M)
+        found[ABOVE_STRIPE] = self._above_stripe(found)
+        return found
+
+    def _above_stripe(self, places: Mapping[str, Place]) -> Place:
+        """Return the position between WP6 and WP7 that is deepest inside the stripe where pictures are forbidden."""
+        way = shapely.LineString([self.frame.xy(*places[name][:2]) for name in ("WP6", "WP7")])
+        middle = way.intersection(self.zone("no-photo")).centroid
+        return (*self.frame.latlon(middle.x, middle.y), ALTITUDE_M)
+
+    def grants(self, manifests: Path, *, policies: bool) -> list[dict[str, Any]]:
+        """Return the Grants that the operator would create. Without policies, they allow everything everywhere.
+
+        Raises:
+            ExperimentError: The application cannot be planned.
+        """
+        return [grant_manifest(spec if policies else self._unbound(spec)) for spec in granted(read([manifests]))]
+
+    def operation_area(self, grants: Sequence[Mapping[str, Any]]) -> list[Any]:
+        """Return the shapes of the operation area in the Grants, in metres."""
+        spec = GrantSpec.model_validate(grants[0]["spec"])
+        return [area_polygon(self.frame, area) for area in spec.operation_area]
+
+    def _unbound(self, spec: GrantSpec) -> GrantSpec:
+        body = spec.to_dict()
+        everywhere = [{"circle": {"center": {"lat": self.home[0], "lon": self.home[1]}, "radius": EVERYWHERE_M}}]
+        body |= {"policies": [], "operationArea": everywhere, "corridor": everywhere}
+        return GrantSpec.model_validate(body)
+
+
+@dataclass(frozen=True, slots=True)
+class _Shift:
+    """Moves positions from one home to another. Distances and bearings are preserved."""
+
+    old: tuple[float, float]
+    new: tuple[float, float]
+
+    def apply(self, value: Any) -> Any:
+        """Move all positions in a manifest: mappings with lat and lon, and texts `lat,lon,alt`."""
+        if isinstance(value, Mapping):
+            moved = {key: self.apply(part) for key, part in value.items()}
+            if "lat" in moved and "lon" in moved:
+                moved["lat"], moved["lon"] = self.point(value["lat"], value["lon"])
+            return moved
+        if isinstance(value, list):
+            return [self.apply(part) for part in value]
+        if isinstance(value, str):
+            return _PLACES.sub(self._in_text, value)
+        return value
+
+    def point(self, lat: float, lon: float) -> tuple[float, float]:
+        """Move one point."""
+        stretch = math.cos(math.radians(self.old[0])) / math.cos(math.radians(self.new[0]))
+        return round(self.new[0] + lat - self.old[0], 7), round(self.new[1] + (lon - self.old[1]) * stretch, 7)
+
+    def _in_text(self, found: re.Match[str]) -> str:
+        lat, lon = self.point(float(found[1]), float(found[2]))
+        return f"{lat:.7f},{lon:.7f},{found[3]}"
+
+
+_PLACES = re.compile(r"(-?\d+\.\d+),\s*(-?\d+\.\d+),\s*(-?\d+(?:\.\d+)?)")
+
+
+def as_text(place: Place) -> str:
+    """Format a position as `lat,lon,alt`."""
+    return f"{place[0]:.7f},{place[1]:.7f},{place[2]:g}"
+
+
+def dump(value: Any) -> str:
+    """Format JSON with indentation."""
+    return json.dumps(value, indent=2) + "\n"

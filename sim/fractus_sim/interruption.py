@@ -12,7 +12,7 @@ from typing import NoReturn
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
-def break_off_on_signals() -> None:
+def interrupt_on_signals() -> None:
     """Raise KeyboardInterrupt on SIGTERM, and on SIGHUP unless it is ignored (nohup)."""
     signal.signal(signal.SIGTERM, _interrupt)
     if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
@@ -21,7 +21,7 @@ def break_off_on_signals() -> None:
 
 @contextmanager
 def uninterrupted() -> Iterator[None]:
-    """Defer these signals until the end of the block. Then handle the last signal.
+    """Defer SIGINT, SIGTERM and SIGHUP until the end of the block. Then handle the last one that was received.
 
     Use this for actions that are short or have a timeout. It has no effect outside of the main thread, because only the
     main thread handles signals.
@@ -29,20 +29,20 @@ def uninterrupted() -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    came: list[signal.Signals] = []
+    deferred: list[signal.Signals] = []
     # A signal mask would be inherited by the processes that the block starts, so handlers are used.
-    before = {number: signal.getsignal(number) for number in _SIGNALS}
-    for number, handler in before.items():
+    handlers = {number: signal.getsignal(number) for number in _SIGNALS}
+    for number, handler in handlers.items():
         if handler not in (signal.SIG_IGN, None):
-            signal.signal(number, lambda number, _frame: came.append(signal.Signals(number)))
+            signal.signal(number, lambda number, _frame: deferred.append(signal.Signals(number)))
     try:
         yield
     finally:
-        for number, handler in before.items():
+        for number, handler in handlers.items():
             if handler is not None:
                 signal.signal(number, handler)
-        if came:
-            signal.raise_signal(came[-1])
+        if deferred:
+            signal.raise_signal(deferred[-1])
 
 
 def _interrupt(_number: int, _frame: FrameType | None) -> NoReturn:

@@ -1,4 +1,4 @@
-"""The tap in an experiment's link, where its server comes and goes."""
+"""The link tap of experiments with a server that is temporarily unavailable."""
 
 from __future__ import annotations
 

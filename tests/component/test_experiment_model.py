@@ -1,4 +1,4 @@
-"""An experiment's file: what it may say, and the sentence for what it may not."""
+"""Experiment files: valid content, and the error messages for invalid content."""
 
 from __future__ import annotations
 
@@ -27,23 +27,23 @@ def test_experiment_runs_in_lockstep_unless_it_has_programs() -> None:
 
 def test_vehicle_row_is_expanded_with_spacing_and_consecutive_ids() -> None:
     row = {"name": "d", "count": 3, "spacing": 20, "bearing": 0, "home": HOME}
-    found = parse(content(vehicles=[row, {"name": "last", "home": HOME}])).setups()
-    assert [(s.name, s.system_id) for s in found] == [("d-1", 1), ("d-2", 2), ("d-3", 3), ("last", 4)]
-    assert found[2].home is not None
-    assert found[2].home.lat == pytest.approx(50.0 + 40 / 111_319.5, abs=2e-6)
-    assert found[2].home.lon == 4.0
+    setups = parse(content(vehicles=[row, {"name": "last", "home": HOME}])).setups()
+    assert [(s.name, s.system_id) for s in setups] == [("d-1", 1), ("d-2", 2), ("d-3", 3), ("last", 4)]
+    assert setups[2].home is not None
+    assert setups[2].home.lat == pytest.approx(50.0 + 40 / 111_319.5, abs=2e-6)
+    assert setups[2].home.lon == 4.0
 
 
 def test_experiment_is_unchanged_after_a_json_round_trip() -> None:
-    once = load(EXAMPLES / "hello.yaml")
-    assert parse(json.loads(json.dumps(once.to_dict()))) == once
+    experiment = load(EXAMPLES / "hello.yaml")
+    assert parse(json.loads(json.dumps(experiment.to_dict()))) == experiment
 
 
 @pytest.mark.parametrize("name", [path.name for path in sorted(EXAMPLES.glob("*.yaml"))])
 def test_example_experiments_are_valid(name: str) -> None:
-    found = load(EXAMPLES / name)
-    assert found.checks
-    assert found.faults
+    experiment = load(EXAMPLES / name)
+    assert experiment.checks
+    assert experiment.faults
 
 
 def test_experiment_schema_contains_every_fault_and_check() -> None:
@@ -53,35 +53,41 @@ def test_experiment_schema_contains_every_fault_and_check() -> None:
 
 
 GUST = {"fault": "windGust", "speed": 8, "at": 3}
-BAD: dict[str, tuple[dict[str, Any], str]] = {
+INVALID: dict[str, tuple[dict[str, Any], str]] = {
     "no vehicle": ({"vehicles": []}, "vehicles"),
     "unknown field": ({"drones": 3}, "drones"),
     "no home": ({"vehicles": [{"name": "d"}]}, "vehicles[0].home"),
-    "twice": ({"vehicles": [{"name": "d", "home": HOME}] * 2}, "the name d is used twice"),
-    "no such fault": (
+    "duplicate name": ({"vehicles": [{"name": "d", "home": HOME}] * 2}, "the name d is used twice"),
+    "unknown fault": (
         {"faults": [{"fault": "gpsLos", "at": 1}]},
         "faults[0].fault: unknown value gpsLos; did you mean gpsLoss?",
     ),
-    "no such check": (
+    "unknown check": (
         {"checks": [{"check": "x"}]},
         "checks[0].check: unknown value x; possible values: landed, neverFlew",
     ),
-    "no fault named": ({"faults": [{"at": 1}]}, "faults[0].fault: is missing"),
+    "missing fault type": ({"faults": [{"at": 1}]}, "faults[0].fault: is missing"),
     "fault without time": ({"faults": [{"fault": "gpsLoss"}]}, "at"),
-    "fault for no one": ({"faults": [{**GUST, "vehicles": ["e"]}]}, "faults[0].vehicles: unknown vehicle e"),
-    "link of another mode": ({"faults": [{"fault": "linkLoss", "at": 1, "link": "uplink"}]}, "use groundStation"),
-    "no node to power off": ({"faults": [{"fault": "nodePowerOff", "at": 1}]}, "mode standalone or cluster"),
-    "half a place": (
-        {"vehicles": [{"name": "d", "home": HOME, "task": [{"do": "goto", "north": 3, "alt": 3}]}]},
-        "give lat and lon, or north and east",
+    "fault for an unknown vehicle": (
+        {"faults": [{**GUST, "vehicles": ["e"]}]},
+        "faults[0].vehicles: unknown vehicle e",
     ),
-    "no such zone": ({"checks": [{"check": "outsideZone", "zone": "z"}]}, "unknown zone z; known: none"),
-    "bad expression": ({"checks": [{"check": "statustext", "matches": "("}]}, "not a valid regular expression"),
-    "fault never planned": (
+    "link of another mode": ({"faults": [{"fault": "linkLoss", "at": 1, "link": "uplink"}]}, "use groundStation"),
+    "power fault without nodes": ({"faults": [{"fault": "nodePowerOff", "at": 1}]}, "mode standalone or cluster"),
+    "incomplete position": (
+        {"vehicles": [{"name": "d", "home": HOME, "task": [{"do": "goto", "north": 3, "alt": 3}]}]},
+        "requires lat and lon, or north and east",
+    ),
+    "unknown zone": ({"checks": [{"check": "outsideZone", "zone": "z"}]}, "unknown zone z; known: none"),
+    "invalid regular expression": (
+        {"checks": [{"check": "statustext", "matches": "("}]},
+        "not a valid regular expression",
+    ),
+    "check after an undefined fault": (
         {"checks": [{"check": "mode", "mode": "RTL", "after": "gpsLoss"}]},
         "unknown fault gpsLoss",
     ),
-    "calls of vehicles alone": (
+    "call check without services": (
         {"checks": [{"check": "call", "action": "deny"}]},
         "only supported in modes standalone and cluster",
     ),
@@ -102,13 +108,13 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
 }
 
 
-@pytest.mark.parametrize("case", BAD)
+@pytest.mark.parametrize("case", INVALID)
 def test_invalid_experiment_is_rejected_with_the_field_name(case: str) -> None:
-    changes, words = BAD[case]
-    with pytest.raises(InvalidObject) as refusal:
+    changes, message = INVALID[case]
+    with pytest.raises(InvalidObject) as error:
         parse(content(**changes))
-    assert words in str(refusal.value)
-    assert "\n" not in str(refusal.value)
+    assert message in str(error.value)
+    assert "\n" not in str(error.value)
 
 
 def test_missing_experiment_file_is_rejected_with_its_name(tmp_path: Path) -> None:

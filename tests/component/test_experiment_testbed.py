@@ -1,4 +1,4 @@
-"""An experiment's testbed and runner end what they have started, whatever goes wrong."""
+"""The testbed and the runner of an experiment close everything that they have started after any error."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
-from fractus_sim import experiment_command
+from fractus_sim import command_line, experiment_command
 from fractus_sim.experiment.definition import Experiment, parse
 from fractus_sim.interruption import uninterrupted
 from fractus_sim.report.report_files import write_page
@@ -22,8 +22,8 @@ from fractus_sim.testbeds import process_guard
 from fractus_sim.testbeds.testbed import Findings, Moment, Testbed
 
 
-class Thing:
-    """Something that a testbed has started."""
+class Resource:
+    """A resource that records its closing, and can fail to close."""
 
     def __init__(self, error: BaseException | None = None) -> None:
         self.closed = False
@@ -35,11 +35,11 @@ class Thing:
             raise self._error
 
 
-class Empty(Testbed):
-    """A testbed on which nothing stands."""
+class EmptyTestbed(Testbed):
+    """A testbed without vehicles."""
 
     def set_up(self) -> None:
-        """Nothing to set up."""
+        """Start nothing."""
 
     def tick(self) -> Moment:
         raise AssertionError("never reached")
@@ -47,12 +47,12 @@ class Empty(Testbed):
     begin = collect = set_up
 
     def cut_link(self, vehicle: str) -> None:
-        """No links."""
+        """Ignore the call."""
 
     heal_link = power_off = power_on = cut_link
 
 
-def full() -> OSError:
+def disk_full() -> OSError:
     return OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
@@ -63,14 +63,14 @@ def experiment() -> Experiment:
 
 
 @pytest.fixture
-def testbed(experiment: Experiment, tmp_path: Path) -> Empty:
-    return Empty(experiment, tmp_path, tmp_path, print)
+def testbed(experiment: Experiment, tmp_path: Path) -> EmptyTestbed:
+    return EmptyTestbed(experiment, tmp_path, tmp_path, print)
 
 
-@pytest.mark.parametrize("error", [full(), KeyboardInterrupt()], ids=["disk full", "Ctrl-C"])
-def test_testbed_closes_remaining_resources_after_a_close_error(testbed: Empty, error: BaseException) -> None:
-    first = testbed.keep(Thing())
-    last = Thing(error)
+@pytest.mark.parametrize("error", [disk_full(), KeyboardInterrupt()], ids=["disk full", "Ctrl-C"])
+def test_testbed_closes_remaining_resources_after_a_close_error(testbed: EmptyTestbed, error: BaseException) -> None:
+    first = testbed.keep(Resource())
+    last = Resource(error)
     order = list[str]()
     testbed.at_end(lambda: order.append("done"))
     testbed.keep(last)
@@ -80,37 +80,37 @@ def test_testbed_closes_remaining_resources_after_a_close_error(testbed: Empty, 
 
 
 def test_testbed_is_closed_and_old_report_removed_if_the_disk_is_full_at_start(
-    experiment: Experiment, testbed: Empty, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    experiment: Experiment, testbed: EmptyTestbed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    thing = testbed.keep(Thing())
+    resource = testbed.keep(Resource())
 
-    def no_log(_path: Path) -> None:
-        raise full()
+    def fail_to_open(_path: Path) -> None:
+        raise disk_full()
 
-    monkeypatch.setattr(experiment_runner, "_testbed", lambda *_: testbed)
-    monkeypatch.setattr(experiment_runner, "McapLog", no_log)
+    monkeypatch.setattr(experiment_runner, "_create_testbed", lambda *_: testbed)
+    monkeypatch.setattr(experiment_runner, "McapLog", fail_to_open)
     (tmp_path / "summary.md").write_text("All checks hold.")
     with pytest.raises(OSError, match="No space left"):
         experiment_runner.run(experiment, tmp_path)
-    assert thing.closed
+    assert resource.closed
     assert not (tmp_path / "summary.md").exists()
 
 
 def test_testbed_is_closed_if_the_disk_is_full_at_the_end(
-    experiment: Experiment, testbed: Empty, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    experiment: Experiment, testbed: EmptyTestbed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    thing = testbed.keep(Thing())
-    monkeypatch.setattr(experiment_runner, "_testbed", lambda *_: testbed)
+    resource = testbed.keep(Resource())
+    monkeypatch.setattr(experiment_runner, "_create_testbed", lambda *_: testbed)
     monkeypatch.setattr(experiment_runner, "_run_session", lambda _: "")
-    monkeypatch.setattr(experiment_runner, "McapLog", lambda _: Thing(full()))
+    monkeypatch.setattr(experiment_runner, "McapLog", lambda _: Resource(disk_full()))
     with pytest.raises(OSError, match="No space left"):
         experiment_runner.run(experiment, tmp_path)
-    assert thing.closed
+    assert resource.closed
 
 
 @pytest.fixture
 def interruptible() -> Iterator[None]:
-    """Hears SIGINT, which a shell's background jobs are told to ignore."""
+    """Install the default handler of SIGINT, which the background jobs of a shell ignore."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
@@ -136,14 +136,14 @@ def test_guard_kills_the_groups_that_were_not_released(monkeypatch: pytest.Monke
 
 
 def test_summary_page_is_absent_after_an_incomplete_write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def half(path: Path, text: str) -> None:
+    def write_half(path: Path, text: str) -> None:
         path.write_bytes(text[:3].encode())
-        raise full()
+        raise disk_full()
 
     write_page(tmp_path, "# Whole")
     assert [path.name for path in tmp_path.iterdir()] == ["summary.md"]
     (tmp_path / "summary.md").unlink()
-    monkeypatch.setattr(Path, "write_text", half)
+    monkeypatch.setattr(Path, "write_text", write_half)
     with pytest.raises(OSError, match="No space left"):
         write_page(tmp_path, "# Flight")
     assert not list(tmp_path.iterdir())
@@ -152,13 +152,13 @@ def test_summary_page_is_absent_after_an_incomplete_write(tmp_path: Path, monkey
 def test_report_is_written_before_figures_and_the_page_after_them(
     experiment: Experiment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def undrawn(_scene: object) -> None:
-        raise full()
+    def fail_to_draw(_content: object) -> None:
+        raise disk_full()
 
     samples = [Sample(float(t), Place(50.0, 4.0, float(t)), 5.0, "GUIDED", t > 0, 0.8) for t in range(3)]
     flights = {"d": Flight("d", samples)}
     outcome = experiment_runner.Outcome(experiment, tmp_path, flights, (), (), Findings(), (), (), 2.0, 2.0)
-    monkeypatch.setattr(experiment_report, "draw_map", undrawn)
+    monkeypatch.setattr(experiment_report, "draw_map", fail_to_draw)
     with pytest.raises(OSError, match="No space left"):
         experiment_report.write_outcome(outcome)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["report.json", "tracks.geojson"]
@@ -167,8 +167,8 @@ def test_report_is_written_before_figures_and_the_page_after_them(
 @pytest.mark.parametrize(
     ("error", "expected"),
     [
-        (OSError(errno.ENOSPC, "No space left on device", "out/x/map.png"), "cannot write to out: out/x/map.png: No"),
-        (full(), "aborted: No space left on device"),
+        (OSError(errno.ENOSPC, "No space left on device", "out/x/map.png"), "cannot read or write out/x/map.png: No"),
+        (disk_full(), "aborted: No space left on device"),
         (TimeoutError("no answer"), "aborted: no answer"),
         (ConnectionResetError(), "aborted: ConnectionResetError"),
     ],
@@ -176,12 +176,12 @@ def test_report_is_written_before_figures_and_the_page_after_them(
 def test_experiment_command_reports_a_write_error_only_if_the_error_names_a_file(
     experiment: Experiment, error: OSError, expected: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def broken(*_: object, **_more: object) -> None:
+    def fail(*_: object, **_more: object) -> None:
         raise error
 
-    monkeypatch.setattr(experiment_command, "break_off_on_signals", lambda: None)
+    monkeypatch.setattr(command_line, "interrupt_on_signals", lambda: None)
     monkeypatch.setattr(experiment_command, "load", lambda _file: experiment)
-    monkeypatch.setattr(experiment_command, "run", broken)
+    monkeypatch.setattr(experiment_command, "run", fail)
     result = CliRunner().invoke(experiment_command.experiment, ["run", "x.yaml", "--out", "out"])
     assert result.exit_code == 1
     assert expected in result.output

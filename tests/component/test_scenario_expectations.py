@@ -1,4 +1,4 @@
-"""The field experiment's ground, how its logs are read, and that its expectations fail when they should."""
+"""The field experiment: its site, the evidence read from logs, and expectations that hold or fail."""
 
 from __future__ import annotations
 
@@ -13,57 +13,59 @@ import pytest
 from fractus_core.api.geometry import Point
 from fractus_core.geo import geodesic_m
 from fractus_sim.errors import ExperimentError
+from fractus_sim.report.flight_record import JudgedCall
+from fractus_sim.report.report_files import Expectation
 from fractus_sim.report.track import Place, Sample, Track
-from fractus_sim.scenarios.field.field_evidence import Call, Evidence, read_evidence
-from fractus_sim.scenarios.field.field_expectations import Check, Judge
+from fractus_sim.scenarios.field.field_evidence import Evidence, read_evidence
+from fractus_sim.scenarios.field.field_expectations import RunEvaluation
 from fractus_sim.scenarios.field.field_flight import parse_link
-from fractus_sim.scenarios.field.field_report import draw_altitudes, draw_ground, figures, summary
-from fractus_sim.scenarios.field.field_site import Field, as_text
+from fractus_sim.scenarios.field.field_report import field_results, write_field_report
+from fractus_sim.scenarios.field.field_site import FieldSite, format_position
 from vehicle_world import alone
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "field"
 CANBERRA = (-35.3632621, 149.1652374, 584.0)
-FIELD = Field.read(EXAMPLE)
+SITE = FieldSite.read(EXAMPLE)
 
 
-def test_the_ground_moves_with_home_and_keeps_its_shape():
-    moved = Field.read(EXAMPLE, CANBERRA)
+def test_site_keeps_its_shape_at_another_home():
+    moved = FieldSite.read(EXAMPLE, CANBERRA)
     assert moved.home == CANBERRA
-    for name, (lat, lon, alt) in FIELD.places.items():
-        there = moved.places[name]
-        assert there[2] == alt
-        here_m = geodesic_m(Point(lat=FIELD.home[0], lon=FIELD.home[1]), Point(lat=lat, lon=lon))
-        there_m = geodesic_m(Point(lat=CANBERRA[0], lon=CANBERRA[1]), Point(lat=there[0], lon=there[1]))
-        assert there_m == pytest.approx(here_m, rel=0.01), name
-    assert moved.zone("no-fly").area == pytest.approx(FIELD.zone("no-fly").area, rel=0.01)
-    assert "39.37" not in json.dumps(moved.documents), "nothing stays behind"
+    for name, (lat, lon, alt) in SITE.places.items():
+        new_lat, new_lon, new_alt = moved.places[name]
+        assert new_alt == alt
+        distance_m = geodesic_m(Point(lat=SITE.home[0], lon=SITE.home[1]), Point(lat=lat, lon=lon))
+        new_distance_m = geodesic_m(Point(lat=CANBERRA[0], lon=CANBERRA[1]), Point(lat=new_lat, lon=new_lon))
+        assert new_distance_m == pytest.approx(distance_m, rel=0.01), name
+    assert moved.zone("no-fly").area == pytest.approx(SITE.zone("no-fly").area, rel=0.01)
+    assert "39.37" not in json.dumps(moved.documents), "a position was not moved"
 
 
-def test_grants_hold_the_policies_or_none(tmp_path: Path):
-    manifests = FIELD.write(tmp_path)
-    bound = FIELD.grants(manifests, policies=True)
-    free = FIELD.grants(manifests, policies=False)
-    assert {g["spec"]["component"] for g in bound} == {"Navigator", "AerialViewer"}
-    for grant in bound:
+def test_grants_contain_all_policies_or_no_policy(tmp_path: Path):
+    manifests = SITE.write(tmp_path)
+    restricted = SITE.grants(manifests, policies=True)
+    unrestricted = SITE.grants(manifests, policies=False)
+    assert {g["spec"]["component"] for g in restricted} == {"Navigator", "AerialViewer"}
+    for grant in restricted:
         assert [p["name"] for p in grant["spec"]["policies"]] == [
             "keep-away",
             "low-flight",
             "no-pictures-of-the-stripe",
         ]
-    for grant in free:
+    for grant in unrestricted:
         assert not grant["spec"].get("policies")
         assert grant["spec"]["operationArea"][0]["circle"]["radius"] == 1000.0
-    assert len(FIELD.operation_area(bound)) == 2
+    assert len(SITE.operation_area(restricted)) == 2
 
 
 @pytest.mark.parametrize("text", ["udp:1.2.3.4:14550", "tcp:host", "tcp::5760", "tcp:host:99999", "5760"])
-def test_autopilots_are_named_as_tcp_host_port(text: str):
+def test_autopilot_link_must_be_tcp_host_port(text: str):
     with pytest.raises(ExperimentError, match="expected tcp:HOST:PORT"):
         parse_link(text)
     assert parse_link("tcp:127.0.0.1:5760") == ("127.0.0.1", 5760)
 
 
-def test_logs_are_read_on_the_clock_of_the_autopilot(tmp_path: Path):
+def test_evidence_is_read_on_the_clock_of_the_autopilot(tmp_path: Path):
     vehicle, pilot = alone()
     path = tmp_path / "drone.tlog"
     with path.open("wb") as file:
@@ -81,21 +83,22 @@ def test_logs_are_read_on_the_clock_of_the_autopilot(tmp_path: Path):
     }  # fmt: skip
     audit = tmp_path / "mobility.jsonl"
     audit.write_text(json.dumps(entry) + "\n" + json.dumps({"kind": "state"}) + '\n{"kind": "ca')
-    read = read_evidence("normal", "normal", policies=True, tlog=path, audits=(audit,))
-    (call,) = read.calls
+    evidence = read_evidence("normal", "normal", policies=True, tlog=path, audits=(audit,))
+    (call,) = evidence.calls
     assert call.time_s == pytest.approx(12.5, abs=0.05)
-    assert (call.who, call.method) == ("Navigator", "Goto")
-    assert call.asked == Place(48.2, 16.37, 20.0) and call.flown == Place(48.2, 16.37, 15.0)
-    assert read.track.max_altitude_m == pytest.approx(8.0, abs=0.5)
-    assert read.track.takeoff_s is not None
-    assert any("Arming motors" in text for text in read.texts)
+    assert (call.caller, call.method) == ("Navigator", "Goto")
+    assert call.requested == Place(48.2, 16.37, 20.0)
+    assert call.flown == Place(48.2, 16.37, 15.0)
+    assert evidence.track.max_altitude_m == pytest.approx(8.0, abs=0.5)
+    assert evidence.track.takeoff_s is not None
+    assert any("Arming motors" in text for text in evidence.texts)
 
 
-# -- expectations on made-up flights ---------------------------------------------------------------------------
+# -- Expectations on synthetic flights -------------------------------------------------------------------------
 
 
 def _samples(stops: list[tuple[float, float, float, str]]) -> tuple[Sample, ...]:
-    """A flight at 5 m/s through (east, north, altitude, mode), from the ground and back to it."""
+    """Return a flight at 5 m/s from home through (east, north, altitude, mode) positions, and back."""
     samples = []
     time_s = 0.0
     at = (0.0, 0.0, 0.0)
@@ -104,7 +107,7 @@ def _samples(stops: list[tuple[float, float, float, str]]) -> tuple[Sample, ...]
         for step in range(1, steps + 1):
             now = tuple(a + (b - a) * step / steps for a, b in zip(at, (east, north, alt), strict=True))
             time_s += 0.2
-            lat, lon = FIELD.frame.latlon(now[0], now[1])
+            lat, lon = SITE.frame.latlon(now[0], now[1])
             samples.append(Sample(time_s, Place(lat, lon, now[2]), 5.0, mode, now[2] > 0.3, 0.9))
         at = (east, north, alt)
     ground = replace(samples[-1], time_s=time_s + 1.0, in_air=False)
@@ -112,44 +115,46 @@ def _samples(stops: list[tuple[float, float, float, str]]) -> tuple[Sample, ...]
 
 
 def _at(name: str, alt: float | None = None) -> tuple[float, float, float, str]:
-    lat, lon, usual = FIELD.places[name]
-    return (*FIELD.frame.xy(lat, lon), usual if alt is None else alt, "GUIDED")
+    lat, lon, usual = SITE.places[name]
+    return (*SITE.frame.xy(lat, lon), usual if alt is None else alt, "GUIDED")
 
 
 def _when(samples: tuple[Sample, ...], name: str) -> float:
-    lat, lon, _ = FIELD.places[name]
+    lat, lon, _ = SITE.places[name]
     return min(samples, key=lambda s: (s.place.lat - lat) ** 2 + (s.place.lon - lon) ** 2).time_s
 
 
 def _goto(
-    time_s: float, name: str, action: str, asked: float = 10.0, flown: float | None = None, why: str = ""
-) -> Call:
-    lat, lon, _ = FIELD.places[name]
-    result = Place(lat, lon, asked if flown is None else flown) if action != "deny" else None
-    return Call(time_s, "Navigator", "Goto", action, why, why, (why,), Place(lat, lon, asked), result, None)
+    time_s: float, name: str, action: str, requested: float = 10.0, flown: float | None = None, policy: str = ""
+) -> JudgedCall:
+    lat, lon, _ = SITE.places[name]
+    result = Place(lat, lon, requested if flown is None else flown) if action != "deny" else None
+    return JudgedCall(
+        time_s, "Navigator", "Goto", action, policy, policy, (policy,), Place(lat, lon, requested), result, None
+    )
 
 
-def _picture(samples: tuple[Sample, ...], time_s: float, action: str) -> Call:
+def _picture(samples: tuple[Sample, ...], time_s: float, action: str) -> JudgedCall:
     at = min(samples, key=lambda s: abs(s.time_s - time_s)).place
     policies = ("no-pictures-of-the-stripe",) if action == "deny" else ()
-    return Call(time_s, "AerialViewer", "CaptureImage", action, "Privacy", "", policies, None, None, at)
+    return JudgedCall(time_s, "AerialViewer", "CaptureImage", action, "Privacy", "", policies, None, None, at)
 
 
-def _system(time_s: float, what: str, code: str = "") -> Call:
-    return Call(time_s, "system", what, "", code, "because", (), None, None, None)
+def _system(time_s: float, action: str, code: str = "") -> JudgedCall:
+    return JudgedCall(time_s, "system", action, "", code, "because", (), None, None, None)
 
 
-def _pictures(samples: tuple[Sample, ...]) -> list[Call]:
-    """One at each of five waypoints, and one refused over the stripe."""
-    found = [_picture(samples, _when(samples, name), "allow") for name in ("WP1", "WP2", "WP3", "WP4", "WP5")]
-    stripe = FIELD.zone("no-photo")
-    frame = FIELD.frame
+def _pictures(samples: tuple[Sample, ...]) -> list[JudgedCall]:
+    """Return a picture at each of five waypoints, and a refused picture above the stripe."""
+    taken = [_picture(samples, _when(samples, name), "allow") for name in ("WP1", "WP2", "WP3", "WP4", "WP5")]
+    stripe = SITE.zone("no-photo")
+    frame = SITE.frame
     middle = stripe.centroid
-    over = min(samples, key=lambda s: math.dist(frame.xy(s.place.lat, s.place.lon), (middle.x, middle.y)))
-    return [*found, _picture(samples, over.time_s, "deny")]
+    above = min(samples, key=lambda s: math.dist(frame.xy(s.place.lat, s.place.lon), (middle.x, middle.y)))
+    return [*taken, _picture(samples, above.time_s, "deny")]
 
 
-def _run(name: str, samples: tuple[Sample, ...], calls: list[Call], *, policies: bool = True) -> Evidence:
+def _run(name: str, samples: tuple[Sample, ...], calls: list[JudgedCall], *, policies: bool = True) -> Evidence:
     ordered = tuple(sorted(calls, key=lambda c: c.time_s))
     return Evidence(name, name, policies, Track(name, samples), ordered, ())
 
@@ -185,10 +190,10 @@ def _guarded() -> Evidence:
     calls = [
         _system(_when(samples, "CTRL1") + 0.1, "granted"),
         _goto(_when(samples, "CTRL1") + 0.2, "WP1", "correct", 20.0, 15.0, "low-flight"),
-        _goto(_when(samples, "WP2"), "WP-E1", "deny", why="operation-area"),
+        _goto(_when(samples, "WP2"), "WP-E1", "deny", policy="operation-area"),
         _goto(_when(samples, "WP2") + 0.2, "WP3", "correct", 20.0, 15.0, "low-flight"),
         _goto(_when(samples, "WP5"), "WP6", "correct", 4.0, 5.0, "low-flight"),
-        _goto(end, "WP-E2", "deny", why="keep-away"),
+        _goto(end, "WP-E2", "deny", policy="keep-away"),
         _system(end + 0.1, "revoke", "InsideExclusionZone"),
     ]
     return _run("guarded", samples, [*calls, *_pictures(samples)])
@@ -217,31 +222,39 @@ def _unguarded() -> Evidence:
     return _run("unguarded", samples, pictures, policies=False)
 
 
-def _failed(checks: list[Check]) -> list[str]:
-    return [check.text for check in checks if not check.holds]
+def _failed(expectations: list[Expectation]) -> list[str]:
+    return [expectation.text for expectation in expectations if not expectation.holds]
 
 
-def test_flights_as_they_should_be_fulfil_every_expectation():
-    assert _failed(Judge(FIELD, _normal()).normal()) == []
-    assert _failed(Judge(FIELD, _guarded()).guarded()) == []
-    assert _failed(Judge(FIELD, _unguarded()).unguarded()) == []
+def test_expectations_hold_for_correct_flights():
+    assert _failed(RunEvaluation(SITE, _normal()).normal()) == []
+    assert _failed(RunEvaluation(SITE, _guarded()).guarded()) == []
+    assert _failed(RunEvaluation(SITE, _unguarded()).unguarded()) == []
 
 
 def _later(run: Evidence, method: str, action: str) -> Evidence:
-    asked = _goto(run.calls[-1].time_s + 2.0, "WP8", action)
-    return replace(run, calls=(*run.calls, replace(asked, method=method)))
+    call = _goto(run.calls[-1].time_s + 2.0, "WP8", action)
+    return replace(run, calls=(*run.calls, replace(call, method=method)))
 
 
-def test_a_program_may_ask_for_control_again_and_may_not_fly():
-    assert _failed(Judge(FIELD, _later(_guarded(), "GetControl", "allow")).guarded()) == []
+def test_program_may_request_control_but_not_fly_after_a_takeover():
+    assert _failed(RunEvaluation(SITE, _later(_guarded(), "GetControl", "allow")).guarded()) == []
     for action in ("allow", "correct"):
-        failed = _failed(Judge(FIELD, _later(_guarded(), "Goto", action)).guarded())
-        assert failed == ["after that the program moves nothing"]
+        failed = _failed(RunEvaluation(SITE, _later(_guarded(), "Goto", action)).guarded())
+        assert failed == ["the program moves nothing after the takeover"]
 
 
 def test_flight_without_policies_fails_the_expectations_with_policies():
-    failed = _failed(Judge(FIELD, _unguarded()).guarded())
-    for part in ("WP1, requested", "WP6, requested", "above 15", "WP-E1 is", "WP-E2", "no-fly", "none of them above"):
+    failed = _failed(RunEvaluation(SITE, _unguarded()).guarded())
+    for part in (
+        "WP1, requested",
+        "WP6, requested",
+        "above 15",
+        "WP-E1 is",
+        "WP-E2",
+        "no-fly",
+        "no picture is taken above",
+    ):
         assert any(part in text for text in failed), part
 
 
@@ -250,16 +263,16 @@ def _without(run: Evidence, *methods: str) -> Evidence:
 
 
 def _changed(run: Evidence, place: str, **changes: object) -> Evidence:
-    lat, lon, _ = FIELD.places[place]
+    lat, lon, _ = SITE.places[place]
     calls = [
-        replace(c, **changes) if c.asked is not None and (c.asked.lat, c.asked.lon) == (lat, lon) else c  # type: ignore[arg-type]
+        replace(c, **changes) if c.requested is not None and (c.requested.lat, c.requested.lon) == (lat, lon) else c  # type: ignore[arg-type]
         for c in run.calls
     ]
     return replace(run, calls=tuple(calls))
 
 
 @pytest.mark.parametrize(
-    ("spoilt", "text"),
+    ("incorrect", "text"),
     [
         (_without(_guarded(), "revoke"), "revokes access"),
         (_without(_guarded(), "CaptureImage"), "pictures are taken"),
@@ -270,22 +283,23 @@ def _changed(run: Evidence, place: str, **changes: object) -> Evidence:
         (replace(_guarded(), track=Track("x", _guarded().track.samples[:-40])), "lands at home"),
     ],
 )
-def test_each_expectation_can_fail(spoilt: Evidence, text: str):
-    assert any(text in failed for failed in _failed(Judge(FIELD, spoilt).guarded()))
+def test_expectation_fails_for_an_incorrect_flight(incorrect: Evidence, text: str):
+    assert any(text in failed for failed in _failed(RunEvaluation(SITE, incorrect).guarded()))
 
 
-def test_the_page_and_the_pictures(tmp_path: Path):
+def test_field_report_is_written_with_page_results_and_figures(tmp_path: Path):
     runs = [_normal(), _guarded(), _unguarded()]
-    checks = Judge(FIELD, runs[1]).guarded()
-    page = summary(FIELD, runs, checks, "made-up vehicles")
-    assert f"All {len(checks)} expectations hold" in page
+    expectations = RunEvaluation(SITE, runs[1]).guarded()
+    write_field_report(SITE, runs, expectations, "synthetic vehicles", tmp_path)
+    page = (tmp_path / "summary.md").read_text()
+    assert f"All {len(expectations)} expectations hold" in page
     assert "| guarded | WP6 | 4 m | 5.0 m |" in page
-    assert figures(FIELD, runs, checks, "x")["runs"][1]["corrected"] == 3
-    area = FIELD.operation_area(FIELD.grants(FIELD.write(tmp_path), policies=True))
-    for figure in (draw_ground(FIELD, area, runs), draw_altitudes(runs)):
-        figure.savefig(tmp_path / "picture.png")
-        assert (tmp_path / "picture.png").stat().st_size > 20_000
+    results = json.loads((tmp_path / "report.json").read_text())
+    assert results == json.loads(json.dumps(field_results(SITE, runs, expectations, "synthetic vehicles")))
+    assert results["runs"][1]["corrected"] == 3
+    for name in ("map.png", "altitude.png"):
+        assert (tmp_path / name).stat().st_size > 20_000
 
 
-def test_places_as_text():
-    assert as_text((39.37, 22.93, 10.0)) == "39.3700000,22.9300000,10"
+def test_position_is_formatted_as_lat_lon_alt():
+    assert format_position((39.37, 22.93, 10.0)) == "39.3700000,22.9300000,10"

@@ -19,8 +19,8 @@ import yaml
 from fractus_cluster.binaries import ensure_binaries
 from fractus_cluster.cluster import Cluster
 from fractus_cluster.images.build import build_images
-from fractus_sim.chaos.chaos_run import flight
-from fractus_sim.demo.demo_clusters import EXAMPLE_NODES, assign
+from fractus_sim.chaos.chaos_run import short_mission
+from fractus_sim.demo.demo_clusters import EXAMPLE_NODES, assign_nodes
 from kubectl import Kube, Object, condition
 
 ROOT = pathlib.Path(__file__).parents[2]
@@ -46,7 +46,7 @@ def _nodes() -> Mapping[str, str]:
     if not _current():
         return {name: name for name in EXAMPLE_NODES}
     done = subprocess.run(["kubectl", "get", "nodes", "-o", "json"], capture_output=True, timeout=60, check=True)
-    return assign(json.loads(done.stdout)["items"], {})
+    return assign_nodes(json.loads(done.stdout)["items"], {})
 
 
 NODES = _nodes()
@@ -133,4 +133,4 @@ def example(name: str) -> list[Object]:
 
 def short_flight(name: str, namespace: str = "default") -> Object:
     """Return an Application with only the example's Navigator, on a path of about a minute near the depot."""
-    return flight(name, namespace)
+    return short_mission(name, namespace)

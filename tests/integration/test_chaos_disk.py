@@ -1,4 +1,4 @@
-"""A disk of a node's own, and what chaos makes of it."""
+"""The separate disk of a node, and the chaos fault that fills it."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from typing import cast
 import pytest
 from control_plane import wait_for
 from fractus_cluster.disk import mount_disk, unmount_below
-from fractus_sim.chaos.chaos_cluster import Stage
-from fractus_sim.chaos.chaos_faults import FAULTS, broken
+from fractus_sim.chaos.chaos_cluster import ChaosTarget
+from fractus_sim.chaos.chaos_faults import FAULTS, inject
 from fractus_sim.errors import ExperimentError
 
 pytestmark = [pytest.mark.slow, pytest.mark.root]
@@ -32,8 +32,8 @@ def disk(tmp_path: Path) -> Iterator[Path]:
         assert str(tmp_path) not in Path("/proc/self/mountinfo").read_text()
 
 
-def stage_on(state: Path) -> Stage:
-    return cast("Stage", SimpleNamespace(state=state, drone="drone-1"))
+def target_on(state: Path) -> ChaosTarget:
+    return cast("ChaosTarget", SimpleNamespace(state=state, drone="drone-1"))
 
 
 def append(path: Path, size: int) -> None:
@@ -41,8 +41,8 @@ def append(path: Path, size: int) -> None:
         file.write(bytes(size))
 
 
-def refuses(path: Path) -> bool:
-    """Whether a file may not grow by a block."""
+def is_full(path: Path) -> bool:
+    """Return True if a file cannot grow by a block."""
     try:
         append(path, 4096)
     except OSError as error:
@@ -51,20 +51,20 @@ def refuses(path: Path) -> bool:
     return False
 
 
-def test_a_full_disk_takes_nothing_until_it_is_healed(disk: Path) -> None:
+def test_disk_fault_leaves_no_space_until_it_ends(disk: Path) -> None:
     append(disk / "log", 100_000)
     append(disk / "old", 1_000_000)
-    with broken(FAULTS["disk-full"], stage_on(disk), Random(1)) as said:
-        assert "drone-1" in said
-        assert refuses(disk / "log")
-        # What is freed is taken, too.
+    with inject(FAULTS["disk-full"], target_on(disk), Random(1)) as description:
+        assert "drone-1" in description
+        assert is_full(disk / "log")
+        # Space that is freed during the fault is filled as well.
         (disk / "old").unlink()
-        wait_for(lambda: refuses(disk / "log") and os.statvfs(disk).f_bavail == 0, "the disk to be full again")
+        wait_for(lambda: is_full(disk / "log") and os.statvfs(disk).f_bavail == 0, "the disk to be full again")
     append(disk / "log", 1_000_000)
     assert [path.name for path in disk.iterdir() if path.is_file()] == ["log"]
 
 
-def test_a_disk_that_is_mounted_keeps_what_is_on_it(disk: Path, tmp_path: Path) -> None:
+def test_mounting_a_disk_again_keeps_its_content(disk: Path, tmp_path: Path) -> None:
     append(disk / "log", 10)
     mount_disk(tmp_path / "disk.img", disk, 64 * 2**20)
     unmount_below(tmp_path)
@@ -73,10 +73,10 @@ def test_a_disk_that_is_mounted_keeps_what_is_on_it(disk: Path, tmp_path: Path) 
     assert (disk / "log").stat().st_size == 10
 
 
-def test_the_machine_s_own_disk_is_never_filled(tmp_path: Path) -> None:
+def test_disk_fault_is_rejected_on_the_disk_of_the_machine(tmp_path: Path) -> None:
     with (
-        pytest.raises(ExperimentError, match="no disk of its own"),
-        broken(FAULTS["disk-full"], stage_on(tmp_path), Random(1)),
+        pytest.raises(ExperimentError, match="has no separate disk"),
+        inject(FAULTS["disk-full"], target_on(tmp_path), Random(1)),
     ):
         pass
     assert list(tmp_path.iterdir()) == []

@@ -1,4 +1,4 @@
-"""Experiments: what they find, what they leave, and that two runs of one seed are the same to the byte."""
+"""Experiments: identical output for the same seed, readable logs, checks, and processes that always end."""
 
 from __future__ import annotations
 
@@ -35,15 +35,15 @@ def content(**changes: Any) -> dict[str, Any]:
     return {"name": "short", "vehicles": [vehicle], "timeout": 120, "settle": 1, **changes}
 
 
-def play(*arguments: str) -> Result:
+def run_command(*arguments: str) -> Result:
     return CliRunner().invoke(command, ["run", *arguments])
 
 
 def test_experiment_output_is_identical_for_the_same_seed(tmp_path: Path) -> None:
-    found = parse(content(faults=[GUST], checks=[{"check": "task"}, {"check": "landed", "nearHome": 3}]))
+    experiment = parse(content(faults=[GUST], checks=[{"check": "task"}, {"check": "landed", "nearHome": 3}]))
     for name in ("one", "two", "other"):
-        chosen = found if name != "other" else parse({**found.to_dict(), "seed": 2})
-        assert run(chosen, tmp_path / name).holds
+        seeded = parse({**experiment.to_dict(), "seed": 2}) if name == "other" else experiment
+        assert run(seeded, tmp_path / name).holds
     logs = [{p.name: p.read_bytes() for p in (tmp_path / name / "logs").iterdir()} for name in ("one", "two", "other")]
     assert set(logs[0]) == {"d.tlog", "d-observer.tlog", "short.mcap"}
     assert logs[0] == logs[1]
@@ -55,14 +55,14 @@ def test_experiment_output_is_readable_by_standard_tools(tmp_path: Path) -> None
     checks = [{"check": "landed"}, {"check": "reached", "north": 15, "east": 0}]
     outcome = run(parse(content(vehicles=[slow], faults=[GUST], checks=checks)), tmp_path)
     leg = [s.speed_mps for s in outcome.flights["d"].track.samples if s.mode == "GUIDED"]
-    assert max(leg) < 4.0, "the leg is flown at the speed that was set before it began"
+    assert max(leg) < 4.0, "the leg is flown at the speed of the step before it"
     log = mavutil.mavlink_connection(str(tmp_path / "logs" / "d.tlog"))
     seen: set[tuple[str, int]] = set()
     while (message := log.recv_match()) is not None:
         seen.add((message.get_type(), message.get_srcSystem()))
     log.close()
-    assert ("GLOBAL_POSITION_INT", 1) in seen, "what the vehicle says"
-    assert ("SET_POSITION_TARGET_GLOBAL_INT", 255) in seen, "what it is told"
+    assert ("GLOBAL_POSITION_INT", 1) in seen, "sent by the vehicle"
+    assert ("SET_POSITION_TARGET_GLOBAL_INT", 255) in seen, "sent by the ground station"
     with (tmp_path / "logs" / "short.mcap").open("rb") as file:
         messages = [
             (channel.topic, json.loads(message.data)) for _, channel, message in make_reader(file).iter_messages()
@@ -84,15 +84,15 @@ def test_experiment_output_is_readable_by_standard_tools(tmp_path: Path) -> None
 
 
 def test_experiment_reports_failsafes_and_failed_checks(tmp_path: Path) -> None:
-    done = play(str(EXAMPLES / "gps-loss.yaml"), "--out", str(tmp_path / "holds"), "--quiet")
-    assert done.exit_code == 0, done.output
+    result = run_command(str(EXAMPLES / "gps-loss.yaml"), "--out", str(tmp_path / "holds"), "--quiet")
+    assert result.exit_code == 0, result.output
     deaf = {"name": "d", "home": HOME, "readyAfter": 2, "task": TASK[:2], "parameters": {"FS_GCS_ENABLE": 1}}
     checks = [{"check": "mode", "mode": "RTL", "after": "linkLoss"}, {"check": "task"}, {"check": "altitude", "max": 1}]
     faults = [{"fault": "linkLoss", "at": 4}]
     file = tmp_path / "fails.yaml"
     file.write_text(json.dumps(content(vehicles=[deaf], faults=faults, checks=checks)))
-    done = play(str(file), "--out", str(tmp_path / "fails"), "--quiet")
-    assert done.exit_code == 2
+    result = run_command(str(file), "--out", str(tmp_path / "fails"), "--quiet")
+    assert result.exit_code == 2
     report = json.loads((tmp_path / "fails" / "report.json").read_text())
     assert [check["holds"] for check in report["checks"]] == [True, False, False]
     assert not report["problem"]
@@ -101,14 +101,14 @@ def test_experiment_reports_failsafes_and_failed_checks(tmp_path: Path) -> None:
 def test_experiment_command_exits_with_1_and_one_message_for_invalid_input(tmp_path: Path) -> None:
     file = tmp_path / "bad.yaml"
     file.write_text(json.dumps(content(faults=[{"fault": "gpsLoss"}])))
-    done = play(str(file), "--out", str(tmp_path / "out"))
-    assert done.exit_code == 1
-    assert "faults[0].gpsLoss.at: is missing; give it" in done.output
+    result = run_command(str(file), "--out", str(tmp_path / "out"))
+    assert result.exit_code == 1
+    assert "faults[0].gpsLoss.at: is missing; give it" in result.output
     unknown = {"name": "d", "home": HOME, "parameters": {"NO_SUCH": 1}}
     file.write_text(json.dumps(content(vehicles=[unknown])))
-    done = play(str(file), "--out", str(tmp_path / "out"))
-    assert done.exit_code == 1
-    assert "d: the autopilot has no parameter NO_SUCH" in done.output
+    result = run_command(str(file), "--out", str(tmp_path / "out"))
+    assert result.exit_code == 1
+    assert "d: the autopilot has no parameter NO_SUCH" in result.output
 
 
 PROGRAM = """
@@ -136,14 +136,14 @@ def test_program_flies_a_vehicle_faster_than_real_time(tmp_path: Path) -> None:
     program = {"name": "fly", "command": ["python", "fly.py"], "vehicle": "d"}
     vehicle = {"name": "d", "home": HOME, "readyAfter": 2}
     checks = [{"check": "program", "program": "fly"}, {"check": "landed"}, {"check": "altitude", "max": 8}]
-    found = parse(content(vehicles=[vehicle], programs=[program], speedup=5, checks=checks))
-    outcome = run(found, tmp_path / "out", base=tmp_path)
+    experiment = parse(content(vehicles=[vehicle], programs=[program], speedup=5, checks=checks))
+    outcome = run(experiment, tmp_path / "out", base=tmp_path)
     assert outcome.holds, outcome.verdicts
     log = mavutil.mavlink_connection(str(tmp_path / "out" / "logs" / "d-fly.tlog"))
-    told = log.recv_match(type="COMMAND_LONG", condition="COMMAND_LONG.command==22")
+    command = log.recv_match(type="COMMAND_LONG", condition="COMMAND_LONG.command==22")
     log.close()
-    assert told is not None
-    assert told.get_srcSystem() == 255
+    assert command is not None
+    assert command.get_srcSystem() == 255
 
 
 def test_interrupted_experiment_leaves_no_process(tmp_path: Path) -> None:
@@ -169,7 +169,7 @@ def test_interrupted_experiment_leaves_no_process(tmp_path: Path) -> None:
 
 
 def test_processes_are_killed_if_they_ignore_sigterm(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("fractus_sim.testbeds.local_processes.GRACE_S", 1.0)
+    monkeypatch.setattr("fractus_sim.testbeds.local_processes.STOP_TIMEOUT_S", 1.0)
     stubborn = (
         "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print('up', flush=True); time.sleep(60)"
     )
@@ -185,18 +185,18 @@ def test_child_processes_end_with_their_program(tmp_path: Path) -> None:
     left = f"sleep 600; : {tmp_path}"
     processes.start("leader", ["/bin/sh", "-c", f"/bin/sh -c '{left}' & exit 3"], {"PATH": os.environ["PATH"]})
     assert processes.wait_end("leader", 20) == 3
-    assert gone(tmp_path)
+    assert all_ended(tmp_path)
     processes.stop_all()
 
 
 RUNNER = """
 import sys, time
 from pathlib import Path
-from fractus_sim.testbeds import local_processes as room
-from fractus_sim.interruption import break_off_on_signals
-room.GRACE_S = 600.0
-break_off_on_signals()
-processes = room.Processes(Path(sys.argv[1]))
+from fractus_sim.testbeds import local_processes
+from fractus_sim.interruption import interrupt_on_signals
+local_processes.STOP_TIMEOUT_S = 600.0
+interrupt_on_signals()
+processes = local_processes.Processes(Path(sys.argv[1]))
 try:
     stubborn = f"trap '' TERM; sleep 600 & echo up; while :; do sleep 1; done; : {sys.argv[1]}"
     processes.start("stubborn", ["/bin/sh", "-c", stubborn], {"PATH": "/usr/bin:/bin"})
@@ -229,11 +229,11 @@ def test_no_process_outlives_an_interrupted_runner(
             assert runner.wait(60) != 0
         finally:
             runner.kill()
-    assert gone(tmp_path)
+    assert all_ended(tmp_path)
 
 
-def gone(mark: Path) -> bool:
-    """Whether no process has the mark in its command line, within some time."""
+def all_ended(mark: Path) -> bool:
+    """Return True if all processes with the mark in their command line end before a timeout."""
     deadline = time.monotonic() + 20
     while subprocess.run(["pgrep", "-f", str(mark)], capture_output=True, check=False).stdout:
         if time.monotonic() > deadline:

@@ -1,4 +1,4 @@
-"""Drones with their services on one machine: programs run as components, power goes and comes, nothing is left."""
+"""Drones with their services as local processes: programs as components, power failures, and complete clean-up."""
 
 from __future__ import annotations
 
@@ -35,16 +35,16 @@ async def main():
 print("began", flush=True)
 try:
     asyncio.run(main())
-except fractus.FractusError as lost:  # the autopilot may have gone home before the restart, or while the program waited
+except fractus.FractusError as lost:  # the autopilot may have returned home before the restart, or while the program waited
     print("lost:", lost)
 """
 
 
-def said(ground: Standalone, words: str, count: int) -> None:
-    """Wait until the program has said something that often."""
-    log = ground.processes.log("pilot")
+def wait_for_output(drones: Standalone, text: str, count: int) -> None:
+    """Wait until the output of the program contains a text a number of times."""
+    log = drones.processes.log("pilot")
     deadline = time.monotonic() + 60
-    while log.read_text().count(words) < count:
+    while log.read_text().count(text) < count:
         assert time.monotonic() < deadline, log.read_text()
         time.sleep(0.1)
 
@@ -52,37 +52,37 @@ def said(ground: Standalone, words: str, count: int) -> None:
 def test_program_flies_until_its_companion_computer_loses_power(tmp_path: Path) -> None:
     (tmp_path / "pilot.py").write_text(PROGRAM)
     (tmp_path / "hold").touch()
-    with Standalone(tmp_path / "ground") as ground:
-        drone = ground.add_drone(DroneSetup("drone-1", HOME, speedup=2))
-        identity = ground.grant(grant())
-        ground.run("pilot", [sys.executable, "pilot.py"], identity, folder=tmp_path)
-        said(ground, "up at drone-1 2", 1)
-        ground.power_off("drone-1")
-        assert not ground.processes.running("pilot")
-        assert not ground.processes.running("drone-1-mobility")
-        assert ground.processes.running("drone-1-vehicle")
-        ground.check()
+    with Standalone(tmp_path / "drones") as drones:
+        drone = drones.add_drone(DroneSetup("drone-1", HOME, speedup=2))
+        identity = drones.grant(grant())
+        drones.run("pilot", [sys.executable, "pilot.py"], identity, folder=tmp_path)
+        wait_for_output(drones, "up at drone-1 2", 1)
+        drones.power_off("drone-1")
+        assert not drones.processes.running("pilot")
+        assert not drones.processes.running("drone-1-mobility")
+        assert drones.processes.running("drone-1-vehicle")
+        drones.check()
         (tmp_path / "hold").unlink()
-        ground.power_on("drone-1")
-        said(ground, "began", 2)
-        assert ground.wait_program("pilot", 30) == 0
-        ground.check()
+        drones.power_on("drone-1")
+        wait_for_output(drones, "began", 2)
+        assert drones.wait_program("pilot", 30) == 0
+        drones.check()
         tlog = str(drone.tlog)
     assert not subprocess.run(["pgrep", "-f", str(tmp_path)], capture_output=True, check=False).stdout
     log = mavutil.mavlink_connection(tlog)
     takeoff = log.recv_match(type="COMMAND_LONG", condition="COMMAND_LONG.command==22")
     log.close()
-    assert takeoff is not None, "the tap of the link shows what the service told the autopilot"
+    assert takeoff is not None, "the tlog contains the commands of the service"
 
 
 def test_standalone_rejects_invalid_use_immediately(tmp_path: Path) -> None:
-    with Standalone(tmp_path) as ground:
+    with Standalone(tmp_path) as drones:
         with pytest.raises(ExperimentError, match="no drone drone-1; known: none"):
-            ground.grant(grant())
+            drones.grant(grant())
         with pytest.raises(ExperimentError, match="has no Grant"):
-            ground.environment("spiffe://fractus.dev/ns/a/app/b/component/C/instance/d")
+            drones.environment("spiffe://fractus.dev/ns/a/app/b/component/C/instance/d")
         bad: dict[str, Any] = {"services": {"mobility": {"maxSpeed": -1}}}
         with pytest.raises(InvalidObject, match="maxSpeed"):
-            ground.add_drone(DroneSetup("drone-1", HOME, description=bad))
+            drones.add_drone(DroneSetup("drone-1", HOME, description=bad))
         with pytest.raises(ExperimentError, match="drone-2-vehicle ended with"):
-            ground.add_drone(DroneSetup("drone-2", HOME, vehicle_arguments=("--no-such-option",)))
+            drones.add_drone(DroneSetup("drone-2", HOME, vehicle_arguments=("--no-such-option",)))

@@ -1,7 +1,7 @@
-"""The field experiment's violating flight, with an autopilot that was started apart, stands elsewhere, and flies slowly.
+"""The violating flight of the field experiment with a running autopilot at another place and with other parameters.
 
-Waypoints, readiness, modes and acknowledgements must not depend on how the scenario's own vehicles are set up. The other
-runs are left to `make scenario-field`: this one, three times faster than real time, takes more than a minute already.
+Waypoints, readiness, modes and acknowledgements must not depend on the set-up of the scenario's own vehicles. Only
+`make scenario-field` flies the other runs, because one run takes more than a minute.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ SPEEDUP = "2"
 
 
 @pytest.mark.timeout(320)
-def test_a_violating_program_is_corrected_refused_and_brought_home(tmp_path: Path):
+def test_violating_program_is_corrected_refused_and_flown_home(tmp_path: Path):
     link = f"tcp:127.0.0.1:{free_port()}"
     parameters = [part for setting in SLOW for part in ("--param", setting)]
     options = (
@@ -39,16 +39,16 @@ def test_a_violating_program_is_corrected_refused_and_brought_home(tmp_path: Pat
         "--seed",
         "9",
     )
-    elsewhere = ("--home", "-35.3632621,149.1652374,584", "--wind", "3,10,1")
+    position = ("--home", "-35.3632621,149.1652374,584", "--wind", "3,10,1")
     out = tmp_path / "field"
-    with running_vehicle(*options, *elsewhere, *parameters, links=(link,)):
-        done = subprocess.run(
+    with running_vehicle(*options, *position, *parameters, links=(link,)):
+        process = subprocess.run(
             [sys.executable, "-m", "fractus_sim.scenarios.field", "--out", str(out), "--run", "guarded",
              "--autopilot", link, "--speedup", SPEEDUP],
             stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=300, check=False,
             cwd=Path(__file__).parents[2],
         )  # fmt: skip
-    assert done.returncode == 0, done.stdout[-4000:]
+    assert process.returncode == 0, process.stdout[-4000:]
     report = json.loads((out / "report.json").read_text())
     (run,) = report["runs"]
     assert report["holds"]
@@ -59,13 +59,13 @@ def test_a_violating_program_is_corrected_refused_and_brought_home(tmp_path: Pat
         assert (out / name).stat().st_size > 1000
 
 
-def test_an_autopilot_that_is_not_there_is_one_sentence(tmp_path: Path):
+def test_missing_autopilot_is_reported_in_one_line(tmp_path: Path):
     link = f"tcp:127.0.0.1:{free_port()}"
-    done = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-m", "fractus_sim.scenarios.field", "--out", str(tmp_path), "--autopilot", link],
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=60, check=False,
         cwd=Path(__file__).parents[2],
     )  # fmt: skip
-    assert done.returncode == 1
-    assert f"no autopilot answers at {link}" in done.stdout
-    assert "Traceback" not in done.stdout
+    assert process.returncode == 1
+    assert f"cannot connect to the autopilot at {link}" in process.stdout
+    assert "Traceback" not in process.stdout

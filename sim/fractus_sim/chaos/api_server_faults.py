@@ -16,23 +16,25 @@ from fractus_sim.chaos import process_lookup
 from fractus_sim.testbeds.kube_commands import SYSTEM, Kube
 
 SLOW_S = 2.0
-_QUICK_S = 0.4
+"""Time for which the API server is suspended."""
+
+_RUNNING_S = 0.4
 _POLL_S = 0.2
 _TIMEOUT_S = 20.0
 _NAME = "fractus-chaos"
-RULES = (
+RATE_LIMIT_OBJECTS = (
     f"flowschemas.flowcontrol.apiserver.k8s.io/{_NAME}",
     f"prioritylevelconfigurations.flowcontrol.apiserver.k8s.io/{_NAME}",
 )
-"""Objects of `no_room` in kubectl notation."""
+"""Objects of `rate_limit_manifests` in kubectl notation."""
 _ACCOUNTS = (SYSTEM, "fractus-nodes")
-_UNFINISHED = (
+_INCOMPLETE_REQUEST = (
     "create", "--raw=/apis/authorization.k8s.io/v1/selfsubjectaccessreviews", "-f", "-",
     f"--as=system:serviceaccount:{SYSTEM}:chaos",
 )  # fmt: skip
 
 
-def no_room() -> str:
+def rate_limit_manifests() -> str:
     """Return manifests that limit all accounts of Fractus to one concurrent API request."""
     api = "flowcontrol.apiserver.k8s.io/v1"
     level = {
@@ -42,38 +44,38 @@ def no_room() -> str:
             "limitResponse": {"type": "Reject"},
         }},
     }  # fmt: skip
-    who = [{"kind": "Group", "group": {"name": f"system:serviceaccounts:{name}"}} for name in _ACCOUNTS]
-    every = {
+    accounts = [{"kind": "Group", "group": {"name": f"system:serviceaccounts:{name}"}} for name in _ACCOUNTS]
+    all_requests = {
         "verbs": ["*"], "apiGroups": ["*"], "resources": ["*"], "clusterScope": True, "namespaces": ["*"]
     }  # fmt: skip
     flow = {
         "apiVersion": api, "kind": "FlowSchema", "metadata": {"name": _NAME},
         "spec": {
             "priorityLevelConfiguration": {"name": _NAME}, "matchingPrecedence": 2,
-            "rules": [{"subjects": who, "resourceRules": [every]}],
+            "rules": [{"subjects": accounts, "resourceRules": [all_requests]}],
         },
     }  # fmt: skip
     return dump_documents([level, flow])
 
 
 @contextmanager
-def occupied(kube: Kube) -> Iterator[None]:
-    """Occupy the request slot of `no_room`. All other requests of Fractus receive status 429."""
+def occupied_request_slot(kube: Kube) -> Iterator[None]:
+    """Occupy the single request slot of `rate_limit_manifests`. All other requests of Fractus receive status 429."""
 
-    def hold(over: threading.Event) -> None:
-        # The API server ends the request after one minute, and rejects it while another request is running.
-        while not over.is_set():
-            with kube.follow(_UNFINISHED, subprocess.DEVNULL, subprocess.PIPE) as request:
-                while request.poll() is None and not over.wait(_POLL_S):
+    def repeat(stop: threading.Event) -> None:
+        # The API server ends the request after one minute, so it is repeated. It is rejected while another request runs.
+        while not stop.is_set():
+            with kube.follow(_INCOMPLETE_REQUEST, subprocess.DEVNULL, subprocess.PIPE) as request:
+                while request.poll() is None and not stop.wait(_POLL_S):
                     continue
                 request.kill()
 
-    with held(hold):
+    with in_background(repeat):
         yield
 
 
 @contextmanager
-def refused(namespace: Path) -> Iterator[None]:
+def connections_reset(namespace: Path) -> Iterator[None]:
     """Reset every connection to the API server."""
     rule = f"tcp dport {API_PORT} reject with tcp reset"
     with _table(namespace, "fractus_chaos_down", f"chain c {{ type filter hook input priority -300; {rule}; }}"):
@@ -81,7 +83,7 @@ def refused(namespace: Path) -> Iterator[None]:
 
 
 @contextmanager
-def silenced(namespace: Path) -> Iterator[int]:
+def responses_dropped(namespace: Path) -> Iterator[int]:
     """Drop all responses on existing connections to the API server, but not on new ones. Yield their number."""
     peers = sorted(_peers(namespace))
     if not peers:
@@ -97,18 +99,18 @@ def silenced(namespace: Path) -> Iterator[int]:
 
 
 @contextmanager
-def slowed(pids: Callable[[], list[int]]) -> Iterator[None]:
+def suspended_repeatedly(pids: Callable[[], list[int]]) -> Iterator[None]:
     """Suspend the API server for two seconds repeatedly."""
 
-    def hold(over: threading.Event) -> None:
-        while not over.is_set():
+    def repeat(stop: threading.Event) -> None:
+        while not stop.is_set():
             process_lookup.send_signal(pids(), signal.SIGSTOP)
-            over.wait(SLOW_S)
+            stop.wait(SLOW_S)
             process_lookup.send_signal(pids(), signal.SIGCONT)
-            over.wait(_QUICK_S)
+            stop.wait(_RUNNING_S)
 
     try:
-        with held(hold):
+        with in_background(repeat):
             yield
     finally:
         process_lookup.send_signal(pids(), signal.SIGCONT)
@@ -116,6 +118,7 @@ def slowed(pids: Callable[[], list[int]]) -> Iterator[None]:
 
 @contextmanager
 def _table(namespace: Path, name: str, content: str) -> Iterator[None]:
+    """Install an nftables table until the end of the block."""
     _run(namespace, ["nft", "-f", "-"], f"table inet {name} {{\n{content}\n}}\n")
     try:
         yield
@@ -125,35 +128,36 @@ def _table(namespace: Path, name: str, content: str) -> Iterator[None]:
 
 def _peers(namespace: Path) -> set[str]:
     """Return the peers of established API server connections as nftables set elements (address . port)."""
-    listed = _run(namespace, ["ss", "-Htn", "state", "established", f"( sport = :{API_PORT} )"])
-    found = set()
-    for line in listed.splitlines():
+    output = _run(namespace, ["ss", "-Htn", "state", "established", f"( sport = :{API_PORT} )"])
+    peers = set()
+    for line in output.splitlines():
         address, _, port = line.split()[-1].rpartition(":")
         address = address.strip("[]").removeprefix("::ffff:")
         if ":" not in address:
-            found.add(f"{address} . {port}")
-    return found
+            peers.add(f"{address} . {port}")
+    return peers
 
 
 def _run(namespace: Path, command: list[str], text: str = "") -> str:
-    done = subprocess.run(
+    """Run a command in a network namespace, and return its output."""
+    completed = subprocess.run(
         ["nsenter", f"--net={namespace}", *command], input=text, capture_output=True, text=True, timeout=_TIMEOUT_S, check=True
     )  # fmt: skip
-    return done.stdout
+    return completed.stdout
 
 
 _JOIN_S = 30.0
 
 
 @contextmanager
-def held(hold: Callable[[threading.Event], None]) -> Iterator[None]:
-    """Run a function in a thread until the end of the block, which sets the event."""
-    over = threading.Event()
-    # Daemon thread: an interrupted run does not wait for faults because its cluster is removed.
-    holder = threading.Thread(target=hold, args=(over,), daemon=True)
-    holder.start()
+def in_background(action: Callable[[threading.Event], None]) -> Iterator[None]:
+    """Run an action in a thread until the end of the block. The event is set when the action must return."""
+    stop = threading.Event()
+    # A daemon thread, because an interrupted run must not wait for faults. Its cluster is removed anyway.
+    thread = threading.Thread(target=action, args=(stop,), daemon=True)
+    thread.start()
     try:
         yield
     finally:
-        over.set()
-        holder.join(_JOIN_S)
+        stop.set()
+        thread.join(_JOIN_S)

@@ -4,30 +4,39 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from fractus_sim.chaos.chaos_run import Run
-from fractus_sim.report.report_files import clock, table
+from fractus_sim.chaos.chaos_run import ChaosRun
+from fractus_sim.report.report_files import format_duration, table
 
 
-def page(runs: Sequence[Run], run_s: float) -> str:
-    """Return the page in Markdown."""
-    broken = sum(len(run.broken) for run in runs)
-    held = "Every invariant held." if not broken else f"{broken} invariant violations."
+def chaos_page(runs: Sequence[ChaosRun], fault_time_s: float) -> str:
+    """Return the page in Markdown.
+
+    Args:
+        runs: Completed runs.
+        fault_time_s: Duration of fault injection per run, seconds.
+    """
+    violations = sum(len(run.violations) for run in runs)
+    headline = f"{violations} invariant violations." if violations else "Every invariant held."
+    head = ("Seed", "In the air", "Missions", "Events", "Audit entries", "Violations")
     rows = [
         (
-            str(run.seed), clock(run.flown_s), _missions(run), str(sum(":" in text for _, text in run.timeline)), str(run.entries),
-            "; ".join(f"{each.invariant}: {each.found}" for each in run.broken) or "none",
+            str(run.seed),
+            format_duration(run.flown_s),
+            _phase_counts(run),
+            str(sum(":" in text for _, text in run.timeline)),
+            str(run.audit_entries),
+            "; ".join(f"{violation.invariant}: {violation.description}" for violation in run.violations) or "none",
         )
         for run in runs
-    ]  # fmt: skip
-    head = ("Seed", "In the air", "Missions", "Events", "Audit entries", "Broken")
-    parts = ["# Chaos", f"{len(runs)} runs of {clock(run_s)}. {held}", table(head, rows)]
+    ]
+    parts = ["# Chaos", f"{len(runs)} runs of {format_duration(fault_time_s)}. {headline}", table(head, rows)]
     for run in runs:
-        lines = [f"- {at_s:.1f} s: {text}" for at_s, text in sorted(run.timeline)]
-        ends = [f"- {name}: {phase}: {message}" for name, (phase, message) in run.ended.items()]
-        parts += [f"## Seed {run.seed}", "\n".join(lines), "Missions:", "\n".join(ends)]
+        events = [f"- {time_s:.1f} s: {text}" for time_s, text in sorted(run.timeline)]
+        missions = [f"- {name}: {phase}: {message}" for name, (phase, message) in run.missions.items()]
+        parts += [f"## Seed {run.seed}", "\n".join(events), "Missions:", "\n".join(missions)]
     return "\n\n".join(parts) + "\n"
 
 
-def _missions(run: Run) -> str:
-    phases = [phase for phase, _ in run.ended.values()]
+def _phase_counts(run: ChaosRun) -> str:
+    phases = [phase for phase, _ in run.missions.values()]
     return ", ".join(f"{phases.count(phase)} {phase}" for phase in sorted(set(phases)))

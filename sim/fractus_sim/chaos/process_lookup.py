@@ -10,42 +10,42 @@ from pathlib import Path
 
 def of_pod(uid: str) -> list[int]:
     """Return the processes of a pod's containers, without its pause process."""
-    marks = (uid, uid.replace("-", "_"))
+    pod_ids = (uid, uid.replace("-", "_"))
     return [
         pid
-        for pid, folder, command in _all()
-        if not command.endswith(b"pause") and any(mark in _text(folder / "cgroup") for mark in marks)
+        for pid, folder, command in _processes()
+        if not command.endswith(b"pause") and any(pod_id in _read_text(folder / "cgroup") for pod_id in pod_ids)
     ]
 
 
 def of_program(name: str, namespace: Path) -> list[int]:
     """Return the processes of a program in a network namespace, such as the kubelet of a node."""
     inode = namespace.stat().st_ino
-    found = []
-    for pid, folder, command in _all():
+    pids = []
+    for pid, folder, command in _processes():
         if command.rpartition(b"/")[2].decode(errors="replace") == name:
             try:
-                own = (folder / "ns" / "net").stat().st_ino
+                namespace_inode = (folder / "ns" / "net").stat().st_ino
             except OSError:
                 continue
-            if own == inode:
-                found.append(pid)
-    return found
+            if namespace_inode == inode:
+                pids.append(pid)
+    return pids
 
 
 def send_signal(pids: Iterable[int], number: signal.Signals) -> int:
     """Send a signal. Return the number of processes that received it."""
-    reached = 0
+    count = 0
     for pid in pids:
         try:
             os.kill(pid, number)
         except ProcessLookupError:
             continue
-        reached += 1
-    return reached
+        count += 1
+    return count
 
 
-def _all() -> Iterator[tuple[int, Path, bytes]]:
+def _processes() -> Iterator[tuple[int, Path, bytes]]:
     """Yield each process with its /proc folder and its program."""
     for folder in Path("/proc").iterdir():
         if folder.name.isdigit():
@@ -57,7 +57,7 @@ def _all() -> Iterator[tuple[int, Path, bytes]]:
                 yield int(folder.name), folder, command
 
 
-def _text(path: Path) -> str:
+def _read_text(path: Path) -> str:
     try:
         return path.read_text()
     except OSError:

@@ -7,25 +7,24 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import click
-from fractus_cluster.errors import ClusterError
 from rich.console import Console
 from rich.markdown import Markdown
 
-from fractus_sim.demo.demo_clusters import CurrentCluster, EmbeddedCluster
-from fractus_sim.demo.demo_run import Demo, Teller, report_again
+from fractus_sim.command_line import command_errors
+from fractus_sim.demo.demo_clusters import EXAMPLE_NODES, CurrentCluster, DemoCluster, DemoEmbeddedCluster
+from fractus_sim.demo.demo_run import ConsoleProgress, Demo, rewrite_report
 from fractus_sim.demo.live_view import replay_command
-from fractus_sim.errors import ExperimentError
-from fractus_sim.interruption import break_off_on_signals
+from fractus_sim.report.report_files import PAGE
 
 
-def _assignments(_context: click.Context, _option: click.Parameter, texts: tuple[str, ...]) -> Mapping[str, str]:
-    found: dict[str, str] = {}
+def _parse_assignments(_context: click.Context, _option: click.Parameter, texts: tuple[str, ...]) -> Mapping[str, str]:
+    assignments: dict[str, str] = {}
     for text in texts:
-        example, equals, node = text.partition("=")
-        if not equals or not node or example not in {"drone-1", "edge-1", "edge-2", "edge-3", "cloud-1"}:
+        example, _, node = text.partition("=")
+        if not node or example not in EXAMPLE_NODES:
             raise click.BadParameter(f"{text!r}: expected drone-1=NODE, edge-1=NODE, ..., cloud-1=NODE")
-        found[example] = node
-    return found
+        assignments[example] = node
+    return assignments
 
 
 @click.command()
@@ -42,7 +41,7 @@ def _assignments(_context: click.Context, _option: click.Parameter, texts: tuple
 )  # fmt: skip
 @click.option("--keep", is_flag=True, help="Do not remove cluster, Fractus and application at the end.")
 @click.option(
-    "--assign", multiple=True, callback=_assignments, metavar="NAME=NODE",
+    "--assign", multiple=True, callback=_parse_assignments, metavar="NAME=NODE",
     help="With --cluster current: node to use as drone-1, edge-1, ..., cloud-1 (repeatable).",
 )  # fmt: skip
 @click.option(
@@ -52,30 +51,32 @@ def _assignments(_context: click.Context, _option: click.Parameter, texts: tuple
 def demo(
     *, cluster: str, out: Path, keep: bool, assign: Mapping[str, str], timeout_s: float, report_only: bool
 ) -> None:
-    """Deploy the traffic monitoring example, observe its flight, and write a report."""
+    """Deploy the traffic monitoring example, observe its flight, and write a report.
+
+    Exit code: 0 if the mission completed as expected, 1 otherwise, 130 if interrupted.
+    """
     console = Console()
-    break_off_on_signals()
     try:
-        if report_only:
-            report_again(out)
-            fine = True
-        else:
-            tell = Teller(console)
-            chosen = EmbeddedCluster(tell) if cluster == "embedded" else CurrentCluster(tell, assign)
-            fine = Demo(chosen, out, keep, timeout_s, tell).run()
-    except (ExperimentError, ClusterError) as error:
-        click.echo(f"demo: {error}", err=True)
-        sys.exit(1)
+        with command_errors():
+            as_expected = True
+            if report_only:
+                rewrite_report(out)
+            else:
+                progress = ConsoleProgress(console)
+                selected: DemoCluster = CurrentCluster(progress.report, assign)
+                if cluster == "embedded":
+                    selected = DemoEmbeddedCluster(progress.report)
+                as_expected = Demo(selected, out, keep, timeout_s, progress).run()
     except KeyboardInterrupt:
         click.echo("demo: interrupted", err=True)
         sys.exit(130)
-    console.print(Markdown((out / "summary.md").read_text()))
+    console.print(Markdown((out / PAGE).read_text()))
     click.echo(
-        f"report: {out}/summary.md, map.png, altitude.png, flight.geojson, plan.yaml, audit/, pictures/, recordings/"
+        f"report: {out / PAGE}, map.png, altitude.png, flight.geojson, plan.yaml, audit/, pictures/, recordings/"
     )
     if (replay := replay_command(out)) is not None:
         click.echo(f"replay: {replay}")
-    sys.exit(0 if fine else 1)
+    sys.exit(0 if as_expected else 1)
 
 
 if __name__ == "__main__":

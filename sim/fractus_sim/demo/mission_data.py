@@ -1,4 +1,4 @@
-"""Collection of mission data from the cluster: objects, events, audit logs of the drone, and pictures."""
+"""Collection of mission data from the cluster: objects, events, audit logs and recordings of the drone, and pictures."""
 
 from __future__ import annotations
 
@@ -11,110 +11,141 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from fractus_runtime.audit_chain import logs, read_lines, verify
 from mcap.exceptions import McapError
 from mcap.reader import NonSeekingReader
 
 from fractus_sim.errors import ExperimentError
-from fractus_sim.report.flight_record import AUDIT, OBJECTS, PICTURES, Record, of_mission, taken_s
+from fractus_sim.report.audit_logs import read_audit_logs
+from fractus_sim.report.flight_record import AUDIT, OBJECTS, PICTURES, FlightRecord, is_of_mission, picture_time_s
 from fractus_sim.testbeds.kube_commands import NAMESPACE, SYSTEM, Kube, Object
 from fractus_sim.testbeds.mission_watch import Mission
 
-_AUDIT = "/var/lib/fractus/audit"
+RECORDINGS = "recordings"
+"""Folder of recordings in the report."""
+
+_NODE_AUDIT_FOLDER = "/var/lib/fractus/audit"
+_NODE_RECORDINGS_FOLDER = "/var/lib/fractus/recordings"
+_LIST_RECORDINGS = "import sys, pathlib as p; r = p.Path(sys.argv[1]); [print(f.stat().st_mtime, f.relative_to(r)) for f in r.glob('*/*.mcap')]"
 _AUDIT_FILE = re.compile(r"(mobility|camera|links)(\.\d{12})?\.jsonl")
-_TRIES = 5
-_SHARES = (0.25, 0.5, 0.75)
+_STORED_PICTURE = re.compile(rb"\[pod/[^/]+/data-store\] .* kept ")
 _KINDS = "applications,deploymentplans,depots,drones,edgenodes,policies,zones"
-_KEPT = re.compile(rb"\[pod/[^/]+/data-store\] .* kept ")
+_FETCH_ATTEMPTS = 5
+_PICTURE_SHARES = (0.25, 0.5, 0.75)
+"""Times of the selected pictures as shares of the flight."""
 
 
-def collect(kube: Kube, mission: Mission, folder: Path, log: Path) -> None:
-    """Write objects.json, events.json and the audit logs into a folder. `log` is the log of the components.
+def collect_mission_data(kube: Kube, mission: Mission, folder: Path, logs: Path) -> None:
+    """Write objects.json, events.json and the audit logs into a folder.
+
+    Args:
+        kube: Cluster.
+        mission: Observed mission.
+        folder: Output folder.
+        logs: Logs of the components. They contain one line per stored picture.
 
     Raises:
         ExperimentError: The API server did not respond.
     """
-    objects = [body for body in kube.objects(_KINDS) if _concerns(body, mission.application)]
+    objects = [body for body in kube.objects(_KINDS) if _belongs_to(body, mission.application)]
     events = [
         event for event in kube.objects("events") if mission.application in event["involvedObject"].get("name", "")
     ]
-    audit = _audit(kube, mission, folder)
     content = {
         "objects": objects,
         "pods": list(mission.pods.values()),
         "times": mission.times,
         "links": mission.links,
-        "audit": audit,
-        "results": len(_KEPT.findall(log.read_bytes())) if log.exists() else 0,
+        "audit": _fetch_audit_logs(kube, mission, folder / AUDIT),
+        "results": len(_STORED_PICTURE.findall(logs.read_bytes())) if logs.exists() else 0,
     }
     (folder / OBJECTS).write_text(json.dumps(content, indent=1) + "\n")
-    (folder / "events.json").write_text(json.dumps([_event(e) for e in events], indent=1) + "\n")
+    (folder / "events.json").write_text(json.dumps([_event(event) for event in events], indent=1) + "\n")
 
 
-def _concerns(body: Object, application: str) -> bool:
-    own = body["kind"] not in {"Application", "DeploymentPlan"}
-    return own or (body["metadata"]["name"] == application and body["metadata"].get("namespace") == NAMESPACE)
+def _belongs_to(body: Object, application: str) -> bool:
+    """Return True for the Application, its plan, and objects that do not belong to an application."""
+    if body["kind"] not in {"Application", "DeploymentPlan"}:
+        return True
+    metadata = body["metadata"]
+    return bool(metadata["name"] == application and metadata.get("namespace") == NAMESPACE)
 
 
-def _audit(kube: Kube, mission: Mission, folder: Path) -> dict[str, Any]:
+def _fetch_audit_logs(kube: Kube, mission: Mission, folder: Path) -> dict[str, Any]:
     """Fetch the audit logs of the drone, verify their chains, and count the entries of this mission."""
-    found: dict[str, Any] = {"entries": 0, "kept": 0, "problem": ""}
     if not mission.drone:
         return {}
+    result: dict[str, Any] = {"entries": 0, "kept": 0, "problem": ""}
     try:
-        fetch_logs(kube, mobility_pod(kube, mission.drone), folder / AUDIT)
+        fetch_audit_logs(kube, mobility_pod(kube, mission.drone), folder)
     except ExperimentError as error:
-        return {**found, "problem": f"cannot be fetched: {error}"}
-
-    def counted(files: list[Path]) -> Iterator[bytes]:
-        for _, _, line in read_lines(files):
-            found["kept"] += line.endswith(b"\n") and of_mission(line, mission.times["applied"])
-            yield line
-
-    for name, files in logs([folder / AUDIT]).items():
-        finding = verify(counted(files))
-        found["entries"] += finding.entries
-        if finding.problem and not found["problem"]:
-            found["problem"] = f"line {finding.line} of {name.name} {finding.problem}"
-    return found
+        return {**result, "problem": f"cannot be fetched: {error}"}
+    for log in read_audit_logs([folder]):
+        result["entries"] += log.length
+        result["kept"] += sum(is_of_mission(entry, mission.times["applied"]) for entry in log.entries)
+        if log.problem and not result["problem"]:
+            result["problem"] = f"{log.path.name}: {log.problem}"
+    return result
 
 
-def fetch_logs(kube: Kube, pod: str, folder: Path) -> None:
+def fetch_audit_logs(kube: Kube, pod: str, folder: Path) -> None:
     """Copy the audit logs of a node's services with all segments.
+
+    The files are listed again after the copy, because a log may have started a new segment meanwhile.
 
     Raises:
         ExperimentError: The logs cannot be read.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    for _ in range(_TRIES):
-        listed = _audit_files(kube, pod)
-        for name in listed:
-            segment = name.count(".") > 1
-            if not (segment and (folder / name).exists()):
-                kube.fetch(pod, f"{_AUDIT}/{name}", folder / name)
-        if _audit_files(kube, pod) == listed:
+    for _ in range(_FETCH_ATTEMPTS):
+        names = _audit_files(kube, pod)
+        for name in names:
+            is_closed_segment = name.count(".") > 1
+            if not (is_closed_segment and (folder / name).exists()):
+                kube.fetch(pod, f"{_NODE_AUDIT_FOLDER}/{name}", folder / name)
+        if _audit_files(kube, pod) == names:
             return
     raise ExperimentError(f"the audit log of pod {pod} rotates faster than it can be copied")
 
 
 def _audit_files(kube: Kube, pod: str) -> list[str]:
-    names = kube.run("exec", "-n", SYSTEM, pod, "--", "ls", _AUDIT).split()
+    names = kube.run("exec", "-n", SYSTEM, pod, "--", "ls", _NODE_AUDIT_FOLDER).split()
     return sorted(name for name in names if _AUDIT_FILE.fullmatch(name))
 
 
-def keep_pictures(recordings: Iterable[Path], record: Record, folder: Path) -> None:
+def fetch_recordings(kube: Kube, drone: str, since_s: float, folder: Path) -> list[Path]:
+    """Copy the recordings that the services of a drone wrote since a time (Unix seconds).
+
+    A recording can begin before the mission, because recordings include the seconds before arming. The result is empty
+    if the services do not record.
+
+    Raises:
+        ExperimentError: The recordings cannot be read.
+    """
+    pod = mobility_pod(kube, drone)
+    listing = kube.run("exec", "-n", SYSTEM, pod, "--", "python3", "-c", _LIST_RECORDINGS, _NODE_RECORDINGS_FOLDER)
+    recordings: list[Path] = []
+    for line in sorted(listing.splitlines()):
+        written_s, _, name = line.partition(" ")
+        if float(written_s) >= since_s:
+            copy = folder / RECORDINGS / name.replace("/", "-")
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            kube.fetch(pod, f"{_NODE_RECORDINGS_FOLDER}/{name}", copy)
+            recordings.append(copy)
+    return recordings
+
+
+def extract_pictures(recordings: Iterable[Path], record: FlightRecord, folder: Path) -> None:
     """Extract a few in-flight pictures, after privacy filters, from the recordings of the camera service.
 
     The image stores cannot be used because components delete their pictures after retrieval.
     """
     if record.takeoff_s is None:
         return
-    taken = {name: jpeg for path in recordings if path.name.startswith("camera-") for name, jpeg in _pictures(path)}
-    begin_s = record.samples[0].time_s
-    end_s = record.samples[-1].time_s
+    camera_recordings = [path for path in recordings if path.name.startswith("camera-")]
+    pictures = {name: jpeg for path in camera_recordings for name, jpeg in _pictures(path)}
     (folder / PICTURES).mkdir(parents=True, exist_ok=True)
-    for name in spread(list(taken), begin_s, end_s):
-        (folder / PICTURES / name).write_bytes(taken[name])
+    for name in select_pictures(list(pictures), record.samples[0].time_s, record.samples[-1].time_s):
+        (folder / PICTURES / name).write_bytes(pictures[name])
 
 
 def _pictures(recording: Path) -> Iterator[tuple[str, bytes]]:
@@ -123,23 +154,23 @@ def _pictures(recording: Path) -> Iterator[tuple[str, bytes]]:
     with recording.open("rb") as file, contextlib.suppress(McapError, KeyError, RuntimeError, ValueError):
         for schema, _, message in NonSeekingReader(file).iter_messages(log_time_order=False):
             if schema is not None and schema.name == "foxglove.CompressedImage":
-                moment = datetime.fromtimestamp(message.log_time / 1e9, UTC)
-                name = f"{moment:%Y%m%d%H%M%S}{moment.microsecond // 1000:03d}-{message.sequence:04d}.jpg"
+                captured = datetime.fromtimestamp(message.log_time / 1e9, UTC)
+                name = f"{captured:%Y%m%d%H%M%S}{captured.microsecond // 1000:03d}-{message.sequence:04d}.jpg"
                 yield name, b64decode(json.loads(message.data)["data"])
 
 
-def spread(names: list[str], begin_s: float, end_s: float) -> list[str]:
+def select_pictures(names: list[str], begin_s: float, end_s: float) -> list[str]:
     """Return the pictures closest to a quarter, half and three quarters of a time span, oldest first."""
-    taken = {name: taken_s(name) for name in names}
-    inside = [name for name in names if begin_s <= taken[name] <= end_s]
-    if not inside:
+    times = {name: picture_time_s(name) for name in names}
+    in_span = [name for name in names if begin_s <= times[name] <= end_s]
+    if not in_span:
         return []
 
-    def nearest(at_s: float) -> str:
-        return min(inside, key=lambda name: abs(taken[name] - at_s))
+    def nearest(time_s: float) -> str:
+        return min(in_span, key=lambda name: abs(times[name] - time_s))
 
-    chosen = {nearest(begin_s + share * (end_s - begin_s)) for share in _SHARES}
-    return sorted(chosen, key=lambda name: taken[name])
+    selected = {nearest(begin_s + share * (end_s - begin_s)) for share in _PICTURE_SHARES}
+    return sorted(selected, key=lambda name: times[name])
 
 
 def mobility_pod(kube: Kube, node: str) -> str:

@@ -21,16 +21,16 @@ class Place(Model):
     east: float | None = Field(default=None, ge=-50_000, le=50_000, description="Metres east of home.")
 
     @model_validator(mode="after")
-    def _one_way(self) -> Self:
+    def _check_coordinates(self) -> Self:
         degrees = {self.lat is None, self.lon is None}
         metres = {self.north is None, self.east is None}
         if len(degrees) == 2 or len(metres) == 2 or degrees == metres:
-            raise InvalidObject("", "give lat and lon, or north and east")
+            raise InvalidObject("", "requires lat and lon, or north and east")
         return self
 
     @property
-    def words(self) -> str:
-        """The place as text."""
+    def label(self) -> str:
+        """Text for titles."""
         if self.lat is not None and self.lon is not None:
             return f"{self.lat:.6f}, {self.lon:.6f}"
         return f"{self.north:g} m north, {self.east:g} m east"
@@ -58,7 +58,7 @@ class Takeoff(TaskStep):
 class Goto(Place, TaskStep):
     """Fly to a position and stop."""
 
-    TITLE = "goto {step.words} at {step.alt:g} m"
+    TITLE = "goto {step.label} at {step.alt:g} m"
     do: Literal["goto"]
     alt: Altitude
     within: float = Field(default=1.5, gt=0, le=100, description="Maximum distance to the target, metres.")

@@ -1,4 +1,4 @@
-"""Map of flights: paths, zones, nodes with their range, and marks of events."""
+"""Map of flights: paths, zones, nodes with their WiFi range, and marks of events."""
 
 from __future__ import annotations
 
@@ -17,21 +17,82 @@ from matplotlib.path import Path as Outline
 
 from fractus_sim.report.figure_style import (
     BLUE,
-    CORRECTED,
-    FAULT,
     GREEN,
     GREY,
     INK,
+    MARKS,
     PURPLE,
-    REFUSED,
     SKY,
     TRACK_COLOURS,
     VERMILION,
-    canvas,
-    legend,
-    number,
+    add_legend,
+    draw_number,
+    new_figure,
 )
 from fractus_sim.report.track import Track
+
+XY = tuple[float, float]
+ZoneKind = Literal["exclusion", "denial", "camera", "inclusion", "limit", "other"]
+
+
+@dataclass(frozen=True, slots=True)
+class DrawnZone:
+    """A zone. `shape` is a shapely geometry in metres of the map's frame."""
+
+    name: str
+    kind: ZoneKind
+    shape: Any
+
+
+@dataclass(frozen=True, slots=True)
+class DrawnNode:
+    """An edge node with its WiFi range."""
+
+    name: str
+    position: XY
+    wifi_range_m: float | None
+    used: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Mark:
+    """A numbered event mark.
+
+    Attributes:
+        kind: Drawing style.
+        number: Number or letter in the page.
+        position: Position in the map's frame.
+        origin: Position of the drone, if `position` is a position that was denied.
+        label: Legend text. Default: the kind.
+    """
+
+    kind: Literal["refused", "corrected", "fault"]
+    number: str
+    position: XY
+    origin: XY | None = None
+    label: str = ""
+
+
+@dataclass(frozen=True)
+class FlightMap:
+    """Content of a map, in metres east and north of the frame's origin.
+
+    Attributes:
+        area: Shape of the operation area.
+        depots: Names and positions.
+        links: Position of the drone when its traffic moved to a direct link, and position of the node.
+    """
+
+    title: str
+    frame: LocalFrame
+    tracks: tuple[Track, ...]
+    zones: tuple[DrawnZone, ...] = ()
+    area: Any = None
+    nodes: tuple[DrawnNode, ...] = ()
+    depots: tuple[tuple[str, XY], ...] = ()
+    marks: tuple[Mark, ...] = ()
+    links: tuple[tuple[XY, XY], ...] = ()
+
 
 _MARGIN_M = 45.0
 _MARGIN_SHARE = 0.12
@@ -49,20 +110,20 @@ _ZONE_STYLES: Mapping[str, tuple[str, str, str]] = {
 Bounds = tuple[float, float, float, float]
 
 
-def draw_map(scene: Scene) -> Figure:
+def draw_map(content: FlightMap) -> Figure:
     """Draw the map, in metres east and north of home."""
-    figure, axes = canvas(9.0, 6.6)
-    bounds = _bounds(scene)
-    _zones(axes, scene, bounds)
-    _operation_area(axes, scene)
-    _nodes(axes, scene, bounds)
-    if len(scene.tracks) == 1:
-        _path(axes, scene, figure)
+    figure, axes = new_figure(9.0, 6.6)
+    bounds = _bounds(content)
+    _draw_zones(axes, content, bounds)
+    _draw_operation_area(axes, content)
+    _draw_nodes(axes, content, bounds)
+    if len(content.tracks) == 1:
+        _draw_track(axes, content, figure)
     else:
-        _paths(axes, scene)
-    for here, there in scene.links:
-        axes.plot(*zip(here, there, strict=True), color=GREEN, linewidth=2.0, label="taking a direct link", zorder=5)
-    _marks(axes, scene)
+        _draw_tracks(axes, content)
+    for drone, node in content.links:
+        axes.plot(*zip(drone, node, strict=True), color=GREEN, linewidth=2.0, label="taking a direct link", zorder=5)
+    _draw_marks(axes, content)
     axes.set_xlim(bounds[0], bounds[2])
     axes.set_ylim(bounds[1], bounds[3])
     axes.set_aspect("equal")
@@ -70,29 +131,30 @@ def draw_map(scene: Scene) -> Figure:
     axes.set_ylabel("metres north of home", fontsize=9)
     axes.grid(color="#EEEEEE", linewidth=0.6, zorder=0)
     axes.set_axisbelow(True)
-    axes.set_title(scene.title, fontsize=11, loc="left")
-    legend(figure, axes)
+    axes.set_title(content.title, fontsize=11, loc="left")
+    add_legend(figure, axes)
     return figure
 
 
-def _bounds(scene: Scene) -> Bounds:
+def _bounds(content: FlightMap) -> Bounds:
     """Return the visible extent: paths, operation area, marks and restrictive zones. Other objects are clipped."""
-    shown: list[XY] = [scene.frame.xy(s.place.lat, s.place.lon) for track in scene.tracks for s in track.samples]
-    shown += [mark.at for mark in scene.marks]
-    if scene.area is not None and not scene.area.is_empty:
-        shown += _corners(scene.area)
-    core = shapely.box(*_grown(_corners(shapely.MultiPoint(shown or [(0.0, 0.0)])), _NEAR_M))
-    for zone in scene.zones:
-        if zone.kind != "limit" and zone.shape.intersects(core):
-            shown += _corners(zone.shape)
-    low_x, low_y, high_x, high_y = shapely.MultiPoint(shown or [(0.0, 0.0)]).bounds
+    points: list[XY] = [content.frame.xy(s.place.lat, s.place.lon) for track in content.tracks for s in track.samples]
+    points += [mark.position for mark in content.marks]
+    if content.area is not None and not content.area.is_empty:
+        points += _corners(content.area)
+    near = shapely.box(*_grown(_corners(shapely.MultiPoint(points or [(0.0, 0.0)])), _NEAR_M))
+    for zone in content.zones:
+        if zone.kind != "limit" and zone.shape.intersects(near):
+            points += _corners(zone.shape)
+    low_x, low_y, high_x, high_y = shapely.MultiPoint(points or [(0.0, 0.0)]).bounds
     margin_m = min(_MARGIN_M, max(_MARGIN_SHARE * max(high_x - low_x, high_y - low_y), 5.0))
     half_x = (high_x - low_x) / 2 + margin_m
     half_y = (high_y - low_y) / 2 + margin_m
-    half_x, half_y = max(half_x, half_y * _ASPECT), max(half_y, half_x / _ASPECT)
+    half_width = max(half_x, half_y * _ASPECT)
+    half_height = max(half_y, half_x / _ASPECT)
     x = (low_x + high_x) / 2
     y = (low_y + high_y) / 2
-    return x - half_x, y - half_y, x + half_x, y + half_y
+    return x - half_width, y - half_height, x + half_width, y + half_height
 
 
 def _grown(corners: list[XY], by_m: float) -> Bounds:
@@ -104,16 +166,18 @@ def _corners(shape: Any) -> list[XY]:
     return [(shape.bounds[0], shape.bounds[1]), (shape.bounds[2], shape.bounds[3])]
 
 
-def _operation_area(axes: Any, scene: Scene) -> None:
-    if scene.area is None or scene.area.is_empty:
+def _draw_operation_area(axes: Any, content: FlightMap) -> None:
+    if content.area is None or content.area.is_empty:
         return
-    for part in getattr(scene.area, "geoms", [scene.area]):
-        _patch(axes, part, facecolor=SKY, alpha=0.25, edgecolor=BLUE, linewidth=0.8, label="operation area", zorder=2)
+    for part in getattr(content.area, "geoms", [content.area]):
+        _draw_shape(
+            axes, part, facecolor=SKY, alpha=0.25, edgecolor=BLUE, linewidth=0.8, label="operation area", zorder=2
+        )
 
 
-def _zones(axes: Any, scene: Scene, bounds: Bounds) -> None:
+def _draw_zones(axes: Any, content: FlightMap, bounds: Bounds) -> None:
     window = shapely.box(*bounds)
-    for zone in scene.zones:
+    for zone in content.zones:
         colour, hatch, label = _ZONE_STYLES[zone.kind]
         shape = zone.shape.intersection(window)
         if shape.is_empty:
@@ -125,13 +189,15 @@ def _zones(axes: Any, scene: Scene, bounds: Bounds) -> None:
             )  # fmt: skip
             continue
         for part in getattr(shape, "geoms", [shape]):
-            _patch(axes, part, facecolor=colour, alpha=0.13, edgecolor="none", zorder=1)
-            _patch(axes, part, facecolor="none", edgecolor=colour, hatch=hatch, linewidth=1.2, label=label, zorder=1.5)
-        beside = scene.area is not None and scene.area.intersects(shape)
-        _zone_name(axes, zone.name, shape, colour, beside=beside)
+            _draw_shape(axes, part, facecolor=colour, alpha=0.13, edgecolor="none", zorder=1)
+            _draw_shape(
+                axes, part, facecolor="none", edgecolor=colour, hatch=hatch, linewidth=1.2, label=label, zorder=1.5
+            )
+        beside = content.area is not None and content.area.intersects(shape)
+        _draw_zone_name(axes, zone.name, shape, colour, beside=beside)
 
 
-def _zone_name(axes: Any, name: str, shape: Any, colour: str, *, beside: bool) -> None:
+def _draw_zone_name(axes: Any, name: str, shape: Any, colour: str, *, beside: bool) -> None:
     """Draw the name of a zone at its upper border, or next to the zone if the path crosses that position."""
     low_x, low_y, high_x, high_y = shape.bounds
     at = (high_x, (low_y + high_y) / 2) if beside else ((low_x + high_x) / 2, high_y)
@@ -142,7 +208,7 @@ def _zone_name(axes: Any, name: str, shape: Any, colour: str, *, beside: bool) -
     )  # fmt: skip
 
 
-def _patch(axes: Any, shape: Any, **style: Any) -> None:
+def _draw_shape(axes: Any, shape: Any, **style: Any) -> None:
     rings = [shape.exterior, *shape.interiors]
     vertices = np.concatenate([np.asarray(ring.coords) for ring in rings])
     codes = np.concatenate(
@@ -151,17 +217,19 @@ def _patch(axes: Any, shape: Any, **style: Any) -> None:
     axes.add_patch(PathPatch(Outline(vertices, codes), **style))
 
 
-def _nodes(axes: Any, scene: Scene, bounds: Bounds) -> None:
-    for node in scene.nodes:
-        at = node.at
+def _draw_nodes(axes: Any, content: FlightMap, bounds: Bounds) -> None:
+    for node in content.nodes:
+        at = node.position
         if not (bounds[0] < at[0] < bounds[2] and bounds[1] < at[1] < bounds[3]):
-            _far_node(axes, node.name, at, bounds)
+            _draw_far_node(axes, node.name, at, bounds)
             continue
-        if node.reach_m is not None:
+        if node.wifi_range_m is not None:
             axes.add_patch(
-                Circle(at, node.reach_m, fill=False, edgecolor=GREEN, linestyle=(0, (4, 3)), linewidth=1.0, zorder=3)
+                Circle(
+                    at, node.wifi_range_m, fill=False, edgecolor=GREEN, linestyle=(0, (4, 3)), linewidth=1.0, zorder=3
+                )
             )
-            axes.plot([], [], color=GREEN, linestyle=(0, (4, 3)), linewidth=1.0, label="WiFi reach")
+            axes.plot([], [], color=GREEN, linestyle=(0, (4, 3)), linewidth=1.0, label="WiFi range")
         axes.plot(
             *at, marker="s", markersize=9, color=GREEN if node.used else "white", markeredgecolor=INK, linestyle="none",
             label="edge node in use" if node.used else "edge node not used", zorder=6,
@@ -169,7 +237,7 @@ def _nodes(axes: Any, scene: Scene, bounds: Bounds) -> None:
         axes.annotate(
             node.name, at, xytext=(0, -15), textcoords="offset points", ha="center", fontsize=8.5, color=INK, zorder=6
         )
-    for name, at in scene.depots:
+    for name, at in content.depots:
         axes.plot(*at, marker="o", markersize=11, color="white", markeredgecolor=INK, markeredgewidth=1.5, zorder=6)
         axes.annotate("H", at, ha="center", va="center", fontsize=7.5, fontweight="bold", color=INK, zorder=7)
         axes.annotate(
@@ -177,7 +245,7 @@ def _nodes(axes: Any, scene: Scene, bounds: Bounds) -> None:
         )
 
 
-def _far_node(axes: Any, name: str, at: XY, bounds: tuple[float, float, float, float]) -> None:
+def _draw_far_node(axes: Any, name: str, at: XY, bounds: tuple[float, float, float, float]) -> None:
     """Draw a pointer to a node outside of the map."""
     middle = ((bounds[0] + bounds[2]) / 2, (bounds[1] + bounds[3]) / 2)
     dx = at[0] - middle[0]
@@ -193,16 +261,16 @@ def _far_node(axes: Any, name: str, at: XY, bounds: tuple[float, float, float, f
     )  # fmt: skip
 
 
-def _points(scene: Scene, track: Track) -> np.ndarray:
-    return np.array([scene.frame.xy(s.place.lat, s.place.lon) for s in track.samples])
+def _points(content: FlightMap, track: Track) -> np.ndarray:
+    return np.array([content.frame.xy(s.place.lat, s.place.lon) for s in track.samples])
 
 
-def _path(axes: Any, scene: Scene, figure: Figure) -> None:
+def _draw_track(axes: Any, content: FlightMap, figure: Figure) -> None:
     """Draw a single track, coloured by altitude."""
-    (track,) = scene.tracks
+    (track,) = content.tracks
     if len(track.samples) < 2:
         return
-    points = _points(scene, track)
+    points = _points(content, track)
     heights = np.array([s.place.alt_m for s in track.samples])
     segments = np.stack([points[:-1], points[1:]], axis=1)
     axes.plot(points[:, 0], points[:, 1], color="white", linewidth=5.0, zorder=4, solid_capstyle="round")
@@ -212,26 +280,26 @@ def _path(axes: Any, scene: Scene, figure: Figure) -> None:
     bar = figure.colorbar(line, ax=axes, shrink=0.6, pad=0.01, aspect=30)
     bar.set_label("metres above home", fontsize=9)
     bar.ax.tick_params(labelsize=8)
-    _arrows(axes, points)
+    _draw_arrows(axes, points)
 
 
-def _paths(axes: Any, scene: Scene) -> None:
+def _draw_tracks(axes: Any, content: FlightMap) -> None:
     """Draw several tracks, each with its own colour and start mark."""
-    for index, track in enumerate(scene.tracks):
+    for index, track in enumerate(content.tracks):
         if len(track.samples) < 2:
             continue
         colour = TRACK_COLOURS[index % len(TRACK_COLOURS)]
-        points = _points(scene, track)
-        label = track.name if len(scene.tracks) <= _NAMED_TRACKS else None
+        points = _points(content, track)
+        label = track.name if len(content.tracks) <= _NAMED_TRACKS else None
         axes.plot(points[:, 0], points[:, 1], color="white", linewidth=3.6, zorder=4, solid_capstyle="round")
         axes.plot(points[:, 0], points[:, 1], color=colour, linewidth=2.0, zorder=5, label=label)
         axes.plot(
             *points[0], marker="o", markersize=6, color="white", markeredgecolor=colour, markeredgewidth=2.0, zorder=6
         )
-        _arrows(axes, points, colour)
+        _draw_arrows(axes, points, colour)
 
 
-def _arrows(axes: Any, points: np.ndarray, colour: str = INK) -> None:
+def _draw_arrows(axes: Any, points: np.ndarray, colour: str = INK) -> None:
     """Draw arrowheads in flight direction at equal distances along the path."""
     steps = np.hypot(*np.diff(points, axis=0).T)
     along = np.concatenate([[0.0], np.cumsum(steps)])
@@ -247,75 +315,12 @@ def _arrows(axes: Any, points: np.ndarray, colour: str = INK) -> None:
             )  # fmt: skip
 
 
-def _marks(axes: Any, scene: Scene) -> None:
-    for mark in scene.marks:
+def _draw_marks(axes: Any, content: FlightMap) -> None:
+    for mark in content.marks:
         if mark.kind == "refused" and mark.origin is not None:
             axes.plot(
-                [mark.origin[0], mark.at[0]], [mark.origin[1], mark.at[1]], color=VERMILION, linewidth=1.2,
+                [mark.origin[0], mark.position[0]], [mark.origin[1], mark.position[1]], color=VERMILION, linewidth=1.2,
                 linestyle=":", zorder=6,
             )  # fmt: skip
-        axes.plot(*mark.at, **MARKS[mark.kind], label=mark.label or mark.kind, zorder=8)
-        number(axes, mark.number, *mark.at)
-
-
-XY = tuple[float, float]
-ZoneKind = Literal["exclusion", "denial", "camera", "inclusion", "limit", "other"]
-MARKS: Mapping[str, Mapping[str, Any]] = {"refused": REFUSED, "corrected": CORRECTED, "fault": FAULT}
-
-
-@dataclass(frozen=True, slots=True)
-class DrawnZone:
-    """A zone. `shape` is a shapely geometry in metres of the scene's frame."""
-
-    name: str
-    kind: ZoneKind
-    shape: Any
-
-
-@dataclass(frozen=True, slots=True)
-class DrawnNode:
-    """An edge node with its WiFi range."""
-
-    name: str
-    at: XY
-    reach_m: float | None
-    used: bool
-
-
-@dataclass(frozen=True, slots=True)
-class Mark:
-    """A numbered event mark.
-
-    Attributes:
-        kind: Drawing style.
-        at: Position in the scene's frame.
-        origin: Position of the drone, if `at` is a position that was denied.
-        label: Legend text. Default: the kind.
-    """
-
-    kind: Literal["refused", "corrected", "fault"]
-    number: str
-    at: XY
-    origin: XY | None = None
-    label: str = ""
-
-
-@dataclass(frozen=True)
-class Scene:
-    """All objects of a map, in metres east and north of the frame's origin.
-
-    Attributes:
-        area: Shape of the operation area.
-        depots: Names and positions.
-        links: Position of the drone when its traffic moved to a direct link, and position of the node.
-    """
-
-    title: str
-    frame: LocalFrame
-    tracks: tuple[Track, ...]
-    zones: tuple[DrawnZone, ...] = ()
-    area: Any = None
-    nodes: tuple[DrawnNode, ...] = ()
-    depots: tuple[tuple[str, XY], ...] = ()
-    marks: tuple[Mark, ...] = ()
-    links: tuple[tuple[XY, XY], ...] = ()
+        axes.plot(*mark.position, **MARKS[mark.kind], label=mark.label or mark.kind, zorder=8)
+        draw_number(axes, mark.number, *mark.position)

@@ -8,15 +8,26 @@ from typing import Any, Literal
 
 from matplotlib.figure import Figure
 
-from fractus_sim.report.figure_style import BLUE, GREY, INK, ORANGE, PURPLE, TRACK_COLOURS, legend, number, panels
-from fractus_sim.report.flight_map import MARKS
+from fractus_sim.report.figure_style import (
+    BLUE,
+    GREY,
+    INK,
+    MARKS,
+    ORANGE,
+    PURPLE,
+    TRACK_COLOURS,
+    add_legend,
+    draw_number,
+    new_panels,
+)
 from fractus_sim.report.track import Sample, Track
 
 Panel = Literal["altitude", "speed", "battery", "voltage"]
 _NAMED_TRACKS = 10
 _HEADROOM = 1.18
 _ROW_POINTS = 12
-_CHARACTER_SHARE = 0.0085  # # width of a letter of a fault label, as a share of the axis
+_CHARACTER_SHARE = 0.0085
+"""Width of a letter of a fault label, as a share of the axis."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,22 +36,29 @@ class Limit:
 
     panel: Panel
     value: float
-    words: str
+    label: str
 
 
 @dataclass(frozen=True, slots=True)
 class Span:
-    """A shaded time span. If `fault` is set, it is drawn as a numbered fault."""
+    """A shaded time span. Faults are drawn in the colour of fault marks, with their label above the figure."""
 
     begin_s: float
     end_s: float
-    words: str
+    label: str
     fault: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """A request that policies changed: requested and flown altitude."""
+    """A request that policies changed.
+
+    Attributes:
+        number: Number in the page.
+        altitude_m: Requested altitude.
+        label: Legend text.
+        flown_m: Altitude that was flown instead. None if it is equal, or if the request was refused.
+    """
 
     kind: Literal["refused", "corrected"]
     number: str
@@ -61,7 +79,7 @@ class Profile:
     limits: tuple[Limit, ...] = ()
     spans: tuple[Span, ...] = ()
     requests: tuple[Request, ...] = ()
-    axis: str = "seconds"
+    time_label: str = "seconds"
 
 
 _VALUES: Mapping[Panel, tuple[str, Callable[[Sample], float]]] = {
@@ -74,19 +92,19 @@ _VALUES: Mapping[Panel, tuple[str, Callable[[Sample], float]]] = {
 
 def draw_profile(profile: Profile) -> Figure:
     """Draw the panels vertically stacked with a common time axis."""
-    figure, every = panels(9.0, _heights(profile), sharex=True)
-    for axes, panel in zip(every, profile.panels, strict=True):
-        shown = _curves(axes, profile, panel) + _limits(axes, profile, panel)
+    figure, all_axes = new_panels(9.0, _heights(profile), sharex=True)
+    for axes, panel in zip(all_axes, profile.panels, strict=True):
+        values = _draw_curves(axes, profile, panel) + _draw_limits(axes, profile, panel)
         if panel == "altitude":
-            shown += _requests(axes, profile)
-        _spans(axes, profile, top=axes is every[0])
-        _scale(axes, panel, shown)
+            values += _draw_requests(axes, profile)
+        _draw_spans(axes, profile, top=axes is all_axes[0])
+        _set_scale(axes, panel, values)
     first, last = _time_span(profile)
-    every[-1].set_xlim(first, max(last, first + 1.0))
-    every[-1].set_xlabel(profile.axis, fontsize=9)
-    rows = max((row + 1 for span, row in _rows(profile) if span.fault), default=0)
-    every[0].set_title(profile.title, fontsize=11, loc="left", pad=6 + _ROW_POINTS * rows)
-    legend(figure, *every)
+    all_axes[-1].set_xlim(first, max(last, first + 1.0))
+    all_axes[-1].set_xlabel(profile.time_label, fontsize=9)
+    rows = max((row + 1 for span, row in _label_rows(profile) if span.fault), default=0)
+    all_axes[0].set_title(profile.title, fontsize=11, loc="left", pad=6 + _ROW_POINTS * rows)
+    add_legend(figure, *all_axes)
     return figure
 
 
@@ -99,13 +117,14 @@ def _time_span(profile: Profile) -> tuple[float, float]:
     return min([*times, 0.0]), max([*times, 1.0])
 
 
-def _curves(axes: Any, profile: Profile, panel: Panel) -> list[float]:
+def _draw_curves(axes: Any, profile: Profile, panel: Panel) -> list[float]:
+    """Draw the curve of each track. Return the drawn values."""
     value = _VALUES[panel][1]
-    shown: list[float] = []
+    drawn: list[float] = []
     for index, track in enumerate(profile.tracks):
         times = [s.time_s - profile.start_s for s in track.samples]
         values = [value(s) for s in track.samples]
-        shown += values
+        drawn += values
         if len(profile.tracks) == 1:
             axes.fill_between(times, values, color=BLUE, alpha=0.10, zorder=1)
             axes.plot(
@@ -115,36 +134,38 @@ def _curves(axes: Any, profile: Profile, panel: Panel) -> list[float]:
             colour = TRACK_COLOURS[index % len(TRACK_COLOURS)]
             label = track.name if len(profile.tracks) <= _NAMED_TRACKS else None
             axes.plot(times, values, color=colour, linewidth=1.5, label=label, zorder=4)
-    return shown
+    return drawn
 
 
-def _limits(axes: Any, profile: Profile, panel: Panel) -> list[float]:
+def _draw_limits(axes: Any, profile: Profile, panel: Panel) -> list[float]:
+    """Draw the limits of a panel. Return their values."""
     drawn = [limit for limit in profile.limits if limit.panel == panel]
     for limit in drawn:
         axes.axhline(limit.value, color=INK, linestyle=(0, (5, 3)), linewidth=1.1, label=f"{panel} limit", zorder=3)
         axes.annotate(
-            limit.words, (0.62, limit.value), xycoords=("axes fraction", "data"), xytext=(0, 4),
+            limit.label, (0.62, limit.value), xycoords=("axes fraction", "data"), xytext=(0, 4),
             textcoords="offset points", ha="center", fontsize=8, color=INK,
         )  # fmt: skip
     return [limit.value for limit in drawn]
 
 
-def _requests(axes: Any, profile: Profile) -> list[float]:
+def _draw_requests(axes: Any, profile: Profile) -> list[float]:
+    """Draw the requests. Return their altitudes."""
     for request in profile.requests:
-        at = request.time_s - profile.start_s
+        time_s = request.time_s - profile.start_s
         if request.flown_m is not None:
             axes.annotate(
-                "", (at, request.flown_m), xytext=(at, request.altitude_m),
+                "", (time_s, request.flown_m), xytext=(time_s, request.altitude_m),
                 arrowprops={"arrowstyle": "-|>", "color": ORANGE, "linewidth": 1.6, "shrinkA": 5, "shrinkB": 0},
                 zorder=5,
             )  # fmt: skip
-        axes.plot(at, request.altitude_m, **MARKS[request.kind], label=request.label, zorder=8)
-        number(axes, request.number, at, request.altitude_m)
+        axes.plot(time_s, request.altitude_m, **MARKS[request.kind], label=request.label, zorder=8)
+        draw_number(axes, request.number, time_s, request.altitude_m)
     return [request.altitude_m for request in profile.requests]
 
 
-def _rows(profile: Profile) -> list[tuple[Span, int]]:
-    """Yield spans with the row of their label, so that labels of neighbours do not overlap."""
+def _label_rows(profile: Profile) -> list[tuple[Span, int]]:
+    """Return spans with the row of their label, so that labels of neighbours do not overlap."""
     first, last = _time_span(profile)
     ends: list[float] = []
     placed = []
@@ -153,14 +174,14 @@ def _rows(profile: Profile) -> list[tuple[Span, int]]:
             placed.append((span, 0))
             continue
         row = next((at for at, end in enumerate(ends) if end <= span.begin_s), len(ends))
-        width_s = (last - first) * len(span.words) * _CHARACTER_SHARE
+        width_s = (last - first) * len(span.label) * _CHARACTER_SHARE
         ends[row : row + 1] = [span.begin_s + width_s]
         placed.append((span, row))
     return placed
 
 
-def _spans(axes: Any, profile: Profile, *, top: bool) -> None:
-    for span, row in _rows(profile):
+def _draw_spans(axes: Any, profile: Profile, *, top: bool) -> None:
+    for span, row in _label_rows(profile):
         begin = span.begin_s - profile.start_s
         end = span.end_s - profile.start_s
         if span.fault:
@@ -171,17 +192,17 @@ def _spans(axes: Any, profile: Profile, *, top: bool) -> None:
             axes.axvspan(begin, end, color=GREY, alpha=0.13, linewidth=0, zorder=0.5)
             place = {"xytext": (0, -12), "ha": "center"}
             begin = (begin + end) / 2
-        if top and span.words:
+        if top and span.label:
             axes.annotate(
-                span.words, (begin, 1.0), xycoords=("data", "axes fraction"), textcoords="offset points", fontsize=8,
+                span.label, (begin, 1.0), xycoords=("data", "axes fraction"), textcoords="offset points", fontsize=8,
                 color=INK, **place,
             )  # fmt: skip
 
 
-def _scale(axes: Any, panel: Panel, shown: list[float]) -> None:
+def _set_scale(axes: Any, panel: Panel, values: list[float]) -> None:
     axes.set_ylabel(_VALUES[panel][0], fontsize=9)
     axes.grid(color="#EEEEEE", linewidth=0.6, zorder=0)
     if panel == "battery":
         axes.set_ylim(0, 105)
     else:
-        axes.set_ylim(0, max(shown, default=10.0) * _HEADROOM + 1.0)
+        axes.set_ylim(0, max(values, default=10.0) * _HEADROOM + 1.0)

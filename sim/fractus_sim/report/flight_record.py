@@ -1,4 +1,4 @@
-"""Data of one flight: objects of the cluster, and the audit log with its telemetry samples."""
+"""Data of one mission: objects of the cluster, and the audit logs of the drone with telemetry samples and calls."""
 
 from __future__ import annotations
 
@@ -14,44 +14,54 @@ from fractus_core.api import Application, DeploymentPlan, Depot, Drone, EdgeNode
 from fractus_core.api.geometry import Point
 from fractus_core.geo import LocalFrame
 from fractus_core.policy.selectors import node_attributes, policy_selects
+from fractus_runtime.audit_chain import entries
 
 from fractus_sim.report.track import Place, Sample, Track
 
 OBJECTS = "objects.json"
 AUDIT = "audit"
 PICTURES = "pictures"
-_DECIDED = {"correct", "deny", "takeover"}
+_CHANGING_ACTIONS = frozenset({"correct", "deny", "takeover"})
+_FLIGHT_MARGIN_S = 3.0
+_MERGE_S = 60.0
+"""Maximum time between identical calls that are listed as one."""
+
 _KINDS: tuple[type[Resource], ...] = (Application, DeploymentPlan, Depot, Drone, EdgeNode, Policy, Zone)
 
 
 @dataclass(frozen=True, slots=True)
-class Judgement:
-    """A call that a policy corrected, denied, or answered with a takeover.
+class JudgedCall:
+    """A call with its verdict, or an action of the system.
 
     Attributes:
-        asked: Requested position for calls that fly to a position. Missing lat and lon are the position of the drone.
-        flown: Position that was flown instead.
-        detail: Requested arguments as text.
-        count: Number of consecutive identical calls.
+        time_s: Time of the call, seconds. The clock depends on the report.
+        caller: Component, or the system.
+        method: Service method. For an action of the system, the action.
+        action: allow, correct, deny, or takeover (denied, and control revoked). Empty for an action of the system.
+        requested: Requested position, for calls that fly to a position.
+        flown: Position that was flown.
+        position: Position of the drone.
+        arguments: Requested arguments as text.
+        count: Number of identical calls that this one stands for.
     """
 
     time_s: float
-    component: str
+    caller: str
     method: str
     action: str
     code: str
     reason: str
     policies: tuple[str, ...]
-    detail: str
-    asked: Place | None
+    requested: Place | None
     flown: Place | None
-    at: Place | None
+    position: Place | None
+    arguments: str = ""
     count: int = 1
 
     @property
     def refused(self) -> bool:
         """True if no part of the call was executed."""
-        return self.action != "correct"
+        return self.action in {"deny", "takeover"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +71,7 @@ class PathChange:
     time_s: float
     node: str
     direct: bool
-    why: str
+    reason: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,8 +87,17 @@ class Pod:
 
 
 @dataclass(frozen=True)
-class Record:
-    """All data of the report. Pictures are listed by file name."""
+class FlightRecord:
+    """All data of the report.
+
+    Attributes:
+        decisions: Calls that policies changed, in order.
+        calls: Number of calls of components.
+        results: Number of pictures that were checked and kept.
+        audit: Numbers of audit log entries, and the problem of the hash chain.
+        times: Unix seconds of events of the mission.
+        pictures: File names of pictures.
+    """
 
     application: Application
     plan: DeploymentPlan | None
@@ -90,7 +109,7 @@ class Record:
     pods: tuple[Pod, ...]
     events: tuple[Mapping[str, Any], ...]
     samples: tuple[Sample, ...]
-    judgements: tuple[Judgement, ...]
+    decisions: tuple[JudgedCall, ...]
     calls: int
     results: int = 0
     audit: Mapping[str, Any] = field(default_factory=dict)
@@ -99,7 +118,7 @@ class Record:
     links: tuple[PathChange, ...] = ()
 
     @classmethod
-    def read(cls, folder: Path) -> Record:
+    def read(cls, folder: Path) -> FlightRecord:
         """Read the files that the demo wrote to a folder.
 
         Raises:
@@ -108,39 +127,42 @@ class Record:
         """
         content = json.loads((folder / OBJECTS).read_text())
         applied_s = content.get("times", {}).get("applied", 0.0)
-        entries = [entry for path in sorted((folder / AUDIT).glob("*.jsonl")) for entry in _entries(path, applied_s)]
+        audit: list[dict[str, Any]] = []
+        for path in sorted((folder / AUDIT).glob("*.jsonl")):
+            with path.open("rb") as file:
+                audit += [entry for entry in entries(file) if is_of_mission(entry, applied_s)]
         pictures = tuple(sorted(path.name for path in (folder / PICTURES).glob("*.jpg")))
-        return replace(cls.of(content, entries), pictures=pictures)
+        return replace(cls.of(content, audit), pictures=pictures)
 
     @classmethod
-    def of(cls, content: Mapping[str, Any], audit: Iterable[Mapping[str, Any]]) -> Record:
+    def of(cls, content: Mapping[str, Any], audit: Iterable[Mapping[str, Any]]) -> FlightRecord:
         """Create the record from parsed JSON.
 
         Args:
             content: `objects` (manifests from the API server), `pods`, `events`, `times`, `audit`.
             audit: Entries of the drone's audit logs: calls, takeovers, and telemetry samples.
         """
-        found: dict[str, list[Any]] = {kind.KIND: [] for kind in _KINDS}
+        objects: dict[str, list[Any]] = {kind.KIND: [] for kind in _KINDS}
         parsers = {kind.KIND: kind for kind in _KINDS}
         for body in content["objects"]:
             if body["kind"] in parsers:
-                found[body["kind"]].append(parsers[body["kind"]].from_body(body))
-        plans = found["DeploymentPlan"]
-        chosen = plans[0].spec.drone.node if plans and plans[0].spec.drone else None
-        entries = sorted(audit, key=lambda e: str(e.get("time", "")))
+                objects[body["kind"]].append(parsers[body["kind"]].from_body(body))
+        plans = objects["DeploymentPlan"]
+        drone_name = plans[0].spec.drone.node if plans and plans[0].spec.drone else None
+        ordered = sorted(audit, key=lambda e: str(e.get("time", "")))
         return cls(
-            application=found["Application"][0],
+            application=objects["Application"][0],
             plan=plans[0] if plans else None,
-            drone=next((d for d in found["Drone"] if d.name == chosen), None),
-            depots=tuple(found["Depot"]),
-            edge_nodes=tuple(sorted(found["EdgeNode"], key=lambda n: n.name)),
-            policies=tuple(sorted(found["Policy"], key=lambda p: p.name)),
-            zones=tuple(sorted(found["Zone"], key=lambda z: z.name)),
+            drone=next((d for d in objects["Drone"] if d.name == drone_name), None),
+            depots=tuple(objects["Depot"]),
+            edge_nodes=tuple(sorted(objects["EdgeNode"], key=lambda n: n.name)),
+            policies=tuple(sorted(objects["Policy"], key=lambda p: p.name)),
+            zones=tuple(sorted(objects["Zone"], key=lambda z: z.name)),
             pods=tuple(sorted((_pod(body) for body in content.get("pods", ())), key=lambda p: (p.component, p.name))),
             events=tuple(content.get("events", ())),
-            samples=_flight(_sample(e) for e in entries if _has_state(e)),
-            judgements=judgements_of(entries),
-            calls=sum(e.get("kind") == "call" for e in entries),
+            samples=_flight(_sample(e) for e in ordered if _has_state(e)),
+            decisions=policy_decisions(ordered),
+            calls=sum(e.get("kind") == "call" for e in ordered),
             results=content.get("results", 0),
             audit=content.get("audit", {}),
             times=content.get("times", {}),
@@ -186,29 +208,23 @@ class Record:
         home = self.home
         if home is not None:
             return LocalFrame(home.lat, home.lon)
-        at = self.depots[0].spec.location if self.depots else Point(lat=0, lon=0)
-        return LocalFrame.at(at)
+        return LocalFrame.at(self.depots[0].spec.location if self.depots else Point(lat=0, lon=0))
 
 
-def of_mission(line: bytes, applied_s: float) -> bool:
-    """Return True if a line of an audit log is an entry made after the application was applied."""
+def is_of_mission(entry: Mapping[str, Any], applied_s: float) -> bool:
+    """Return True if an audit log entry was made after the application was applied. Entries without time are ignored."""
     try:
-        return _time(json.loads(line)["time"]) >= applied_s
-    except (ValueError, KeyError, TypeError):  # # incomplete last line
+        return _time_s(entry["time"]) >= applied_s
+    except (ValueError, KeyError, TypeError):
         return False
 
 
-def taken_s(picture: str) -> float:
-    """Return the time of a picture from its file name."""
+def picture_time_s(picture: str) -> float:
+    """Return the time of a picture from its file name, Unix seconds."""
     return datetime.strptime(picture[:17], "%Y%m%d%H%M%S%f").replace(tzinfo=UTC).timestamp()
 
 
-def _entries(path: Path, applied_s: float) -> list[dict[str, Any]]:
-    with path.open("rb") as file:
-        return [json.loads(line) for line in file if of_mission(line, applied_s)]
-
-
-def _time(text: str) -> float:
+def _time_s(text: str) -> float:
     return datetime.fromisoformat(text).timestamp()
 
 
@@ -219,7 +235,7 @@ def _has_state(entry: Mapping[str, Any]) -> bool:
 
 def _sample(entry: Mapping[str, Any]) -> Sample:
     return Sample(
-        time_s=_time(entry["time"]),
+        time_s=_time_s(entry["time"]),
         place=Place(entry.get("lat") or 0.0, entry.get("lon") or 0.0, entry.get("alt") or 0.0),
         speed_mps=entry.get("speed", 0.0),
         mode=entry.get("mode", ""),
@@ -234,38 +250,48 @@ def _flight(samples: Iterable[Sample]) -> tuple[Sample, ...]:
     flying = [s.time_s for s in ordered if s.in_air]
     if not flying:
         return ()
-    return tuple(s for s in ordered if flying[0] - 3.0 <= s.time_s <= flying[-1] + 3.0)
+    begin_s = flying[0] - _FLIGHT_MARGIN_S
+    end_s = flying[-1] + _FLIGHT_MARGIN_S
+    return tuple(s for s in ordered if begin_s <= s.time_s <= end_s)
 
 
-def judgements_of(entries: Iterable[Mapping[str, Any]]) -> tuple[Judgement, ...]:
-    """Return the calls that policies changed, in order. Repetitions within a short time count as one."""
-    ordered = sorted(entries, key=lambda e: str(e.get("time", "")))
-    return _merged([j for e in ordered if (j := _judgement(e)) is not None])
+def policy_decisions(audit: Iterable[Mapping[str, Any]]) -> tuple[JudgedCall, ...]:
+    """Return the calls that policies changed, in order. Repetitions within a short time are merged.
+
+    Args:
+        audit: Entries of audit logs in any order.
+    """
+    ordered = sorted(audit, key=lambda e: str(e.get("time", "")))
+    return _merged(call for entry in ordered if (call := _policy_decision(entry)) is not None)
 
 
-def _judgement(entry: Mapping[str, Any]) -> Judgement | None:
-    """Return the judgement of a call, monitor or takeover entry. Return None if nothing was changed."""
+def _policy_decision(entry: Mapping[str, Any]) -> JudgedCall | None:
+    """Return the changed call of a call, monitor or takeover entry. Return None if nothing was changed."""
     kind = entry.get("kind")
-    if kind not in {"call", "monitor", "takeover"} or (kind != "takeover" and entry.get("action") not in _DECIDED):
+    action = entry.get("action")
+    if kind not in {"call", "monitor", "takeover"}:
         return None
-    at = _place(entry, None)
+    if kind != "takeover" and action not in _CHANGING_ACTIONS:
+        return None
+    position = _place(entry, None)
     args = entry.get("args") or {}
-    return Judgement(
-        time_s=_time(entry["time"]),
-        component=_component(entry.get("caller", "")) if kind == "call" else "the system",
+    return JudgedCall(
+        time_s=_time_s(entry["time"]),
+        caller=component_name(entry.get("caller", "")) if kind == "call" else "the system",
         method=entry["method"] if kind == "call" else entry.get("action", kind),
-        action=entry["action"] if entry.get("action") in _DECIDED else "takeover",
+        action=str(action) if action in _CHANGING_ACTIONS else "takeover",
         code=entry.get("code", ""),
         reason=entry.get("reason", ""),
         policies=tuple(entry.get("policies", ())),
-        detail=_words(args),
-        asked=_place(args, at),
-        flown=_place(entry.get("result"), at),
-        at=at,
+        requested=_place(args, position),
+        flown=_place(entry.get("result"), position),
+        position=position,
+        arguments=_format_arguments(args),
     )
 
 
-def _component(identity: str) -> str:
+def component_name(identity: str) -> str:
+    """Return the component of an instance's identity, or the identity if it has a different format."""
     parts = identity.split("/")
     return parts[parts.index("component") + 1] if "component" in parts[:-1] else identity
 
@@ -280,34 +306,40 @@ def _place(value: Mapping[str, Any] | None, base: Place | None) -> Place | None:
         return None
     if lat is None or lon is None:
         return Place(base.lat, base.lon, float(alt)) if base is not None and alt is not None else None
-    return Place(float(lat), float(lon), float(alt) if alt is not None else base.alt_m if base else 0.0)
+    if alt is not None:
+        return Place(float(lat), float(lon), float(alt))
+    return Place(float(lat), float(lon), base.alt_m if base is not None else 0.0)
 
 
-_UNITS = {"speed_mps": "{:.1f} m/s", "altitude_m": "{:.0f} m", "alt": "{:.0f} m"}
+_ARGUMENT_FORMATS = {"speed_mps": "{:.1f} m/s", "altitude_m": "{:.0f} m", "alt": "{:.0f} m"}
 
 
-def _words(args: Mapping[str, Any]) -> str:
+def _format_arguments(args: Mapping[str, Any]) -> str:
     lat = args.get("lat")
     lon = args.get("lon")
-    where = [f"{lat:.6f}, {lon:.6f}"] if isinstance(lat, float) and isinstance(lon, float) else []
-    figures = [shape.format(args[key]) for key, shape in _UNITS.items() if isinstance(args.get(key), int | float)]
-    return ", ".join([*where, *figures])
+    position = [f"{lat:.6f}, {lon:.6f}"] if isinstance(lat, float) and isinstance(lon, float) else []
+    values = [
+        template.format(args[key])
+        for key, template in _ARGUMENT_FORMATS.items()
+        if isinstance(args.get(key), int | float)
+    ]
+    return ", ".join([*position, *values])
 
 
-def _merged(judged: Iterable[Judgement]) -> tuple[Judgement, ...]:
+def _merged(calls: Iterable[JudgedCall]) -> tuple[JudgedCall, ...]:
     """Merge identical calls of a component with the same verdict within one minute, also if they are interleaved."""
-    kept: list[Judgement] = []
+    merged: list[JudgedCall] = []
     last: dict[tuple[str, ...], tuple[int, float]] = {}
-    for one in judged:
-        key = (one.component, one.method, one.action, one.code, one.detail, *one.policies)
+    for call in calls:
+        key = (call.caller, call.method, call.action, call.code, call.arguments, *call.policies)
         index, time_s = last.get(key, (-1, -math.inf))
-        if index >= 0 and one.time_s - time_s < 60.0:
-            kept[index] = replace(kept[index], count=kept[index].count + 1)
+        if index >= 0 and call.time_s - time_s < _MERGE_S:
+            merged[index] = replace(merged[index], count=merged[index].count + 1)
         else:
-            index = len(kept)
-            kept.append(one)
-        last[key] = (index, one.time_s)
-    return tuple(kept)
+            index = len(merged)
+            merged.append(call)
+        last[key] = (index, call.time_s)
+    return tuple(merged)
 
 
 def _pod(body: Mapping[str, Any]) -> Pod:
@@ -324,7 +356,7 @@ def _pod(body: Mapping[str, Any]) -> Pod:
         name=metadata["name"],
         component=labels.get("fractus.dev/component", ""),
         node=body.get("spec", {}).get("nodeName", ""),
-        created_s=_time(metadata["creationTimestamp"]),
-        running_s=max(map(_time, starts)) if ready and starts else None,
+        created_s=_time_s(metadata["creationTimestamp"]),
+        running_s=max(map(_time_s, starts)) if ready and starts else None,
         restarts=sum(c.get("restartCount", 0) for c in status.get("containerStatuses", ())),
     )

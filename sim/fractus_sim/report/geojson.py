@@ -1,7 +1,8 @@
-"""GeoJSON building blocks (lon, lat, metres above home) of the reports."""
+"""GeoJSON building blocks of the reports. Coordinates are longitude, latitude, and metres above home."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 from fractus_sim.report.track import Place, Track
@@ -22,7 +23,12 @@ def feature(geometry: dict[str, Any], **properties: Any) -> dict[str, Any]:
     return {"type": "Feature", "geometry": geometry, "properties": properties}
 
 
-def path(track: Track, **properties: Any) -> dict[str, Any]:
+def feature_collection(features: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Return a FeatureCollection."""
+    return {"type": "FeatureCollection", "features": list(features)}
+
+
+def path_feature(track: Track, **properties: Any) -> dict[str, Any]:
     """Return a track as a LineString Feature with the time of each point."""
     line = {"type": "LineString", "coordinates": [lonlat(s.place) for s in track.samples]}
     times = [round(s.time_s, 3) for s in track.samples]

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from fractus_core.api.geometry import Point
 from fractus_core.geo import geodesic_m
 
+MIN_STEP_M = 0.25
+
 
 @dataclass(frozen=True, slots=True)
 class Place:
@@ -24,7 +26,13 @@ class Place:
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """State of the drone at one time. `battery` is the share of the full charge."""
+    """State of the drone at one time.
+
+    Attributes:
+        time_s: Time, seconds. The clock depends on the report.
+        mode: Flight mode of the autopilot.
+        battery: Share of the full charge.
+    """
 
     time_s: float
     place: Place
@@ -50,45 +58,45 @@ class Track:
     @property
     def landing_s(self) -> float | None:
         """Final landing time. None while in the air or if the drone never took off."""
-        flying = [i for i, s in enumerate(self.samples) if s.in_air]
-        return self.samples[flying[-1] + 1].time_s if flying and flying[-1] + 1 < len(self.samples) else None
+        in_air = [i for i, s in enumerate(self.samples) if s.in_air]
+        if not in_air or in_air[-1] + 1 == len(self.samples):
+            return None
+        return self.samples[in_air[-1] + 1].time_s
 
     @property
     def home(self) -> Place | None:
         """Takeoff position. None if the drone never took off."""
-        at = next((i for i, s in enumerate(self.samples) if s.in_air), None)
-        return self.samples[max(at - 1, 0)].place if at is not None else None
+        first = next((i for i, s in enumerate(self.samples) if s.in_air), None)
+        return self.samples[max(first - 1, 0)].place if first is not None else None
 
     @property
     def distance_m(self) -> float:
-        """Horizontal distance flown, metres. Steps below 0.25 m are ignored as position noise."""
+        """Horizontal distance flown, metres. Steps below MIN_STEP_M are ignored as position noise."""
         total = 0.0
-        last = None
-        for sample in self.samples:
-            if not sample.in_air:
-                continue
+        last: Place | None = None
+        for place in (sample.place for sample in self.samples if sample.in_air):
             if last is None:
-                last = sample.place
+                last = place
                 continue
-            step = geodesic_m(last.ground, sample.place.ground)
-            if step >= 0.25:
-                total = total + step
-                last = sample.place
+            step_m = geodesic_m(last.ground, place.ground)
+            if step_m >= MIN_STEP_M:
+                total += step_m
+                last = place
         return total
 
     @property
     def max_altitude_m(self) -> float:
-        """Maximum altitude above home."""
+        """Maximum altitude above home, metres."""
         return max((s.place.alt_m for s in self.samples), default=0.0)
 
     @property
     def max_speed_mps(self) -> float:
-        """Maximum ground speed in the air."""
+        """Maximum ground speed in the air, m/s."""
         return max((s.speed_mps for s in self.samples if s.in_air), default=0.0)
 
     @property
-    def miss_m(self) -> float | None:
-        """Distance between takeoff and landing position. None before the landing."""
+    def landing_error_m(self) -> float | None:
+        """Distance between takeoff and landing position, metres. None before the landing."""
         if self.home is None or self.landing_s is None:
             return None
         return geodesic_m(self.home.ground, self.samples[-1].place.ground)

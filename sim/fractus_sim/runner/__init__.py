@@ -6,6 +6,7 @@ Run an experiment file and require that all its checks hold:
     assert outcome.holds
 """
 
-from fractus_sim.runner.experiment_runner import Outcome, Progress, run
+from fractus_sim.progress import Progress
+from fractus_sim.runner.experiment_runner import Outcome, run
 
 __all__ = ["Outcome", "Progress", "run"]

@@ -10,7 +10,7 @@ from fractus_sim.experiment.timed_faults import Fault, LinkLoss, NodePowerOff
 from fractus_sim.testbeds.ground_station import Station
 from fractus_sim.testbeds.testbed import Testbed
 
-ANSWER_S = 1.0
+RESPONSE_TIMEOUT_S = 1.0
 ATTEMPTS = 5
 
 
@@ -31,7 +31,9 @@ class Occurrence:
 
 
 @dataclass(slots=True)
-class _Running:
+class _InjectedFault:
+    """A fault for one vehicle. `index` is its number in the occurrences once it has begun."""
+
     fault: Fault
     vehicle: str
     steps: Iterator[None]
@@ -39,23 +41,27 @@ class _Running:
     over: bool = False
 
 
-class Injector:
-    """Injects all faults of an experiment.
+class FaultInjector:
+    """Injects the faults of an experiment. Each fault is a generator that is resumed at every poll.
 
     Args:
         faults: Faults of the experiment file.
         testbed: Provides links and power to cut, and observers that no fault disconnects.
-        tell: Called with a message when a fault begins or ends.
+        report: Called with the vehicle (empty for a node without a vehicle) and a text when a fault begins or ends.
+
+    Attributes:
+        occurrences: Faults that have begun.
+        takeoffs_s: Time of the first takeoff of each vehicle.
     """
 
-    def __init__(self, faults: Sequence[Fault], testbed: Testbed, tell: Callable[[str], None]) -> None:
+    def __init__(self, faults: Sequence[Fault], testbed: Testbed, report: Callable[[str, str], None]) -> None:
         self.occurrences: list[Occurrence] = []
         self.takeoffs_s: dict[str, float] = {}
         self._testbed = testbed
         self._observers = testbed.observers
-        self._tell = tell
+        self._report = report
         self._now_s = 0.0
-        self._running = [self._prepare(fault, vehicle) for fault in faults for vehicle in self._victims(fault)]
+        self._faults = [self._prepare(fault, vehicle) for fault in faults for vehicle in self._targets(fault)]
 
     def step(self, now_s: float) -> None:
         """Advance all faults. Call this after each poll of the observers.
@@ -67,45 +73,46 @@ class Injector:
         for name, observer in self._observers.items():
             if observer.state.flying and name not in self.takeoffs_s:
                 self.takeoffs_s[name] = now_s
-        for running in self._running:
+        for running in self._faults:
             if not running.over:
                 running.over = next(running.steps, StopIteration) is StopIteration
 
     @property
-    def pending(self) -> bool:
+    def active(self) -> bool:
         """True while a fault has begun and not ended."""
-        return any(not running.over and running.index is not None for running in self._running)
+        return any(not running.over and running.index is not None for running in self._faults)
 
     @property
     def missed(self) -> list[tuple[str, str]]:
         """Vehicle and title of the faults that have not begun."""
-        return [(running.vehicle, running.fault.title) for running in self._running if running.index is None]
+        return [(running.vehicle, running.fault.title) for running in self._faults if running.index is None]
 
-    def _victims(self, fault: Fault) -> Sequence[str]:
+    def _targets(self, fault: Fault) -> Sequence[str]:
         if isinstance(fault, NodePowerOff) and fault.node is not None:
             return [""]
         return fault.vehicles or tuple(self._observers)
 
-    def _prepare(self, fault: Fault, vehicle: str) -> _Running:
-        running = _Running(fault, vehicle, iter(()))
-        running.steps = self._happen(running)
+    def _prepare(self, fault: Fault, vehicle: str) -> _InjectedFault:
+        running = _InjectedFault(fault, vehicle, iter(()))
+        running.steps = self._inject(running)
         return running
 
-    def _begin_s(self, running: _Running) -> float | None:
+    def _begin_s(self, running: _InjectedFault) -> float | None:
+        """Return the time when a fault begins, or None before the takeoff that it depends on."""
         if running.fault.since == "start":
             return running.fault.at
         takeoffs = self.takeoffs_s
-        first = takeoffs.get(running.vehicle) if running.vehicle else min(takeoffs.values(), default=None)
-        return None if first is None else first + running.fault.at
+        takeoff_s = takeoffs.get(running.vehicle) if running.vehicle else min(takeoffs.values(), default=None)
+        return None if takeoff_s is None else takeoff_s + running.fault.at
 
-    def _happen(self, running: _Running) -> Generator[None, None, None]:
+    def _inject(self, running: _InjectedFault) -> Generator[None, None, None]:
         fault = running.fault
         while (begin_s := self._begin_s(running)) is None or self._now_s < begin_s:
             yield
         running.index = len(self.occurrences)
         self.occurrences.append(Occurrence(fault.fault, fault.title, running.vehicle, self._now_s))
-        self._tell(f"{running.vehicle or 'cluster'}: {fault.title}")
-        before: dict[str, float] = {}
+        self._report(running.vehicle, fault.title)
+        original: dict[str, float] = {}
         if isinstance(fault, LinkLoss):
             self._testbed.cut_link(running.vehicle)
         elif isinstance(fault, NodePowerOff):
@@ -114,8 +121,8 @@ class Injector:
             while self._now_s < begin_s + after_s:
                 yield
             for name, value in values.items():
-                if name not in before and fault.duration is not None:
-                    before[name] = yield from self._read(running.vehicle, name)
+                if name not in original and fault.duration is not None:
+                    original[name] = yield from self._read(running.vehicle, name)
                 yield from self._set(running.vehicle, name, value)
         if fault.duration is None:
             return
@@ -125,29 +132,40 @@ class Injector:
             self._testbed.heal_link(running.vehicle)
         elif isinstance(fault, NodePowerOff):
             self._testbed.power_on(fault.node or running.vehicle)
-        for name, value in before.items():
+        for name, value in original.items():
             yield from self._set(running.vehicle, name, value)
         self.occurrences[running.index] = replace(self.occurrences[running.index], end_s=self._now_s)
-        self._tell(f"{running.vehicle or 'cluster'}: {fault.title} ended")
+        self._report(running.vehicle, f"{fault.title} ended")
 
     def _read(self, vehicle: str, name: str) -> Generator[None, None, float]:
+        """Read a parameter.
+
+        Raises:
+            ExperimentError: The vehicle did not report the parameter.
+        """
         observer = self._observers[vehicle]
         for _ in range(ATTEMPTS):
             observer.read_parameter(name)
-            if (yield from self._answered(observer, name)):
+            if (yield from self._wait_for_parameter(observer, name)):
                 return observer.parameters[name]
         raise ExperimentError(f"{vehicle}: the autopilot has no parameter {name}, which a fault needs")
 
     def _set(self, vehicle: str, name: str, value: float) -> Generator[None, None, None]:
+        """Set a parameter.
+
+        Raises:
+            ExperimentError: The vehicle did not report the parameter.
+        """
         observer = self._observers[vehicle]
         for _ in range(ATTEMPTS):
             observer.set_parameter(name, value)
-            if (yield from self._answered(observer, name)):
+            if (yield from self._wait_for_parameter(observer, name)):
                 return
         raise ExperimentError(f"{vehicle}: the autopilot rejected {name} = {value:g}, which a fault needs")
 
-    def _answered(self, observer: Station, name: str) -> Generator[None, None, bool]:
-        deadline_s = self._now_s + ANSWER_S
+    def _wait_for_parameter(self, observer: Station, name: str) -> Generator[None, None, bool]:
+        """Wait until the vehicle reports a parameter. Return False after the timeout."""
+        deadline_s = self._now_s + RESPONSE_TIMEOUT_S
         while self._now_s < deadline_s:
             yield
             if name in observer.parameters:

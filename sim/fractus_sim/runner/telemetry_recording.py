@@ -27,8 +27,8 @@ _SCHEMAS = dict(
         schema("fractus.Event", time_s=_NUMBER, text=_TEXT),
     )
 )  # fmt: skip
-# MAV_SEVERITY to foxglove.Log levels: debug 1, info 2, warning 3, error 4, fatal 5.
-_LEVELS = (5, 5, 5, 4, 3, 2, 2, 1)
+_FOXGLOVE_LEVELS = (5, 5, 5, 4, 3, 2, 2, 1)
+"""Level of foxglove.Log by MAV_SEVERITY: debug 1, info 2, warning 3, error 4, fatal 5."""
 
 
 class McapLog(McapWriter):
@@ -82,7 +82,7 @@ class Recorder:
         self.flight = flight
         self._log = log
 
-    def take(self, station: Station, messages: list[Message], now_s: float, unix_us: int) -> None:
+    def record(self, station: Station, messages: list[Message], now_s: float, unix_us: int) -> None:
         """Record messages in order."""
         state = station.state
         flight = self.flight
@@ -92,7 +92,7 @@ class Recorder:
                 flight.samples.append(
                     Sample(now_s, place, state.speed_mps, state.mode, state.flying, state.battery, state.voltage_v)
                 )
-                self._position(station, now_s, unix_us)
+                self._record_position(station, now_s, unix_us)
             elif message.name == "ATTITUDE":
                 angles = {f"{axis}_rad": round(message.real(axis), 5) for axis in ("roll", "pitch", "yaw")}
                 content = {"time_s": round(now_s, 3), **angles}
@@ -101,14 +101,20 @@ class Recorder:
                 status_text = Text(now_s, message.integer("severity"), message.text("text"))
                 flight.texts.append(status_text)
                 self._write(
-                    text(unix_us * 1000, "text", flight.name, _LEVELS[min(status_text.severity, 7)], status_text.text)
+                    text(
+                        unix_us * 1000,
+                        "text",
+                        flight.name,
+                        _FOXGLOVE_LEVELS[min(status_text.severity, 7)],
+                        status_text.text,
+                    )
                 )
             elif message.name == "HEARTBEAT":
                 flight.armed_at_end = state.armed
                 if not flight.modes or flight.modes[-1][1] != state.mode:
                     flight.modes.append((now_s, state.mode))
 
-    def _position(self, station: Station, now_s: float, unix_us: int) -> None:
+    def _record_position(self, station: Station, now_s: float, unix_us: int) -> None:
         state = station.state
         time_ns = unix_us * 1000
         self._write(location(time_ns, self.flight.name, state.lat, state.lon, state.amsl_m))

@@ -1,8 +1,9 @@
-"""Ground station end of a MAVLink link: heartbeats, commands, parameters, and the state of the vehicle."""
+"""Ground station of a vehicle: heartbeats, commands, parameters, and the state that the vehicle reports."""
 
 from __future__ import annotations
 
 import contextlib
+import math
 import socket
 import time
 from collections.abc import Callable, Mapping
@@ -76,9 +77,9 @@ class ChannelLink:
 class TcpLink:
     """A link over TCP."""
 
-    def __init__(self, connection: socket.socket, what: str) -> None:
+    def __init__(self, connection: socket.socket, name: str) -> None:
         self._socket = connection
-        self._what = what
+        self._name = name
         self._socket.setblocking(False)
 
     @classmethod
@@ -110,7 +111,7 @@ class TcpLink:
         except BlockingIOError:
             return
         except OSError as error:
-            raise ExperimentError(f"link {self._what}: {error.strerror}") from None
+            raise ExperimentError(f"link {self._name}: {error.strerror}") from None
 
     def receive(self) -> bytes:
         """Return the bytes received since the last call.
@@ -125,9 +126,9 @@ class TcpLink:
             except BlockingIOError:
                 return b"".join(parts)
             except OSError as error:
-                raise ExperimentError(f"link {self._what}: {error.strerror}") from None
+                raise ExperimentError(f"link {self._name}: {error.strerror}") from None
             if not data:
-                raise ExperimentError(f"link {self._what}: closed by the autopilot")
+                raise ExperimentError(f"link {self._name}: closed by the autopilot")
             parts.append(data)
 
     def close(self) -> None:
@@ -138,13 +139,25 @@ class TcpLink:
 
 @dataclass(slots=True)
 class State:
-    """Last reported state of the vehicle. Units: degrees, metres, volts."""
+    """Last reported state of the vehicle. Units: degrees, metres, volts, amperes.
 
-    heard: bool = False
+    Attributes:
+        received: True after the first heartbeat.
+        prearm_ok: True if the pre-arm checks pass in the current mode.
+        position_known: True if the estimator has a position.
+        alt_m: Altitude above home.
+        amsl_m: Altitude above mean sea level.
+        battery: Share of the full charge.
+        fix: GPS fix type.
+        home: Latitude and longitude of the home position.
+        texts: STATUSTEXT messages: time, severity and text.
+    """
+
+    received: bool = False
     mode: str = ""
     armed: bool = False
-    checked: bool = False  # # pre-arm checks pass in the current mode
-    located: bool = False  # # the estimator has a position
+    prearm_ok: bool = False
+    position_known: bool = False
     flying: bool = False
     lat: float = 0.0
     lon: float = 0.0
@@ -164,7 +177,12 @@ class State:
     @property
     def ready(self) -> bool:
         """True if the vehicle would arm in a mode that needs a position."""
-        return self.checked and self.located and self.home is not None
+        return self.prearm_ok and self.position_known and self.home is not None
+
+    @property
+    def last_text(self) -> str:
+        """Text of the last STATUSTEXT message."""
+        return self.texts[-1][2] if self.texts else "no STATUSTEXT received"
 
 
 class Station:
@@ -174,10 +192,19 @@ class Station:
         now_s: Time of the last poll, on the clock of the caller.
         state: Last reported state of the vehicle.
         cut: True while the link drops all traffic.
+        acks: Results of acknowledged commands.
+        parameters: Values of parameters that the vehicle reported.
+        inbox: Messages of the autopilot in the last poll.
     """
 
     def __init__(
-        self, link: Link, system_id: int, log: TlogWriter | None, *, own_id: int = GROUND_STATION_ID, beats: bool = True
+        self,
+        link: Link,
+        system_id: int,
+        log: TlogWriter | None,
+        *,
+        own_id: int = GROUND_STATION_ID,
+        sends_heartbeats: bool = True,
     ) -> None:
         self.state = State()
         self.cut = False
@@ -188,11 +215,11 @@ class Station:
         self._link = link
         self._system_id = system_id
         self._log = log
-        self._beats = beats
+        self._sends_heartbeats = sends_heartbeats
         self._endpoint = Endpoint(own_id, STATION_COMPONENT, saturate=True)
         self._unix_us = 0
-        self._next_beat_s = -1e9
-        self._asked = False
+        self._next_heartbeat_s = -math.inf
+        self._streams_requested = False
 
     def poll(self, now_s: float, unix_us: int) -> list[Message]:
         """Process received messages, and send a heartbeat if it is due.
@@ -209,18 +236,18 @@ class Station:
             if self._log is not None:
                 self._log.write(unix_us, message.frame)
         for message in self.inbox:
-            reader = _READERS.get(message.name)
-            if reader is not None:
-                reader(self, message)
-        if self._beats and now_s >= self._next_beat_s:
-            self._next_beat_s = now_s + HEARTBEAT_S
+            handler = _HANDLERS.get(message.name)
+            if handler is not None:
+                handler(self, message)
+        if self._sends_heartbeats and now_s >= self._next_heartbeat_s:
+            self._next_heartbeat_s = now_s + HEARTBEAT_S
             self.send(
                 "HEARTBEAT",
                 {"type": mavlink.MAV_TYPE_GCS, "autopilot": mavlink.MAV_AUTOPILOT_INVALID, "mavlink_version": 3},
             )
-        if self.state.heard and not self._asked:
-            self._asked = True
-            self._ask_for_streams()
+        if self.state.received and not self._streams_requested:
+            self._streams_requested = True
+            self._request_streams()
         return self.inbox
 
     def send(self, name: str, values: Mapping[str, Value]) -> None:
@@ -232,7 +259,7 @@ class Station:
             self._log.write(self._unix_us, frame)
         self._link.send(frame)
 
-    def tell(self, name: str, values: Mapping[str, Value]) -> None:
+    def send_to_autopilot(self, name: str, values: Mapping[str, Value]) -> None:
         """Send a message to the autopilot of the vehicle."""
         self.send(name, {**values, "target_system": self._system_id, "target_component": 1})
 
@@ -240,17 +267,17 @@ class Station:
         """Send COMMAND_LONG. The result is stored in `acks`."""
         self.acks.pop(command, None)
         values: dict[str, Value] = {f"param{at}": float(value) for at, value in enumerate(params, start=1)}
-        self.tell("COMMAND_LONG", {**values, "command": command})
+        self.send_to_autopilot("COMMAND_LONG", {**values, "command": command})
 
     def read_parameter(self, name: str) -> None:
         """Request a parameter. Its value is stored in `parameters`."""
         self.parameters.pop(name, None)
-        self.tell("PARAM_REQUEST_READ", {"param_id": name.encode("ascii"), "param_index": -1})
+        self.send_to_autopilot("PARAM_REQUEST_READ", {"param_id": name.encode("ascii"), "param_index": -1})
 
     def set_parameter(self, name: str, value: float) -> None:
         """Set a parameter. The value that the vehicle reports is stored in `parameters`."""
         self.parameters.pop(name, None)
-        self.tell(
+        self.send_to_autopilot(
             "PARAM_SET",
             {"param_id": name.encode("ascii"), "param_value": value, "param_type": mavlink.MAV_PARAM_TYPE_REAL32},
         )
@@ -261,20 +288,20 @@ class Station:
         if self._log is not None:
             self._log.close()
 
-    def _ask_for_streams(self) -> None:
+    def _request_streams(self) -> None:
         for name, rate_hz in RATES_HZ.items():
             self.command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, message_id(name), 1e6 / rate_hz)
 
 
-def _heartbeat(station: Station, message: Message) -> None:
+def _on_heartbeat(station: Station, message: Message) -> None:
     state = station.state
-    state.heard = True
+    state.received = True
     state.armed = bool(message.integer("base_mode") & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
     number = message.integer("custom_mode")
     state.mode = enum_names("COPTER_MODE").get(number, f"MODE_{number}")
 
 
-def _position(station: Station, message: Message) -> None:
+def _on_position(station: Station, message: Message) -> None:
     state = station.state
     state.lat = message.integer("lat") / 1e7
     state.lon = message.integer("lon") / 1e7
@@ -287,54 +314,54 @@ def _position(station: Station, message: Message) -> None:
     state.heading_deg = message.integer("hdg") / 100.0
 
 
-def _sys_status(station: Station, message: Message) -> None:
+def _on_sys_status(station: Station, message: Message) -> None:
     state = station.state
-    state.checked = bool(message.integer("onboard_control_sensors_health") & mavlink.MAV_SYS_STATUS_PREARM_CHECK)
+    state.prearm_ok = bool(message.integer("onboard_control_sensors_health") & mavlink.MAV_SYS_STATUS_PREARM_CHECK)
     state.voltage_v = message.integer("voltage_battery") / 1000.0
     state.current_a = message.integer("current_battery") / 100.0
     remaining = message.integer("battery_remaining")
     state.battery = remaining / 100.0 if remaining >= 0 else state.battery
 
 
-def _extended(station: Station, message: Message) -> None:
+def _on_landed_state(station: Station, message: Message) -> None:
     station.state.flying = message.integer("landed_state") in FLYING_STATES
 
 
-def _estimate(station: Station, message: Message) -> None:
-    known = mavlink.EKF_POS_HORIZ_ABS | mavlink.EKF_PRED_POS_HORIZ_ABS
-    station.state.located = message.integer("flags") & known == known
+def _on_estimator_status(station: Station, message: Message) -> None:
+    required = mavlink.EKF_POS_HORIZ_ABS | mavlink.EKF_PRED_POS_HORIZ_ABS
+    station.state.position_known = message.integer("flags") & required == required
 
 
-def _gps(station: Station, message: Message) -> None:
+def _on_gps(station: Station, message: Message) -> None:
     station.state.fix = message.integer("fix_type")
     station.state.satellites = message.integer("satellites_visible")
 
 
-def _home(station: Station, message: Message) -> None:
+def _on_home(station: Station, message: Message) -> None:
     station.state.home = (message.integer("latitude") / 1e7, message.integer("longitude") / 1e7)
 
 
-def _text(station: Station, message: Message) -> None:
+def _on_text(station: Station, message: Message) -> None:
     station.state.texts.append((station.now_s, message.integer("severity"), message.text("text")))
 
 
-def _ack(station: Station, message: Message) -> None:
+def _on_ack(station: Station, message: Message) -> None:
     station.acks[message.integer("command")] = message.integer("result")
 
 
-def _parameter(station: Station, message: Message) -> None:
+def _on_parameter(station: Station, message: Message) -> None:
     station.parameters[message.text("param_id")] = message.real("param_value")
 
 
-_READERS: Mapping[str, Callable[[Station, Message], None]] = {
-    "HEARTBEAT": _heartbeat,
-    "GLOBAL_POSITION_INT": _position,
-    "SYS_STATUS": _sys_status,
-    "EXTENDED_SYS_STATE": _extended,
-    "EKF_STATUS_REPORT": _estimate,
-    "GPS_RAW_INT": _gps,
-    "HOME_POSITION": _home,
-    "STATUSTEXT": _text,
-    "COMMAND_ACK": _ack,
-    "PARAM_VALUE": _parameter,
+_HANDLERS: Mapping[str, Callable[[Station, Message], None]] = {
+    "HEARTBEAT": _on_heartbeat,
+    "GLOBAL_POSITION_INT": _on_position,
+    "SYS_STATUS": _on_sys_status,
+    "EXTENDED_SYS_STATE": _on_landed_state,
+    "EKF_STATUS_REPORT": _on_estimator_status,
+    "GPS_RAW_INT": _on_gps,
+    "HOME_POSITION": _on_home,
+    "STATUSTEXT": _on_text,
+    "COMMAND_ACK": _on_ack,
+    "PARAM_VALUE": _on_parameter,
 }

@@ -1,4 +1,4 @@
-"""kubectl and helm commands for one cluster."""
+"""kubectl and helm commands for a cluster."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ NAMESPACE = "default"
 
 @dataclass(frozen=True, slots=True)
 class Kube:
-    """One cluster with the programs that access it. The release tool is helm."""
+    """A cluster and the programs that access it."""
 
     kubectl: Path
-    release_tool: Path
+    helm: Path
     kubeconfig: Path
 
     def run(self, *arguments: str, stdin: str | None = None, timeout_s: float = 60.0) -> str:
@@ -35,54 +35,54 @@ class Kube:
         """
         return self._run(self.kubectl, arguments, stdin, timeout_s)
 
-    def fetch(self, pod: str, path: str, to: Path, timeout_s: float = 120.0) -> None:
-        """Copy a file of a system pod. An incomplete copy is removed.
+    def fetch(self, pod: str, path: str, copy: Path, timeout_s: float = 120.0) -> None:
+        """Copy a file of a system pod to a local file. An incomplete copy is removed.
 
         Raises:
             ExperimentError: The file cannot be read or written.
         """
-        scratch = to.with_name(f".{to.name}")
+        scratch = copy.with_name(f".{copy.name}")
         try:
             with scratch.open("wb") as out:
                 self._run(self.kubectl, ["exec", "-n", SYSTEM, pod, "--", "cat", path], None, timeout_s, out)
-            scratch.replace(to)
+            scratch.replace(copy)
         except OSError as error:
-            raise ExperimentError(f"cannot write {to}: {error.strerror}") from None
+            raise ExperimentError(f"cannot write {copy}: {error.strerror}") from None
         finally:
             scratch.unlink(missing_ok=True)
 
     def objects(self, kinds: str, namespace: str = NAMESPACE) -> list[Object]:
         """Return objects of the kinds (comma-separated) in a namespace. Cluster-scoped kinds are also supported."""
-        text = self.run("get", kinds, "-n", namespace, "-o", "json")
-        return list(json.loads(text)["items"])
+        output = self.run("get", kinds, "-n", namespace, "-o", "json")
+        return list(json.loads(output)["items"])
 
-    def apply(self, objects: Sequence[Object]) -> None:
+    def apply(self, objects: Sequence[Object], timeout_s: float = 60.0) -> None:
         """Apply manifests."""
-        self.run("apply", "-f", "-", stdin=yaml.safe_dump_all(objects))
+        self.run("apply", "-f", "-", stdin=yaml.safe_dump_all(objects), timeout_s=timeout_s)
 
     def delete(self, objects: Sequence[Object], timeout_s: float) -> None:
         """Delete the objects of manifests and wait until they are gone."""
-        text = yaml.safe_dump_all(objects)
+        manifests = yaml.safe_dump_all(objects)
         self.run(
-            "delete", "-f", "-", "--ignore-not-found", f"--timeout={timeout_s:.0f}s", stdin=text, timeout_s=timeout_s + 10
+            "delete", "-f", "-", "--ignore-not-found", f"--timeout={timeout_s:.0f}s", stdin=manifests, timeout_s=timeout_s + 10
         )  # fmt: skip
 
     def install(self, release: str, chart: Path, values: Sequence[str] = ()) -> bool:
         """Install or upgrade a chart with `key=value` settings. Return True if it is a new installation."""
-        listed = self._run(self.release_tool, ["list", "-n", SYSTEM, "-q", "-f", f"^{release}$"], None, 60.0)
+        releases = self._run(self.helm, ["list", "-n", SYSTEM, "-q", "-f", f"^{release}$"], None, 60.0)
         arguments = ["upgrade", "--install", release, str(chart), "-n", SYSTEM, "--create-namespace"]
         arguments += [f"--set={value}" for value in values]
-        self._run(self.release_tool, arguments, None, 120.0)
-        return not listed.strip()
+        self._run(self.helm, arguments, None, 120.0)
+        return not releases.strip()
 
     def uninstall(self, release: str) -> None:
         """Uninstall a release."""
-        self._run(self.release_tool, ["uninstall", release, "-n", SYSTEM, "--ignore-not-found", "--wait"], None, 180.0)
+        self._run(self.helm, ["uninstall", release, "-n", SYSTEM, "--ignore-not-found", "--wait"], None, 180.0)
 
     def follow(
         self, arguments: Sequence[str], out: IO[bytes] | int, stdin: int | None = None
     ) -> subprocess.Popen[bytes]:
-        """Start a kubectl process that writes until it is ended."""
+        """Start kubectl and return its process. The caller ends the process."""
         return subprocess.Popen(
             [str(self.kubectl), *arguments], stdin=stdin, stdout=out, stderr=subprocess.DEVNULL, env=self._environment()
         )
@@ -95,9 +95,9 @@ class Kube:
         timeout_s: float,
         out: IO[bytes] | None = None,
     ) -> str:
-        words = f"{program.name} {' '.join(arguments[:4])}"
+        command = f"{program.name} {' '.join(arguments[:4])}"
         try:
-            done = subprocess.run(
+            completed = subprocess.run(
                 [str(program), *arguments],
                 input=stdin,
                 stdout=subprocess.PIPE if out is None else out,
@@ -108,14 +108,14 @@ class Kube:
                 check=False,
             )
         except subprocess.TimeoutExpired:
-            raise ExperimentError(f"{words}: timed out after {timeout_s:.0f} s") from None
+            raise ExperimentError(f"{command}: timed out after {timeout_s:.0f} s") from None
         except OSError as error:
             raise ExperimentError(
                 f"cannot run {program}: {error.strerror}; install it, or use --cluster embedded"
             ) from None
-        if done.returncode:
-            raise ExperimentError(f"{words}: {' '.join(done.stderr.split())}")
-        return done.stdout or ""
+        if completed.returncode:
+            raise ExperimentError(f"{command}: {' '.join(completed.stderr.split())}")
+        return completed.stdout or ""
 
     def _environment(self) -> dict[str, str]:
         return {**os.environ, "KUBECONFIG": str(self.kubeconfig)}

@@ -26,8 +26,8 @@ class _End:
 
     socket: socket.socket
     framer: Framer
-    other: _End | None = None
-    waiting: bytes = b""
+    peer: _End | None = None
+    backlog: bytes = b""
 
 
 class LinkTap:
@@ -100,9 +100,10 @@ class LinkTap:
         except (OSError, ExperimentError):
             client.close()
             return
-        near, far = (_End(one, Framer(self._log)) for one in (client, server))
-        near.other = far
-        far.other = near
+        near = _End(client, Framer(self._log))
+        far = _End(server, Framer(self._log))
+        near.peer = far
+        far.peer = near
         for end in (near, far):
             end.socket.setblocking(False)
             end.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -117,32 +118,33 @@ class LinkTap:
         except OSError:
             data = b""
         if not data:
-            self._drop(end)
+            self._disconnect(end)
             return
-        if self._cut.is_set() or end.other is None:
+        if self._cut.is_set() or end.peer is None:
             return
-        end.framer.take(data, time.time_ns() // 1000)
-        other = end.other
-        if len(other.waiting) < BACKLOG_LIMIT:
-            other.waiting += data
-        self._send(other)
+        end.framer.feed(data, time.time_ns() // 1000)
+        peer = end.peer
+        if len(peer.backlog) < BACKLOG_LIMIT:
+            peer.backlog += data
+        self._send(peer)
 
     def _send(self, end: _End) -> None:
         try:
-            sent = end.socket.send(end.waiting) if end.waiting else 0
+            sent = end.socket.send(end.backlog) if end.backlog else 0
         except BlockingIOError:
             sent = 0
         except OSError:
-            self._drop(end)
+            self._disconnect(end)
             return
-        end.waiting = end.waiting[sent:]
-        wanted = selectors.EVENT_READ | (selectors.EVENT_WRITE if end.waiting else 0)
-        self._selector.modify(end.socket, wanted, end)
+        end.backlog = end.backlog[sent:]
+        events = selectors.EVENT_READ | (selectors.EVENT_WRITE if end.backlog else 0)
+        self._selector.modify(end.socket, events, end)
 
-    def _drop(self, end: _End) -> None:
-        for one in (end, end.other):
-            if one in self._ends and one is not None:
-                self._ends.discard(one)
+    def _disconnect(self, end: _End) -> None:
+        """Close both ends of a connection."""
+        for either in (end, end.peer):
+            if either is not None and either in self._ends:
+                self._ends.discard(either)
                 with contextlib.suppress(KeyError, ValueError):
-                    self._selector.unregister(one.socket)
-                one.socket.close()
+                    self._selector.unregister(either.socket)
+                either.socket.close()

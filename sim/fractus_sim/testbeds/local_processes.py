@@ -1,4 +1,4 @@
-"""Local processes, each with a log file. They are stopped at the end of the experiment."""
+"""Local processes with log files. All processes are stopped at the end of the experiment."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from pathlib import Path
 
 from fractus_sim.errors import ExperimentError
 from fractus_sim.interruption import uninterrupted
-from fractus_sim.testbeds.process_guard import Reaper
+from fractus_sim.testbeds.process_guard import ProcessGuard
 
 POLL_S = 0.05
 STOP_POLL_S = 0.01
-GRACE_S = 5.0
+STOP_TIMEOUT_S = 5.0
 _TAIL_BYTES = 600
 
 
@@ -32,7 +32,7 @@ class Processes:
     def __init__(self, logs: Path) -> None:
         self._logs = logs
         self._running: dict[str, subprocess.Popen[bytes]] = {}
-        self._reaper = Reaper()
+        self._guard = ProcessGuard()
 
     def start(self, name: str, argv: Sequence[str], environment: Mapping[str, str], folder: Path | None = None) -> None:
         """Start a process. Its output is appended to `NAME.log`.
@@ -58,15 +58,15 @@ class Processes:
                 raise ExperimentError(f"{name}: cannot start {argv[0]}: {error.strerror}") from None
             self._running.pop(name, None)
             self._running[name] = process
-            self._reaper.hold(process.pid)
+            self._guard.hold(process.pid)
 
     def log(self, name: str) -> Path:
-        """Path of the log file of a process."""
+        """Return the path of the log file of a process."""
         return self._logs / f"{name}.log"
 
     def running(self, name: str) -> bool:
-        """True if a process with this name is running."""
-        return name in self._running and self._code(self._running[name]) is None
+        """Return True if a process with this name is running."""
+        return name in self._running and self._poll(self._running[name]) is None
 
     def exit_code(self, name: str) -> int | None:
         """Return the exit code of a process, or None while it is running.
@@ -76,11 +76,11 @@ class Processes:
         """
         if name not in self._running:
             raise ExperimentError(f"no process {name}; known: {', '.join(sorted(self._running)) or 'none'}")
-        return self._code(self._running[name])
+        return self._poll(self._running[name])
 
     def dead(self) -> dict[str, int]:
         """Return the exit codes of the processes that have ended."""
-        return {name: code for name, process in self._running.items() if (code := self._code(process)) is not None}
+        return {name: code for name, process in self._running.items() if (code := self._poll(process)) is not None}
 
     def wait(self, name: str, condition: Callable[[], bool], timeout_s: float) -> None:
         """Wait for a condition while a process is running.
@@ -132,30 +132,31 @@ class Processes:
         """
         names = list(reversed(self._running))
         try:
-            for testbed in stages:
-                chosen = [name for name in names if testbed(name)]
+            for selects in stages:
+                chosen = [name for name in names if selects(name)]
                 self.stop(*chosen)
                 names = [name for name in names if name not in chosen]
             self.stop(*names)
         finally:
             self.stop(*self._running, kill=True)
-            self._reaper.close()
+            self._guard.close()
 
     def _wait_ended(self, processes: Sequence[subprocess.Popen[bytes]]) -> None:
-        deadline = time.monotonic() + GRACE_S
-        while any(self._code(process) is None for process in processes) and time.monotonic() < deadline:
+        deadline = time.monotonic() + STOP_TIMEOUT_S
+        while any(self._poll(process) is None for process in processes) and time.monotonic() < deadline:
             time.sleep(STOP_POLL_S)
 
-    def _code(self, process: subprocess.Popen[bytes]) -> int | None:
+    def _poll(self, process: subprocess.Popen[bytes]) -> int | None:
         """Return the exit code of a process, or None while it is running. Kill its group when it has ended."""
-        if process.returncode is None and _has_ended(process.pid):
+        if process.returncode is None and _is_zombie(process.pid):
             # The process is not reaped yet, so its id is still valid as the group id.
             _kill_group(process.pid)
-            self._reaper.let_go(process.pid)
+            self._guard.release(process.pid)
         return process.poll()
 
 
-def _has_ended(pid: int) -> bool:
+def _is_zombie(pid: int) -> bool:
+    """Return True if a child process has ended and was not reaped."""
     try:
         return os.waitid(os.P_PID, pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None
     except ChildProcessError:
@@ -168,7 +169,7 @@ def _kill_group(group: int) -> None:
 
 
 def listening(port: int) -> bool:
-    """True if a process accepts connections on a loopback port."""
+    """Return True if a process accepts connections on a loopback port."""
     with socket.socket() as probe:
         probe.settimeout(1.0)
         return probe.connect_ex(("127.0.0.1", port)) == 0

@@ -13,13 +13,16 @@ from fractus_cluster.manifests import is_ready
 from fractus_core.api.nodes import GROUNDED
 
 from fractus_sim.errors import ExperimentError
+from fractus_sim.progress import Progress, ignore
 from fractus_sim.testbeds.kube_commands import NAMESPACE, SYSTEM, Kube, Object
 
 POLL_S = 0.5
 LANDING_TIMEOUT_S = 180.0
-_DEPLOYED = {"Running", "Waiting", "TakingOff", "Flying", "Landed"}
-Say = Callable[[str], None]
+_DEPLOYED_PHASES = frozenset({"Running", "Waiting", "TakingOff", "Flying", "Landed"})
+_START_FAILURES = frozenset({"CrashLoopBackOff", "ErrImageNeverPull", "ImagePullBackOff", "ErrImagePull"})
+_STATE_WORDS = {"takingOff": "taking off", "inactive": "on the ground"}
 _LOG_LINE = re.compile(rb"\[pod/(?P<pod>[^/]+)/(?P<container>[^\]]+)\] (?P<text>.*)")
+Report = Callable[[str], None]
 
 
 @dataclass
@@ -32,6 +35,9 @@ class Mission:
         pods: Last observed state of each pod, by name.
         links: Changes of the traffic path: Unix seconds, node, cloud or direct, and reason.
         phase: Phase of the Application.
+        message: Message of the Application.
+        drone: Name of the drone. Empty until one is selected.
+        flight_state: Flight state of the drone that its agent reported.
     """
 
     application: str
@@ -42,28 +48,29 @@ class Mission:
     message: str = ""
     drone: str = ""
     flight_state: str = ""
-    _running: int = 0
+    _running_pods: int = 0
 
-    def see(self, objects: list[Object], now_s: float, say: Say) -> None:
+    def update(self, objects: list[Object], now_s: float, report: Report) -> None:
         """Read the objects of the cluster and report changes."""
         for body in objects:
             kind = body["kind"]
             name = body["metadata"]["name"]
             if kind == "Application" and name == self.application:
-                self._see_application(body, now_s, say)
+                self._update_application(body, now_s, report)
             elif kind == "DeploymentPlan" and name == self.application and "planned" not in self.times:
                 self.times["planned"] = now_s
                 placements = body["spec"].get("placements", [])
-                say(
-                    f"plan created after {now_s - self.times['applied']:.1f} s: {len(placements)} instances, {_drone(body)}"
+                drone = f"{body['spec']['drone']['node']} flies" if body["spec"].get("drone") else "no drone"
+                report(
+                    f"plan created after {now_s - self.times['applied']:.1f} s: {len(placements)} instances, {drone}"
                 )
-            elif kind == "Pod" and not _ends(body):
+            elif kind == "Pod" and not _is_stopping(body):
                 self.pods[name] = body
             elif kind == "DirectLink" and body["spec"]["application"]["name"] == self.application:
-                self._see_link(body, now_s, say)
+                self._update_traffic(body, now_s, report)
             elif kind == "Drone" and name == self.drone:
-                self._see_drone(body, now_s, say)
-        self._see_pods(now_s, say)
+                self._update_drone(body, now_s, report)
+        self._update_running_pods(now_s, report)
 
     @property
     def ended(self) -> bool:
@@ -75,95 +82,119 @@ class Mission:
         """True if the drone is on the ground according to its agent and the operator."""
         return self.phase != "Returning" and (self.flight_state in GROUNDED or not self.drone)
 
-    def _see_application(self, body: Object, now_s: float, say: Say) -> None:
+    @property
+    def flight_state_words(self) -> str:
+        """Flight state of the drone as words."""
+        return _STATE_WORDS.get(self.flight_state, self.flight_state)
+
+    def _update_application(self, body: Object, now_s: float, report: Report) -> None:
         status = body.get("status") or {}
         phase = status.get("phase", "")
         message = status.get("message", "")
         self.drone = status.get("drone") or self.drone
         if (phase, message) != (self.phase, self.message):
-            say(f"application {phase or 'new'}{': ' + message if message else ''}")
+            report(f"application {phase or 'new'}{': ' + message if message else ''}")
         self.phase = phase
         self.message = message
         if self.ended and "ended" not in self.times:
             self.times["ended"] = now_s
 
-    def _see_drone(self, body: Object, now_s: float, say: Say) -> None:
+    def _update_drone(self, body: Object, now_s: float, report: Report) -> None:
         state = (body.get("status") or {}).get("flightState", "")
         if state == self.flight_state:
             return
         if state in GROUNDED and self.flight_state and "running" in self.times:
             self.times["landed"] = now_s
         self.flight_state = state
-        say(f"{self.drone} is {_words(state)}")
+        report(f"{self.drone} is {self.flight_state_words}")
 
-    def _see_link(self, body: Object, now_s: float, say: Say) -> None:
+    def _update_traffic(self, body: Object, now_s: float, report: Report) -> None:
         node = body["spec"]["node"]
         status = body.get("status") or {}
         traffic = status.get("traffic") or "cloud"
         before = next((change["traffic"] for change in reversed(self.links) if change["node"] == node), "cloud")
         if traffic != before:
-            why = status.get("message", "")
-            self.links.append({"time": now_s, "node": node, "traffic": traffic, "why": why})
+            reason = status.get("message", "")
+            self.links.append({"time": now_s, "node": node, "traffic": traffic, "why": reason})
             path = f"to the direct link to {node}" if traffic == "direct" else f"from {node} to the cloud path"
-            say(f"traffic moved {path}: {why}")
+            report(f"traffic moved {path}: {reason}")
 
-    def _see_pods(self, now_s: float, say: Say) -> None:
+    def _update_running_pods(self, now_s: float, report: Report) -> None:
         running = sum(map(is_ready, self.pods.values()))
-        if running > self._running:
-            say(f"pods Running: {running} of {len(self.pods)}")
-        self._running = running
-        if self.phase in _DEPLOYED and running == len(self.pods) > 0 and "running" not in self.times:
+        if running > self._running_pods:
+            report(f"pods Running: {running} of {len(self.pods)}")
+        self._running_pods = running
+        if self.phase in _DEPLOYED_PHASES and running == len(self.pods) > 0 and "running" not in self.times:
             self.times["running"] = now_s
-            say(f"all pods Running after {now_s - self.times['applied']:.1f} s")
+            report(f"all pods Running after {now_s - self.times['applied']:.1f} s")
 
 
-def follow(kube: Kube, mission: Mission, logs: Path, *, timeout_s: float, say: Say, show: Say) -> None:
-    """Observe the mission until it has ended and the drone has landed.
+def follow_mission(kube: Kube, mission: Mission, logs: Path, progress: Progress, *, timeout_s: float) -> None:
+    """Observe a mission until it has ended and the drone has landed.
 
     Args:
         kube: Cluster.
         mission: Mission to update. `times["applied"]` must be set.
         logs: File for the logs of the components.
+        progress: Callbacks for progress.
         timeout_s: Maximum duration of the mission without the landing.
-        say: Called with one line per change.
-        show: Called with the current state for a status line.
 
     Raises:
         ExperimentError: The timeout expired.
     """
     deadline = mission.times["applied"] + timeout_s
-    tail: subprocess.Popen[bytes] | None = None
-    told = 0
+    log_follower: subprocess.Popen[bytes] | None = None
+    reported = 0
     with logs.open("wb") as out:
         try:
             while not (mission.ended and mission.grounded):
                 now = time.time()
-                mission.see(kube.objects("applications,deploymentplans,pods,drones,directlinks"), now, say)
+                objects = kube.objects("applications,deploymentplans,pods,drones,directlinks")
+                mission.update(objects, now, progress.report)
                 if mission.ended and deadline < now + LANDING_TIMEOUT_S:
                     deadline = max(deadline, mission.times["ended"] + LANDING_TIMEOUT_S)
                 if now > deadline:
-                    raise ExperimentError(
-                        f"the mission did not end within {timeout_s:.0f} s: {mission.message or mission.phase}"
-                    )
-                if tail is None and "running" in mission.times:
+                    state = mission.message or mission.phase
+                    raise ExperimentError(f"the mission did not end within {timeout_s:.0f} s: {state}")
+                if log_follower is None and "running" in mission.times:
                     selector = f"fractus.dev/application={mission.application}"
-                    tail = kube.follow(
-                        ["logs", "-n", NAMESPACE, "-l", selector, "-f", "--prefix", "--tail=-1", "--max-log-requests=50"], out
-                    )  # fmt: skip
-                told = _tell(logs, told, say)
-                show(
-                    f"{now - mission.times['applied']:.0f} s  {mission.phase}  {mission.drone} {_words(mission.flight_state)}"
-                )
+                    arguments = ["-l", selector, "-f", "--prefix", "--tail=-1", "--max-log-requests=50"]
+                    log_follower = kube.follow(["logs", "-n", NAMESPACE, *arguments], out)
+                reported = report_driver_lines(logs, reported, progress.report)
+                elapsed_s = now - mission.times["applied"]
+                progress.show(f"{elapsed_s:.0f} s  {mission.phase}  {mission.drone} {mission.flight_state_words}")
                 time.sleep(POLL_S)
-            _tell(logs, told, say)
+            report_driver_lines(logs, reported, progress.report)
         finally:
-            if tail is not None:
-                tail.terminate()
-                tail.wait(timeout=10)
+            if log_follower is not None:
+                log_follower.terminate()
+                log_follower.wait(timeout=10)
 
 
-def wait_ready(kube: Kube, timeout_s: float, show: Say) -> None:
+def report_driver_lines(logs: Path, start: int, report: Report) -> int:
+    """Report new complete log lines of the Navigator.
+
+    Returns:
+        Offset in the file at which the next call continues.
+    """
+    with logs.open("rb") as file:
+        file.seek(start)
+        data = file.read()
+    end = data.rfind(b"\n") + 1
+    for line in data[:end].splitlines():
+        match = _LOG_LINE.match(line)
+        if match and match["container"] == b"navigator":
+            report("navigator: " + match["text"].decode("utf-8", "replace"))
+    return start + end
+
+
+def wait_for_drone(kube: Kube, timeout_s: float, show: Report = ignore) -> None:
     """Wait until a drone reports that it is ready to fly.
+
+    Args:
+        kube: Cluster.
+        timeout_s: Maximum time to wait, seconds.
+        show: Called repeatedly with the reason why no drone is ready.
 
     Raises:
         ExperimentError: No drone was ready before the timeout. The message contains its condition.
@@ -172,49 +203,30 @@ def wait_ready(kube: Kube, timeout_s: float, show: Say) -> None:
     reason = "no Drone has registered"
     while time.monotonic() < deadline:
         for body in kube.objects("drones"):
-            ready = [c for c in (body.get("status") or {}).get("conditions", ()) if c["type"] == "Ready"]
-            if ready and ready[0]["status"] == "True":
+            conditions = (body.get("status") or {}).get("conditions", ())
+            ready = next((condition for condition in conditions if condition["type"] == "Ready"), None)
+            if ready is not None and ready["status"] == "True":
                 return
-            reason = f"{body['metadata']['name']}: " + (ready[0].get("message") if ready else "has not reported yet")
+            detail = "has not reported yet" if ready is None else ready.get("message")
+            reason = f"{body['metadata']['name']}: {detail}"
         show(reason)
         time.sleep(POLL_S)
-    sick = "; ".join(_sick(kube)) or "see: kubectl -n fractus-system get pods"
-    raise ExperimentError(f"no drone was ready within {timeout_s:.0f} s ({reason}); {sick}")
+    failures = "; ".join(_start_failures(kube)) or "see: kubectl -n fractus-system get pods"
+    raise ExperimentError(f"no drone was ready within {timeout_s:.0f} s ({reason}); {failures}")
 
 
-def _sick(kube: Kube) -> list[str]:
-    """Return the system pods that fail to start, with the reason."""
-    found = []
+def _start_failures(kube: Kube) -> list[str]:
+    """Describe the system pods that fail to start."""
+    failures = []
     for pod in kube.objects("pods", SYSTEM):
         for container in pod.get("status", {}).get("containerStatuses", ()):
-            waiting = container.get("state", {}).get("waiting", {})
-            if waiting.get("reason") in {"CrashLoopBackOff", "ErrImageNeverPull", "ImagePullBackOff", "ErrImagePull"}:
-                found.append(f"pod {pod['metadata']['name']} is in {waiting['reason']}")
-    return found
+            reason = container.get("state", {}).get("waiting", {}).get("reason")
+            if reason in _START_FAILURES:
+                failures.append(f"pod {pod['metadata']['name']} is in {reason}")
+    return failures
 
 
-def _tell(logs: Path, start: int, say: Say) -> int:
-    """Report new log lines of the driver. Return the offset where the next call continues."""
-    with logs.open("rb") as file:
-        file.seek(start)
-        fresh = file.read()
-    end = fresh.rfind(b"\n") + 1
-    for line in fresh[:end].splitlines():
-        match = _LOG_LINE.match(line)
-        if match and match["container"] == b"navigator":
-            say("navigator: " + match["text"].decode("utf-8", "replace"))
-    return start + end
-
-
-def _ends(pod: Object) -> bool:
-    """Return True if a pod's mission has ended, so its last running state is kept."""
+def _is_stopping(pod: Object) -> bool:
+    """Return True if a pod is deleted or stopped after its mission. Its last running state is kept."""
     metadata = pod["metadata"]
     return "deletionTimestamp" in metadata or "fractus.dev/finished" in metadata.get("labels", {})
-
-
-def _drone(plan: Object) -> str:
-    return f"{plan['spec']['drone']['node']} flies" if plan["spec"].get("drone") else "no drone"
-
-
-def _words(state: str) -> str:
-    return {"takingOff": "taking off", "inactive": "on the ground"}.get(state, state)

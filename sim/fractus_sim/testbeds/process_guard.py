@@ -12,8 +12,8 @@ from collections.abc import Iterable
 _CLOSE_S = 5.0
 
 
-class Reaper:
-    """A guard process that holds a list of process groups, and kills them when the pipe to it closes."""
+class ProcessGuard:
+    """A guard process with a list of process groups. It kills them when its input pipe is closed."""
 
     def __init__(self) -> None:
         self._guard: subprocess.Popen[bytes] | None = None
@@ -22,23 +22,23 @@ class Reaper:
     def hold(self, group: int) -> None:
         """Kill a process group when the current process ends."""
         if self._guard is None:
-            theirs, self._pipe = os.pipe()
+            read_end, self._pipe = os.pipe()
             try:
                 self._guard = subprocess.Popen(
                     [sys.executable, "-I", "-S", __file__],
-                    stdin=theirs,
+                    stdin=read_end,
                     stdout=subprocess.DEVNULL,
                     stderr=subprocess.DEVNULL,
                     cwd="/",
                     start_new_session=True,
                 )
             finally:
-                os.close(theirs)
-        self._say(group)
+                os.close(read_end)
+        self._send(group)
 
-    def let_go(self, group: int) -> None:
+    def release(self, group: int) -> None:
         """Release a process group that has ended, because its id can be reused."""
-        self._say(-group)
+        self._send(-group)
 
     def close(self) -> None:
         """Kill the process groups that are still held."""
@@ -53,9 +53,10 @@ class Reaper:
             guard.kill()
             guard.wait(_CLOSE_S)
 
-    def _say(self, number: int) -> None:
+    def _send(self, number: int) -> None:
         if self._guard is not None:
-            with contextlib.suppress(BrokenPipeError):  # # The guard was killed. The processes are stopped without it.
+            # If the guard was killed, the processes are stopped without it.
+            with contextlib.suppress(BrokenPipeError):
                 os.write(self._pipe, b"%d\n" % number)
 
 

@@ -17,31 +17,30 @@ from fractus_core.planning.grant_compiler import compile_grants
 
 from fractus_sim.errors import ExperimentError
 from fractus_sim.experiment.definition import Experiment, Program, VehicleSetup
-from fractus_sim.report.audit_logs import read_audit
-from fractus_sim.testbeds.detections import FILE, VARIABLE, TruthWatch, read_detections
+from fractus_sim.testbeds.detections import DETECTIONS_FILE, DETECTIONS_VARIABLE, TruthWatch, read_detections
 from fractus_sim.testbeds.ground_station import TcpLink
 from fractus_sim.testbeds.standalone_drones import CameraSetup, DroneSetup, Standalone
-from fractus_sim.testbeds.testbed import Moment, Testbed
-from fractus_sim.testbeds.vehicle_testbed import command_of
+from fractus_sim.testbeds.testbed import Moment, Testbed, program_command, wind_argument
 
 TICK_S = 0.02
 CONNECT_S = 10.0
 
 
-class ServiceTestbed(Testbed):
+class StandaloneTestbed(Testbed):
     """Drones with their services. Programs run as components of the manifests."""
 
-    def __init__(self, experiment: Experiment, folder: Path, base: Path, tell: Callable[[str], None]) -> None:
-        super().__init__(experiment, folder, base, tell)
+    def __init__(self, experiment: Experiment, folder: Path, base: Path, report: Callable[[str], None]) -> None:
+        super().__init__(experiment, folder, base, report)
         for name in ("pki", *(setup.name for setup in experiment.setups())):
             shutil.rmtree(folder / name, ignore_errors=True)
         for log in (folder / "logs").glob("*.log"):
             log.unlink()
-        self._manifests = read([base / path for path in experiment.manifests])
-        self._ground = self.keep(Standalone(folder))
+        self._manifests = read_all_manifests([base / path for path in experiment.manifests])
+        self._drones = self.keep(Standalone(folder))
+        self.processes = self._drones.processes
         self._identities: dict[str, str] = {}
         self._watches: list[TruthWatch] = []
-        self._detections = folder / FILE
+        self._detections = folder / DETECTIONS_FILE
         self._detections.unlink(missing_ok=True)
         self._began_s = time.monotonic()
 
@@ -51,10 +50,10 @@ class ServiceTestbed(Testbed):
         Raises:
             ExperimentError: An application cannot be planned, or a process did not start.
         """
-        grants = list(granted(self._manifests))
-        described = self._manifests.of(Drone)
+        grants = list(planned_grants(self._manifests))
+        drone_manifests = self._manifests.of(Drone)
         for setup in self.experiment.setups():
-            drone = self._ground.add_drone(self._setup(setup, described.get(setup.name)))
+            drone = self._drones.add_drone(self._setup(setup, drone_manifests.get(setup.name)))
             host, port = drone.station_link.split(":")[1:]
             self.observe(setup, TcpLink.connect(host, int(port), CONNECT_S))
             self.endpoints[setup.name] = drone.guest_link
@@ -62,8 +61,8 @@ class ServiceTestbed(Testbed):
                 truths = self.folder / "logs" / f"{setup.name}-truth.jsonl"
                 self._watches.append(self.keep(TruthWatch(drone.world_url, truths)))
         for spec in grants:
-            if spec.node in self._ground.drones:
-                self._identities[spec.component] = self._ground.grant(grant_manifest(spec))
+            if spec.node in self._drones.drones:
+                self._identities[spec.component] = self._drones.grant(grant_manifest(spec))
         self._began_s = time.monotonic()
 
     def tick(self) -> Moment:
@@ -73,7 +72,7 @@ class ServiceTestbed(Testbed):
             ExperimentError: A vehicle or a service has ended.
         """
         time.sleep(TICK_S)
-        self._ground.check()
+        self._drones.check()
         return Moment((time.monotonic() - self._began_s) * self.experiment.pace, time.time_ns() // 1000)
 
     def begin(self) -> None:
@@ -84,56 +83,49 @@ class ServiceTestbed(Testbed):
             if program.component is not None and program.port is not None
         }
         for program in self.experiment.programs:
-            self._start(program, addresses)
+            self._start_program(program, addresses)
 
     @property
-    def busy(self) -> bool:
-        """True while a foreground program is running."""
-        return any(self._ground.processes.running(p.name) for p in self.experiment.programs if not p.background)
-
-    @property
-    def flies(self) -> list[str]:
+    def required_flights(self) -> list[str]:
         """All vehicles, or none if foreground programs determine the end of the experiment."""
-        return [] if any(not p.background for p in self.experiment.programs) else list(self.observers)
+        if any(not program.background for program in self.experiment.programs):
+            return []
+        return list(self.observers)
 
     def cut_link(self, vehicle: str) -> None:
         """Cut the link between companion computer and autopilot."""
-        self._ground.drones[vehicle].cut_link()
+        self._drones.drones[vehicle].cut_link()
 
     def heal_link(self, vehicle: str) -> None:
         """Restore the link between companion computer and autopilot."""
-        self._ground.drones[vehicle].heal_link()
+        self._drones.drones[vehicle].heal_link()
 
     def power_off(self, node: str) -> None:
         """Kill services and programs of a drone."""
-        self._ground.power_off(node)
+        self._drones.power_off(node)
 
     def power_on(self, node: str) -> None:
         """Restart services and programs of a drone."""
-        self._ground.power_on(node, wait=False)
+        self._drones.power_on(node, wait=False)
 
     def collect(self) -> None:
         """Stop programs and services, and read their audit logs."""
-        for program in self.experiment.programs:
-            self.findings.programs[program.name] = self._ground.processes.exit_code(program.name)
-        self._ground.stop_services()
+        super().collect()
+        self._drones.stop_services()
         if self._detections.exists():
             self.findings.detections = read_detections(self._detections.read_text().splitlines())
         for watch in self._watches:
             watch.close()
-            self.findings.truths += watch.seen
-        for drone in self._ground.drones.values():
-            for path in (drone.audit, drone.audit.with_name("camera.jsonl")):
-                if path.exists():
-                    read_audit(path, f"{drone.name}/{path.name}", self.findings)
+            self.findings.truths += watch.objects
+        for drone in self._drones.drones.values():
+            self.read_audit_logs(drone.name, drone.folder)
 
-    def _setup(self, setup: VehicleSetup, described: Drone | None) -> DroneSetup:
-        if described is None:
+    def _setup(self, setup: VehicleSetup, manifest: Drone | None) -> DroneSetup:
+        if manifest is None:
             raise ExperimentError(f"the manifests contain no Drone {setup.name}; add one")
         if setup.home is None:
             raise ExperimentError(f"{setup.name} has no start position; set `home`")
         entry = setup.entry
-        wind = self.experiment.wind
         world = self.experiment.world
         camera = CameraSetup(("--seed", str(world.seed), *world.arguments)) if entry.camera else None
         return DroneSetup(
@@ -145,33 +137,38 @@ class ServiceTestbed(Testbed):
             speedup=self.experiment.pace,
             ready_after_s=entry.ready_after,
             parameters=entry.parameters,
-            description=described.spec.to_dict(),
+            description=manifest.spec.to_dict(),
             camera=camera,
-            vehicle_arguments=("--wind", f"{wind.speed},{wind.direction},{wind.turbulence}"),
+            vehicle_arguments=("--wind", wind_argument(self.experiment)),
         )
 
-    def _start(self, program: Program, addresses: Mapping[str, str]) -> None:
-        others = {name: address for name, address in addresses.items() if name != program.component}
-        own = {"PORT": str(program.port)} if program.port is not None else {}
+    def _start_program(self, program: Program, addresses: Mapping[str, str]) -> None:
+        services = {name: address for name, address in addresses.items() if name != program.component}
+        port = {"PORT": str(program.port)} if program.port is not None else {}
         identity = self._identities.get(program.component or "")
-        environment = {VARIABLE: str(self._detections.absolute()), **own, **program.environment}
+        environment = {DETECTIONS_VARIABLE: str(self._detections.absolute()), **port, **program.environment}
         if identity is not None:
-            self._ground.run(
-                program.name, command_of(program), identity, environment=environment, services=others, folder=self.base
+            self._drones.run(
+                program.name,
+                program_command(program),
+                identity,
+                environment=environment,
+                services=services,
+                folder=self.base,
             )
             return
-        known = {component.name for app in self._manifests.applications() for component in app.spec.components}
-        if program.component not in known:
+        components = {component.name for app in self._manifests.applications() for component in app.spec.components}
+        if program.component not in components:
             raise ExperimentError(
                 f"program {program.name}: no application has a component {program.component}; known:"
-                f" {', '.join(sorted(known))}"
+                f" {', '.join(sorted(components))}"
             )
-        self._ground.run_beside(
-            program.name, command_of(program), environment=environment, services=others, folder=self.base
+        self._drones.run_beside(
+            program.name, program_command(program), environment=environment, services=services, folder=self.base
         )
 
 
-def read(paths: Sequence[Path]) -> Manifests:
+def read_all_manifests(paths: Sequence[Path]) -> Manifests:
     """Read the manifests of files and directories.
 
     Raises:
@@ -183,7 +180,7 @@ def read(paths: Sequence[Path]) -> Manifests:
         raise ExperimentError(str(error)) from None
 
 
-def granted(manifests: Manifests) -> Iterable[GrantSpec]:
+def planned_grants(manifests: Manifests) -> Iterable[GrantSpec]:
     """Yield the Grants that the operator would create.
 
     Raises:
@@ -191,14 +188,14 @@ def granted(manifests: Manifests) -> Iterable[GrantSpec]:
     """
     settings = Settings()
     try:
-        decided = plan_all(manifests, settings)
+        decisions = plan_all(manifests, settings)
     except BadManifest as error:
         raise ExperimentError(str(error)) from None
-    for answer in decided:
-        name = answer.application.name
-        if answer.plan is None:
-            raise ExperimentError(f"Application {name} cannot be planned: {answer.refusal}")
-        yield from compile_grants(answer.application, answer.plan, manifests.inventory(), settings)
+    for decision in decisions:
+        name = decision.application.name
+        if decision.plan is None:
+            raise ExperimentError(f"Application {name} cannot be planned: {decision.refusal}")
+        yield from compile_grants(decision.application, decision.plan, manifests.inventory(), settings)
 
 
 def grant_manifest(spec: GrantSpec) -> dict[str, Any]:

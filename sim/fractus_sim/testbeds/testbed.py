@@ -1,7 +1,8 @@
-"""Common interface of the three experiment modes."""
+"""Common interface of the three experiment modes, and the results that they collect."""
 
 from __future__ import annotations
 
+import sys
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
@@ -9,10 +10,17 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
-from fractus_sim.experiment.definition import Experiment, VehicleSetup
-from fractus_sim.testbeds.detections import Seen
+from fractus_sim.experiment.definition import Experiment, Program, VehicleSetup
+from fractus_sim.report.audit_logs import read_audit_logs
+from fractus_sim.testbeds.detections import ObservedObject
 from fractus_sim.testbeds.ground_station import OBSERVER_ID, Link, Station
+from fractus_sim.testbeds.local_processes import Processes
 from fractus_sim.testbeds.tlog import TlogWriter
+
+AUDIT_LOGS = ("mobility.jsonl", "camera.jsonl")
+"""Audit logs of the services of a drone."""
+
+_JUDGED_KINDS = frozenset({"call", "monitor", "takeover"})
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,6 +31,27 @@ class Moment:
     unix_us: int
 
 
+@dataclass
+class Findings:
+    """Results for checks and report that are not part of a flight recording.
+
+    Attributes:
+        programs: Exit codes by program. None if the program had to be stopped.
+        calls: Audit log entries with a verdict.
+        audit_problems: Verification problem by log. Empty if the log is valid.
+        phases: Phases of each Application in the order observed.
+        detections: Detections of programs.
+        truths: Objects in view of the camera worlds.
+    """
+
+    programs: dict[str, int | None] = field(default_factory=dict)
+    calls: list[Mapping[str, Any]] = field(default_factory=list)
+    audit_problems: dict[str, str] = field(default_factory=dict)
+    phases: dict[str, list[str]] = field(default_factory=dict)
+    detections: list[ObservedObject] = field(default_factory=list)
+    truths: list[ObservedObject] = field(default_factory=list)
+
+
 class Closable(Protocol):
     """An object with a `close` method."""
 
@@ -30,7 +59,7 @@ class Closable(Protocol):
         """Close the object."""
 
 
-_Kept = TypeVar("_Kept", bound=Closable)
+_Resource = TypeVar("_Resource", bound=Closable)
 
 
 class Testbed(ABC):
@@ -40,36 +69,48 @@ class Testbed(ABC):
         observers: Link of each vehicle that records and injects faults. It is never cut.
         pilots: Ground station of each vehicle that flies its task. Empty in modes where applications fly.
         endpoints: MAVLink endpoint of each vehicle for QGroundControl or Mission Planner.
+        findings: Results, complete after `collect`.
+        processes: Local processes. None if the mode starts none.
     """
 
-    def __init__(self, experiment: Experiment, folder: Path, base: Path, tell: Callable[[str], None]) -> None:
+    def __init__(self, experiment: Experiment, folder: Path, base: Path, report: Callable[[str], None]) -> None:
+        """Create the testbed without starting anything.
+
+        Args:
+            experiment: Experiment to run.
+            folder: Output folder.
+            base: Base directory of relative paths in the experiment.
+            report: Called with progress lines.
+        """
         self.experiment = experiment
         self.folder = folder
         self.base = base
-        self.tell = tell
+        self.report = report
         self.observers: dict[str, Station] = {}
         self.pilots: dict[str, Station] = {}
         self.endpoints: dict[str, str] = {}
         self.findings = Findings()
-        self._kept = ExitStack()
+        self.processes: Processes | None = None
+        self._resources = ExitStack()
 
-    def keep(self, resource: _Kept) -> _Kept:
+    def keep(self, resource: _Resource) -> _Resource:
         """Register an object to be closed with the testbed. Call this right after its creation."""
-        self._kept.callback(resource.close)
+        self._resources.callback(resource.close)
         return resource
 
     def at_end(self, action: Callable[[], object]) -> None:
         """Register an action to run when the testbed is closed."""
-        self._kept.callback(action)
+        self._resources.callback(action)
 
     def observe(self, setup: VehicleSetup, link: Link) -> None:
         """Record a vehicle over a separate link."""
         log = self.keep(TlogWriter(self.folder / "logs" / f"{setup.name}-observer.tlog"))
-        self.observers[setup.name] = self.keep(Station(link, setup.system_id, log, own_id=OBSERVER_ID, beats=False))
+        station = Station(link, setup.system_id, log, own_id=OBSERVER_ID, sends_heartbeats=False)
+        self.observers[setup.name] = self.keep(station)
 
     def close(self) -> None:
         """Close everything in reverse order. Failures and interrupts do not skip the remaining objects."""
-        self._kept.close()
+        self._resources.close()
 
     @abstractmethod
     def set_up(self) -> None:
@@ -93,11 +134,13 @@ class Testbed(ABC):
 
     @property
     def busy(self) -> bool:
-        """True while a program or Application has not ended."""
-        return False
+        """True while a foreground program or an Application has not ended."""
+        processes = self.processes
+        programs = [program.name for program in self.experiment.programs if not program.background]
+        return processes is not None and any(map(processes.running, programs))
 
     @property
-    def flies(self) -> Sequence[str]:
+    def required_flights(self) -> Sequence[str]:
         """Vehicles of which at least one must fly before the experiment can end."""
         return ()
 
@@ -117,27 +160,26 @@ class Testbed(ABC):
     def power_on(self, node: str) -> None:
         """Power on a node."""
 
-    @abstractmethod
     def collect(self) -> None:
-        """Collect results into `findings` before the testbed is closed."""
+        """Collect results into `findings` before the testbed is closed. This method adds exit codes of programs."""
+        if self.processes is not None:
+            for program in self.experiment.programs:
+                self.findings.programs[program.name] = self.processes.exit_code(program.name)
+
+    def read_audit_logs(self, vehicle: str, folder: Path) -> None:
+        """Verify the audit logs of a drone's services, and add their policy decisions to the findings."""
+        for log in read_audit_logs(folder / name for name in AUDIT_LOGS if (folder / name).exists()):
+            self.findings.audit_problems[f"{vehicle}/{log.path.name}"] = log.problem
+            self.findings.calls += [entry for entry in log.entries if entry.get("kind") in _JUDGED_KINDS]
 
 
-@dataclass
-class Findings:
-    """Results that the testbed collects for checks and report.
+def program_command(program: Program) -> list[str]:
+    """Return the command of a program. `python` is replaced by the current interpreter."""
+    executable, *arguments = program.command
+    return [sys.executable if executable in {"python", "python3"} else executable, *arguments]
 
-    Attributes:
-        programs: Exit codes by program. None if the program had to be stopped.
-        calls: Audit log entries with a verdict.
-        audit_problems: Verification problem by log. Empty if the log is valid.
-        phases: Phases of each Application in the order observed.
-        detections: Detections of programs.
-        truths: Objects in view of the camera worlds.
-    """
 
-    programs: dict[str, int | None] = field(default_factory=dict)
-    calls: list[Mapping[str, Any]] = field(default_factory=list)
-    audit_problems: dict[str, str] = field(default_factory=dict)
-    phases: dict[str, list[str]] = field(default_factory=dict)
-    detections: list[Seen] = field(default_factory=list)
-    truths: list[Seen] = field(default_factory=list)
+def wind_argument(experiment: Experiment) -> str:
+    """Return the initial wind as the option `--wind` of the simulated vehicle: speed, direction, turbulence."""
+    wind = experiment.wind
+    return f"{wind.speed},{wind.direction},{wind.turbulence}"

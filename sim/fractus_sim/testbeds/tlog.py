@@ -11,7 +11,7 @@ from fractus_runtime.mavlink_codec import Parser, frame_length
 
 _STAMP = struct.Struct(">Q")
 _MIN_HEADER_LENGTH = 3
-"""Bytes of a frame from which its length follows."""
+"""Number of bytes at the start of a frame that determine its length."""
 
 
 class TlogWriter:
@@ -40,8 +40,8 @@ class Framer:
         self._log = log
         self._parser = Parser()
 
-    def take(self, data: bytes, unix_us: int) -> None:
-        """Parse received or sent bytes."""
+    def feed(self, data: bytes, unix_us: int) -> None:
+        """Parse received or sent bytes, and write the complete frames."""
         for message in self._parser.feed(data):
             self._log.write(unix_us, message.frame)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -16,11 +15,11 @@ from fractus_vehicle.simulation import Craft, Simulation
 from fractus_vehicle.state import CONTROL_STEP_S, REPEATABLE_EPOCH_US, VehicleConfig
 
 from fractus_sim.errors import ExperimentError
-from fractus_sim.experiment.definition import Experiment, Program, VehicleSetup
+from fractus_sim.experiment.definition import Experiment, VehicleSetup
 from fractus_sim.testbeds.ground_station import ChannelLink, Link, Station, TcpLink
 from fractus_sim.testbeds.link_tap import LinkTap
 from fractus_sim.testbeds.local_processes import Processes
-from fractus_sim.testbeds.testbed import Moment, Testbed
+from fractus_sim.testbeds.testbed import Moment, Testbed, program_command
 from fractus_sim.testbeds.tlog import TlogWriter
 
 STEPS_PER_TICK = 2
@@ -31,10 +30,11 @@ CONNECT_S = 20.0
 class VehicleTestbed(Testbed):
     """Vehicles without services."""
 
-    def __init__(self, experiment: Experiment, folder: Path, base: Path, tell: Callable[[str], None]) -> None:
-        super().__init__(experiment, folder, base, tell)
+    def __init__(self, experiment: Experiment, folder: Path, base: Path, report: Callable[[str], None]) -> None:
+        super().__init__(experiment, folder, base, report)
         self._logs = folder / "logs"
-        self._processes = Processes(self._logs)
+        self._programs = Processes(self._logs)
+        self.processes = self._programs
         self._hub = self.keep(Hub())
         self._simulation = Simulation([])
         self._program_links: dict[str, str] = {}
@@ -52,10 +52,10 @@ class VehicleTestbed(Testbed):
         self._logs.mkdir(parents=True, exist_ok=True)
         for setup in self.experiment.setups():
             if setup.entry.connection is not None:
-                self._attach(setup)
+                self._attach_autopilot(setup)
             else:
-                self._make(setup)
-        self.at_end(self._processes.stop_all)
+                self._create_vehicle(setup)
+        self.at_end(self._programs.stop_all)
         self._last_wall_s = time.monotonic()
 
     def tick(self) -> Moment:
@@ -80,15 +80,10 @@ class VehicleTestbed(Testbed):
         for program in self.experiment.programs:
             link = self._program_links[program.name]
             environment = {**os.environ, "PYTHONUNBUFFERED": "1", "FRACTUS_VEHICLE": link, **program.environment}
-            self._processes.start(program.name, command_of(program), environment, self.base)
+            self._programs.start(program.name, program_command(program), environment, self.base)
 
     @property
-    def busy(self) -> bool:
-        """True while a foreground program is running."""
-        return any(self._processes.running(p.name) for p in self.experiment.programs if not p.background)
-
-    @property
-    def flies(self) -> list[str]:
+    def required_flights(self) -> list[str]:
         """Vehicles that are flown by programs."""
         flown = {p.vehicle for p in self.experiment.programs}
         return [s.name for s in self.experiment.setups() if s.name in flown and not s.entry.task]
@@ -113,42 +108,40 @@ class VehicleTestbed(Testbed):
         """Raise an error. The data model rejects this fault in mode vehicles."""
         raise ExperimentError(f"{node}: mode vehicles has no nodes to power on")
 
-    def collect(self) -> None:
-        """Record the exit codes of the programs."""
-        for program in self.experiment.programs:
-            self.findings.programs[program.name] = self._processes.exit_code(program.name)
-
-    def _make(self, setup: VehicleSetup) -> None:
+    def _create_vehicle(self, setup: VehicleSetup) -> None:
         try:
-            craft = Craft(self._config(setup))
+            craft = Craft(self._vehicle_config(setup))
         except UnknownParameterError as error:
             raise ExperimentError(f"{setup.name}: the autopilot has no parameter {error.args[0]}") from None
         self._simulation.crafts.append(craft)
-        self._stations(setup, ChannelLink(craft, "station"), ChannelLink(craft, "observer"))
+        self._connect_stations(setup, ChannelLink(craft, "station"), ChannelLink(craft, "observer"))
         if not self._pace:
             return
-        self.endpoints[setup.name] = self._open(craft)
+        self.endpoints[setup.name] = self._open_endpoint(craft)
         for program in self.experiment.programs:
             if program.vehicle == setup.name:
-                self._program_links[program.name] = self._tap(setup.name, program.name, self._open(craft))
+                self._program_links[program.name] = self._insert_tap(
+                    setup.name, program.name, self._open_endpoint(craft)
+                )
 
-    def _attach(self, setup: VehicleSetup) -> None:
+    def _attach_autopilot(self, setup: VehicleSetup) -> None:
         connection = setup.entry.connection or ""
         _, host, port = connection.split(":")
         links = [TcpLink.connect(host, int(port), CONNECT_S) for _ in range(2)]
-        self._stations(setup, links[0], links[1])
+        self._connect_stations(setup, links[0], links[1])
         self.endpoints[setup.name] = connection
         for program in self.experiment.programs:
             if program.vehicle == setup.name:
                 self._program_links[program.name] = connection
 
-    def _stations(self, setup: VehicleSetup, pilot: Link, observer: Link) -> None:
+    def _connect_stations(self, setup: VehicleSetup, pilot: Link, observer: Link) -> None:
         log = self.keep(TlogWriter(self._logs / f"{setup.name}.tlog"))
-        beats = all(program.vehicle != setup.name for program in self.experiment.programs)
-        self.pilots[setup.name] = self.keep(Station(pilot, setup.system_id, log, beats=beats))
+        has_program = any(program.vehicle == setup.name for program in self.experiment.programs)
+        station = Station(pilot, setup.system_id, log, sends_heartbeats=not has_program)
+        self.pilots[setup.name] = self.keep(station)
         self.observe(setup, observer)
 
-    def _open(self, craft: Craft) -> str:
+    def _open_endpoint(self, craft: Craft) -> str:
         link = f"tcp:127.0.0.1:{free_port()}"
         try:
             self._hub.open(LinkSpec.parse(link), craft, 1)
@@ -156,7 +149,7 @@ class VehicleTestbed(Testbed):
             raise ExperimentError(str(error)) from None
         return link
 
-    def _tap(self, vehicle: str, program: str, link: str) -> str:
+    def _insert_tap(self, vehicle: str, program: str, link: str) -> str:
         port = free_port()
         tap = LinkTap.between(
             port, ("127.0.0.1", int(link.rpartition(":")[2])), self._logs / f"{vehicle}-{program}.tlog"
@@ -164,25 +157,19 @@ class VehicleTestbed(Testbed):
         self._taps.setdefault(vehicle, []).append(self.keep(tap))
         return f"tcp:127.0.0.1:{port}"
 
-    def _config(self, setup: VehicleSetup) -> VehicleConfig:
+    def _vehicle_config(self, setup: VehicleSetup) -> VehicleConfig:
         home = setup.home
         wind = self.experiment.wind
         entry = setup.entry
         if home is None:
             raise ExperimentError(f"{setup.name} has no start position; set `home`")
-        blow = {"SIM_WIND_SPD": wind.speed, "SIM_WIND_DIR": wind.direction, "SIM_WIND_TURB": wind.turbulence}
+        wind_parameters = {"SIM_WIND_SPD": wind.speed, "SIM_WIND_DIR": wind.direction, "SIM_WIND_TURB": wind.turbulence}
         return VehicleConfig(
             start=Place.from_degrees(home.lat, home.lon, home.alt),
             heading_deg=entry.heading,
             sysid=setup.system_id,
             seed=self.experiment.seed,
             ready_after_s=entry.ready_after,
-            parameters={**blow, **entry.parameters},
-            epoch_us=REPEATABLE_EPOCH_US if not self._pace else time.time_ns() // 1000,
+            parameters={**wind_parameters, **entry.parameters},
+            epoch_us=time.time_ns() // 1000 if self._pace else REPEATABLE_EPOCH_US,
         )
-
-
-def command_of(program: Program) -> list[str]:
-    """Return the command of a program. `python` is replaced by the current interpreter."""
-    first, *rest = program.command
-    return [sys.executable if first in {"python", "python3"} else first, *rest]

@@ -2,30 +2,28 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import click
 
-from fractus_sim.errors import ExperimentError
-from fractus_sim.interruption import break_off_on_signals
-from fractus_sim.report.figure_style import save
-from fractus_sim.report.report_files import PAGE, write_page
+from fractus_sim.command_line import command_errors, exit_with_expectations
+from fractus_sim.report.report_files import Expectation, remove_report
 from fractus_sim.scenarios.field.field_evidence import Evidence
-from fractus_sim.scenarios.field.field_expectations import Check, Judge
-from fractus_sim.scenarios.field.field_flight import RUNS, Autopilot, fly, look
-from fractus_sim.scenarios.field.field_report import draw_altitudes, draw_ground, figures, summary
-from fractus_sim.scenarios.field.field_site import EXAMPLE, Field, dump
-
-FAILED_EXPECTATIONS = 2
+from fractus_sim.scenarios.field.field_expectations import evaluate_run
+from fractus_sim.scenarios.field.field_flight import RUNS, Autopilot, find_parked_vehicle, fly
+from fractus_sim.scenarios.field.field_report import write_field_report
+from fractus_sim.scenarios.field.field_site import EXAMPLE, FieldSite
 
 
 @click.command()
-@click.option("--out", type=click.Path(path_type=Path), default=Path("out/field"), show_default=True)
+@click.option(
+    "--out", type=click.Path(path_type=Path), default=Path("out/field"), show_default=True,
+    help="Output folder of the report.",
+)  # fmt: skip
 @click.option(
     "--autopilot",
     metavar="tcp:HOST:PORT",
-    help="Fly with an ArduCopter that runs already (SITL or a vehicle) instead of simulated ones.",
+    help="Fly with a running ArduCopter (SITL or a vehicle) instead of simulated vehicles.",
 )
 @click.option(
     "--speedup",
@@ -40,53 +38,46 @@ def field(*, out: Path, autopilot: str | None, speedup: float, names: tuple[str,
 
     Exit code: 0 if all expectations hold, 2 if one does not, 1 if the experiment could not be flown.
     """
-    break_off_on_signals()
-    try:
-        checks = experiment(out, Autopilot(autopilot, speedup), names)
-    except ExperimentError as error:
-        raise click.ClickException(str(error)) from None
-    failed = [check for check in checks if not check.holds]
-    for check in failed:
-        click.echo(f"NOT AS EXPECTED, {check.run}: {check.text} ({check.seen})", err=True)
-    click.echo(f"{len(checks) - len(failed)} of {len(checks)} expectations hold; see {out / 'summary.md'}")
-    if failed:
-        sys.exit(FAILED_EXPECTATIONS)
+    with command_errors():
+        expectations = run_field_experiment(out, Autopilot(autopilot, speedup), names)
+    exit_with_expectations(expectations, out)
 
 
-def experiment(out: Path, autopilot: Autopilot, names: tuple[str, ...] = ()) -> list[Check]:
-    """Fly the runs, write the report, and return the checks.
+def run_field_experiment(out: Path, autopilot: Autopilot, names: tuple[str, ...] = ()) -> list[Expectation]:
+    """Fly the runs, write the report, and return the expectations.
+
+    Args:
+        out: Output folder.
+        autopilot: Vehicle to fly.
+        names: Names of the runs. Default: all runs.
 
     Raises:
         ExperimentError: A run could not be flown.
     """
-    ground = Field.read(EXAMPLE)
-    words = "simulated vehicles"
-    if autopilot.link is not None:
-        standing = look(autopilot.link, _tell)
-        ground = Field.read(EXAMPLE, standing.home)
-        words = f"vehicle {standing.system_id} at {autopilot.link}"
+    if autopilot.link is None:
+        site = FieldSite.read(EXAMPLE)
+        vehicle = "simulated vehicles"
+    else:
+        parked = find_parked_vehicle(autopilot.link, _report)
+        site = FieldSite.read(EXAMPLE, parked.home)
+        vehicle = f"vehicle {parked.system_id} at {autopilot.link}"
     out.mkdir(parents=True, exist_ok=True)
-    (out / PAGE).unlink(missing_ok=True)
+    remove_report(out)
     runs: list[Evidence] = []
-    checks: list[Check] = []
+    expectations: list[Expectation] = []
     for run in RUNS:
         if names and run.name not in names:
             continue
-        _tell(f"run: {run.title}")
-        flown = fly(run, ground, autopilot, out / run.name, _tell)
-        judge = Judge(ground, flown)
-        checks += {"normal": judge.normal, "guarded": judge.guarded, "unguarded": judge.unguarded}[run.name]()
-        runs.append(flown)
-    area = ground.operation_area(ground.grants(ground.write(out), policies=True))
-    save(draw_ground(ground, area, runs), out / "map.png")
-    save(draw_altitudes(runs), out / "altitude.png")
-    (out / "report.json").write_text(dump(figures(ground, runs, checks, words)))
-    write_page(out, summary(ground, runs, checks, words))
-    return checks
+        click.echo(f"run: {run.title}")
+        evidence = fly(run, site, autopilot, out / run.name, _report)
+        expectations += evaluate_run(site, evidence)
+        runs.append(evidence)
+    write_field_report(site, runs, expectations, vehicle, out)
+    return expectations
 
 
-def _tell(text: str) -> None:
-    click.echo(f"  {text}" if not text.startswith("run:") else text)
+def _report(line: str) -> None:
+    click.echo(f"  {line}")
 
 
 if __name__ == "__main__":

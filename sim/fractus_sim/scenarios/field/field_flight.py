@@ -1,4 +1,4 @@
-"""Execution of one run: vehicle, services and both example programs as processes, until the drone has landed."""
+"""Flight of one run: vehicle, services and both example programs as processes, until the drone has landed."""
 
 from __future__ import annotations
 
@@ -24,19 +24,20 @@ from fractus_sim.scenarios.field.field_site import (
     NAVIGATOR,
     VIEWER,
     ZIGZAG,
-    Field,
-    as_text,
+    FieldSite,
+    format_position,
 )
 from fractus_sim.testbeds.ground_station import OBSERVER_ID, STATION_COMPONENT, TcpLink
 from fractus_sim.testbeds.standalone_drones import CameraSetup, DroneSetup, RunningDrone, Standalone
 
-PERIOD_S = 10.0
-STAY_S = 2 * PERIOD_S
+PICTURE_INTERVAL_S = 10.0
+HOVER_S = 2 * PICTURE_INTERVAL_S
 FLIGHT_TIMEOUT_S = 600.0
 READY_TIMEOUT_S = 180.0
 POLL_S = 0.25
-# Speed of the simulated vehicle. It equals the maximum speed in the drone's description, so nothing is corrected.
 PARAMETERS: Mapping[str, float] = {"WPNAV_SPEED": 500.0}
+"""The speed (cm/s) equals the maximum speed in the drone's description, so that no policy corrects it."""
+
 WIND = "2,240,0.5"
 
 
@@ -75,50 +76,50 @@ class Autopilot:
     speedup: float
 
 
-def fly(run: Run, field: Field, autopilot: Autopilot, folder: Path, tell: Callable[[str], None]) -> Evidence:
+def fly(run: Run, site: FieldSite, autopilot: Autopilot, folder: Path, report: Callable[[str], None]) -> Evidence:
     """Fly one run and read its evidence.
 
     Raises:
         ExperimentError: A process did not start, or the drone did not land before the timeout.
     """
     shutil.rmtree(folder, ignore_errors=True)
-    manifests = field.write(folder)
-    grants = field.grants(manifests, policies=run.policies)
-    with Standalone(folder) as ground:
-        drone = ground.add_drone(_setup(field, autopilot))
-        identities = {grant["spec"]["component"]: ground.grant(grant) for grant in grants}
-        extra = _environment(run, field, STAY_S / autopilot.speedup)
+    manifests = site.write(folder)
+    grants = site.grants(manifests, policies=run.policies)
+    with Standalone(folder) as drones:
+        drone = drones.add_drone(_drone_setup(site, autopilot))
+        identities = {grant["spec"]["component"]: drones.grant(grant) for grant in grants}
+        environment = navigator_environment(run, site, HOVER_S / autopilot.speedup)
         programs = {NAVIGATOR: "navigator", VIEWER: "aerial_viewer"}
-        period = {"PERIOD_S": f"{PERIOD_S / autopilot.speedup:.3f}"}
+        interval = {"PERIOD_S": f"{PICTURE_INTERVAL_S / autopilot.speedup:.3f}"}
         for component, program in programs.items():
             command = [sys.executable, str(EXAMPLE.absolute() / f"{program}.py")]
-            ground.run(program, command, identities[component], environment={**extra, **period})
-        _wait_home(ground, drone, autopilot, tell)
-        ground.stop_services()
+            drones.run(program, command, identities[component], environment={**environment, **interval})
+        _wait_landed(drones, drone, autopilot, report)
+        drones.stop_services()
     audits = (drone.audit, drone.audit.with_name("camera.jsonl"))
     return read_evidence(run.name, run.title, policies=run.policies, tlog=drone.tlog, audits=audits)
 
 
-def _environment(run: Run, field: Field, stay_s: float) -> dict[str, str]:
+def navigator_environment(run: Run, site: FieldSite, hover_s: float) -> dict[str, str]:
     """Return the environment of the Navigator: manifest values, hover position above the stripe, and violations."""
-    places = field.places
-    above = f"6:{as_text(places[ABOVE_STRIPE])},{stay_s:.1f}"
-    told = {ZIGZAG: field.environment[ZIGZAG], "DETOURS": above}
+    places = site.places
+    above = f"6:{format_position(places[ABOVE_STRIPE])},{hover_s:.1f}"
+    environment = {ZIGZAG: site.environment[ZIGZAG], "DETOURS": above}
     if not run.violates:
-        return told
-    detours = f"2:{as_text(places['WP-E1'])}; {above}; 7:{as_text(places['WP-E2'])}"
-    return {**told, "ALTITUDES": "1:20,3:20,6:4", "DETOURS": detours}
+        return environment
+    detours = f"2:{format_position(places['WP-E1'])}; {above}; 7:{format_position(places['WP-E2'])}"
+    return {**environment, "ALTITUDES": "1:20,3:20,6:4", "DETOURS": detours}
 
 
-def _setup(field: Field, autopilot: Autopilot) -> DroneSetup:
+def _drone_setup(site: FieldSite, autopilot: Autopilot) -> DroneSetup:
     simulated = autopilot.link is None
     return DroneSetup(
         DRONE,
-        field.home,
+        site.home,
         speedup=autopilot.speedup,
         ready_after_s=FULL_START_S,
         parameters=PARAMETERS,
-        description=field.drone.spec.to_dict(),
+        description=site.drone.spec.to_dict(),
         # The camera world needs a second link to the vehicle, which a running autopilot may not offer.
         camera=CameraSetup(("--seed", "3")) if simulated else CameraSetup(None),
         vehicle_arguments=("--wind", WIND),
@@ -126,39 +127,40 @@ def _setup(field: Field, autopilot: Autopilot) -> DroneSetup:
     )
 
 
-def _wait_home(ground: Standalone, drone: RunningDrone, autopilot: Autopilot, tell: Callable[[str], None]) -> None:
+def _wait_landed(drones: Standalone, drone: RunningDrone, autopilot: Autopilot, report: Callable[[str], None]) -> None:
     """Wait until the mobility service reports the landing.
 
     Raises:
         ExperimentError: The drone did not take off or land before the timeout, or a process ended.
     """
     began_s = time.monotonic()
-    said = 0
+    reported = 0
     flown = False
     while True:
         log = list(entries(drone.audit.read_bytes().splitlines() if drone.audit.exists() else ()))
         control = [e for e in log if e.get("kind") in ("control", "takeover")]
-        for entry in control[said:]:
-            tell(f"{entry.get('action')}{': ' + entry['reason'] if entry.get('reason') else ''}")
-        said = len(control)
+        for entry in control[reported:]:
+            reason = f": {entry['reason']}" if entry.get("reason") else ""
+            report(f"{entry.get('action')}{reason}")
+        reported = len(control)
         flown = flown or any(e.get("in_air") for e in log if e.get("kind") == "state")
         if flown and any(e.get("action") == "landed" for e in control):
             return
         waited_s = time.monotonic() - began_s
         if not flown and waited_s > READY_TIMEOUT_S:
             raise ExperimentError(
-                f"the drone did not take off within {READY_TIMEOUT_S:.0f} s: {ground.processes.log_tail('navigator')}"
+                f"the drone did not take off within {READY_TIMEOUT_S:.0f} s: {drones.processes.log_tail('navigator')}"
             )
         if waited_s > READY_TIMEOUT_S + FLIGHT_TIMEOUT_S / autopilot.speedup:
-            raise ExperimentError(f"the drone was not home within {waited_s:.0f} s; its last word: {control[-1:]}")
-        ground.check()
+            raise ExperimentError(f"the drone was not home within {waited_s:.0f} s; last control entry: {control[-1:]}")
+        drones.check()
         time.sleep(POLL_S)
 
 
-CONNECT_S = 5.0
-HEARTBEAT_S = 15.0
+CONNECT_TIMEOUT_S = 5.0
+HEARTBEAT_TIMEOUT_S = 15.0
 POSITION_TIMEOUT_S = 120.0
-ASK_S = 1.0
+REQUEST_INTERVAL_S = 1.0
 LINK_POLL_S = 0.05
 
 
@@ -182,7 +184,7 @@ def parse_link(text: str) -> tuple[str, int]:
         raise ExperimentError(f"autopilot {text!r}: expected tcp:HOST:PORT") from None
 
 
-def look(link: str, tell: Callable[[str], None]) -> ParkedVehicle:
+def find_parked_vehicle(link: str, report: Callable[[str], None]) -> ParkedVehicle:
     """Wait until an ArduPilot vehicle on the ground has a position, then close the link.
 
     Raises:
@@ -190,34 +192,36 @@ def look(link: str, tell: Callable[[str], None]) -> ParkedVehicle:
             timeout.
     """
     host, port = parse_link(link)
-    visitor = _Visitor(TcpLink.connect(host, port, CONNECT_S))
+    connection = _AutopilotConnection(TcpLink.connect(host, port, CONNECT_TIMEOUT_S))
     try:
-        heartbeat = visitor.wait(
-            lambda m: m.name == "HEARTBEAT" and m.compid == mavlink.MAV_COMP_ID_AUTOPILOT1, HEARTBEAT_S, "no heartbeat"
+        heartbeat = connection.wait(
+            lambda m: m.name == "HEARTBEAT" and m.compid == mavlink.MAV_COMP_ID_AUTOPILOT1,
+            HEARTBEAT_TIMEOUT_S,
+            "no heartbeat",
         )
         if heartbeat.integer("autopilot") != mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA:
-            raise ExperimentError(f"the autopilot at {link} is no ArduPilot")
+            raise ExperimentError(f"the autopilot at {link} is not ArduPilot")
         if heartbeat.integer("base_mode") & mavlink.MAV_MODE_FLAG_SAFETY_ARMED:
             raise ExperimentError(f"the vehicle at {link} is armed; land and disarm it first")
-        visitor.system_id = heartbeat.sysid
-        tell(f"vehicle {heartbeat.sysid} at {link}; waiting for its position")
-        visitor.ask("GPS_RAW_INT")
-        visitor.wait(
+        connection.system_id = heartbeat.sysid
+        report(f"vehicle {heartbeat.sysid} at {link}; waiting for its position")
+        connection.request("GPS_RAW_INT")
+        connection.wait(
             lambda m: m.name == "GPS_RAW_INT" and m.integer("fix_type") >= mavlink.GPS_FIX_TYPE_3D_FIX,
             POSITION_TIMEOUT_S,
             "no GPS fix",
             "GPS_RAW_INT",
         )
-        home = visitor.wait(
+        home = connection.wait(
             lambda m: m.name == "HOME_POSITION", POSITION_TIMEOUT_S, "no home position", "HOME_POSITION"
         )
     finally:
-        visitor.close()
+        connection.close()
     place = (home.integer("latitude") / 1e7, home.integer("longitude") / 1e7, home.integer("altitude") / 1000.0)
     return ParkedVehicle(heartbeat.sysid, place)
 
 
-class _Visitor:
+class _AutopilotConnection:
     """A short exchange over one link."""
 
     def __init__(self, link: TcpLink) -> None:
@@ -225,26 +229,32 @@ class _Visitor:
         self._link = link
         self._endpoint = Endpoint(OBSERVER_ID, STATION_COMPONENT)
 
-    def ask(self, name: str) -> None:
+    def request(self, name: str) -> None:
         """Request one message of a type."""
         values: dict[str, Value] = {"command": int(mavlink.MAV_CMD_REQUEST_MESSAGE), "param1": float(message_id(name))}
         values |= {"target_system": self.system_id, "target_component": 1}
         self._link.send(self._endpoint.encode("COMMAND_LONG", values))
 
-    def wait(self, wanted: Callable[[Message], bool], timeout_s: float, missing: str, asking: str = "") -> Message:
-        """Return the first matching message. `asking` repeats the request every second.
+    def wait(self, matches: Callable[[Message], bool], timeout_s: float, missing: str, requested: str = "") -> Message:
+        """Return the first message that matches.
+
+        Args:
+            matches: Condition of the message.
+            timeout_s: Maximum time to wait, seconds.
+            missing: Description of the message for the error.
+            requested: Name of a message to request every second.
 
         Raises:
             ExperimentError: No message matched before the timeout.
         """
         deadline = time.monotonic() + timeout_s
-        next_ask = time.monotonic()
+        next_request_s = time.monotonic()
         while time.monotonic() < deadline:
-            if asking and time.monotonic() >= next_ask:
-                next_ask += ASK_S
-                self.ask(asking)
+            if requested and time.monotonic() >= next_request_s:
+                next_request_s += REQUEST_INTERVAL_S
+                self.request(requested)
             for message in self._endpoint.decode(self._link.receive()):
-                if wanted(message):
+                if matches(message):
                     return message
             time.sleep(LINK_POLL_S)
         raise ExperimentError(f"{missing} from the autopilot within {timeout_s:.0f} s")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import re
 from collections.abc import Mapping, Sequence
@@ -18,26 +17,29 @@ from fractus_core.documents import BadDocument, dump_documents, parse_documents
 from fractus_core.geo import LocalFrame, area_polygon
 
 from fractus_sim.errors import ExperimentError
-from fractus_sim.testbeds.standalone_testbed import grant_manifest, granted, read
+from fractus_sim.testbeds.standalone_testbed import grant_manifest, planned_grants, read_all_manifests
 
 EXAMPLE = Path("examples/field")
 NAVIGATOR = "Navigator"
 VIEWER = "AerialViewer"
 DRONE = "drone-1"
 ZIGZAG = "ZIGZAG"
-# Extent of Grants without policies, metres from home. No run flies that far.
-EVERYWHERE_M = 1000.0
-# Positions requested by the violating program, metres east and north of home.
-ASKED_OUTSIDE = {"WP-E1": (62.0, 130.0), "WP-E2": (226.0, 60.0)}
+UNRESTRICTED_RADIUS_M = 1000.0
+"""Radius of the operation area without policies. No run flies that far."""
+
+OUTSIDE_POSITIONS_M = {"WP-E1": (62.0, 130.0), "WP-E2": (226.0, 60.0)}
+"""Positions outside of the operation area that the violating program requests, metres east and north of home."""
+
 ABOVE_STRIPE = "WP-S"
-"""Hover position. Each run hovers longer than the picture interval, so one picture is requested above the stripe."""
+"""Hover position above the no-photo stripe. Each run hovers there for longer than the picture interval, so that at least one picture is requested."""
 
 ALTITUDE_M = 10.0
-Place = tuple[float, float, float]
+Position = tuple[float, float, float]
+"""Latitude, longitude and altitude."""
 
 
 @dataclass(frozen=True)
-class Field:
+class FieldSite:
     """The experiment at its site.
 
     Attributes:
@@ -46,10 +48,10 @@ class Field:
     """
 
     documents: tuple[Mapping[str, Any], ...]
-    home: Place
+    home: Position
 
     @classmethod
-    def read(cls, folder: Path, home: Place | None = None) -> Field:
+    def read(cls, folder: Path, home: Position | None = None) -> FieldSite:
         """Read the manifests, and move them so that the depot is at `home`.
 
         Raises:
@@ -66,7 +68,7 @@ class Field:
             raise ExperimentError(f"{folder} contains no Depot, which defines the home position; add one")
         if home is None:
             return cls(tuple(documents), (depot["lat"], depot["lon"], 25.0))
-        moved = _Shift((depot["lat"], depot["lon"]), home[:2])
+        moved = _HomeShift((depot["lat"], depot["lon"]), home[:2])
         return cls(tuple(moved.apply(d) for d in documents), home)
 
     def write(self, folder: Path) -> Path:
@@ -82,22 +84,22 @@ class Field:
 
     @cached_property
     def application(self) -> Application:
-        """Return the application."""
+        """Application."""
         return Application.from_body(self.objects("Application")[0])
 
     @cached_property
     def drone(self) -> Drone:
-        """Return the drone."""
+        """Drone."""
         return Drone.from_body(self.objects("Drone")[0])
 
     @cached_property
     def policies(self) -> tuple[Policy, ...]:
-        """Return the policies."""
+        """Policies."""
         return tuple(Policy.from_body(d) for d in self.objects("Policy"))
 
     @cached_property
     def frame(self) -> LocalFrame:
-        """Return the local frame in metres east and north of home."""
+        """Local frame in metres east and north of home."""
         return LocalFrame(self.home[0], self.home[1])
 
     def zone(self, name: str) -> Any:
@@ -107,35 +109,35 @@ class Field:
 
     @cached_property
     def environment(self) -> dict[str, str]:
-        """Return the environment of the Navigator's container."""
+        """Environment of the Navigator's container."""
         component = next(c for c in self.objects("Application")[0]["spec"]["components"] if c["name"] == NAVIGATOR)
         return {variable["name"]: variable["value"] for variable in component["container"]["env"]}
 
     @cached_property
-    def places(self) -> dict[str, Place]:
-        """Return CTRL1, WP1 to WP9, CTRL2, WP-E1, WP-E2 and WP-S in degrees and metres above home."""
+    def places(self) -> dict[str, Position]:
+        """Positions CTRL1, WP1 to WP9, CTRL2, WP-E1, WP-E2 and WP-S in degrees and metres above home."""
         component = next(c for c in self.application.spec.components if c.name == NAVIGATOR)
-        found: dict[str, Place] = {}
-        waypoints: list[Place] = []
+        positions: dict[str, Position] = {}
+        waypoints: list[Position] = []
         for number, point in enumerate(component.control_points, start=1):
             start = point.point.position if point.point is not None else None
             if start is not None:
-                found[f"CTRL{number}"] = (start.lat, start.lon, start.alt or ALTITUDE_M)
+                positions[f"CTRL{number}"] = (start.lat, start.lon, start.alt or ALTITUDE_M)
             waypoints += [(p.lat, p.lon, p.alt or ALTITUDE_M) for p in point.path or ()]
         for part in self.environment[ZIGZAG].split(";"):
             lat, lon, alt = (float(value) for value in part.split(","))
             waypoints.append((lat, lon, alt))
-        found |= {f"WP{number}": place for number, place in enumerate(waypoints, start=1)}
-        for name, (east, north) in ASKED_OUTSIDE.items():
+        positions |= {f"WP{number}": place for number, place in enumerate(waypoints, start=1)}
+        for name, (east, north) in OUTSIDE_POSITIONS_M.items():
             lat, lon = self.frame.latlon(east, north)
-            found[name] = (lat, lon, ALTITUDE_M)
-        found[ABOVE_STRIPE] = self._above_stripe(found)
-        return found
+            positions[name] = (lat, lon, ALTITUDE_M)
+        positions[ABOVE_STRIPE] = self._above_stripe(positions)
+        return positions
 
-    def _above_stripe(self, places: Mapping[str, Place]) -> Place:
+    def _above_stripe(self, places: Mapping[str, Position]) -> Position:
         """Return the position between WP6 and WP7 that is deepest inside the stripe where pictures are forbidden."""
-        way = shapely.LineString([self.frame.xy(*places[name][:2]) for name in ("WP6", "WP7")])
-        middle = way.intersection(self.zone("no-photo")).centroid
+        path = shapely.LineString([self.frame.xy(*places[name][:2]) for name in ("WP6", "WP7")])
+        middle = path.intersection(self.zone("no-photo")).centroid
         return (*self.frame.latlon(middle.x, middle.y), ALTITUDE_M)
 
     def grants(self, manifests: Path, *, policies: bool) -> list[dict[str, Any]]:
@@ -144,22 +146,25 @@ class Field:
         Raises:
             ExperimentError: The application cannot be planned.
         """
-        return [grant_manifest(spec if policies else self._unbound(spec)) for spec in granted(read([manifests]))]
+        return [
+            grant_manifest(spec if policies else self._unrestricted(spec))
+            for spec in planned_grants(read_all_manifests([manifests]))
+        ]
 
     def operation_area(self, grants: Sequence[Mapping[str, Any]]) -> list[Any]:
         """Return the shapes of the operation area in the Grants, in metres."""
         spec = GrantSpec.model_validate(grants[0]["spec"])
         return [area_polygon(self.frame, area) for area in spec.operation_area]
 
-    def _unbound(self, spec: GrantSpec) -> GrantSpec:
+    def _unrestricted(self, spec: GrantSpec) -> GrantSpec:
         body = spec.to_dict()
-        everywhere = [{"circle": {"center": {"lat": self.home[0], "lon": self.home[1]}, "radius": EVERYWHERE_M}}]
-        body |= {"policies": [], "operationArea": everywhere, "corridor": everywhere}
+        area = [{"circle": {"center": {"lat": self.home[0], "lon": self.home[1]}, "radius": UNRESTRICTED_RADIUS_M}}]
+        body |= {"policies": [], "operationArea": area, "corridor": area}
         return GrantSpec.model_validate(body)
 
 
 @dataclass(frozen=True, slots=True)
-class _Shift:
+class _HomeShift:
     """Moves positions from one home to another. Distances and bearings are preserved."""
 
     old: tuple[float, float]
@@ -175,27 +180,22 @@ class _Shift:
         if isinstance(value, list):
             return [self.apply(part) for part in value]
         if isinstance(value, str):
-            return _PLACES.sub(self._in_text, value)
+            return _POSITION.sub(self._move_text, value)
         return value
 
     def point(self, lat: float, lon: float) -> tuple[float, float]:
         """Move one point."""
-        stretch = math.cos(math.radians(self.old[0])) / math.cos(math.radians(self.new[0]))
-        return round(self.new[0] + lat - self.old[0], 7), round(self.new[1] + (lon - self.old[1]) * stretch, 7)
+        scale = math.cos(math.radians(self.old[0])) / math.cos(math.radians(self.new[0]))
+        return round(self.new[0] + lat - self.old[0], 7), round(self.new[1] + (lon - self.old[1]) * scale, 7)
 
-    def _in_text(self, found: re.Match[str]) -> str:
-        lat, lon = self.point(float(found[1]), float(found[2]))
-        return f"{lat:.7f},{lon:.7f},{found[3]}"
-
-
-_PLACES = re.compile(r"(-?\d+\.\d+),\s*(-?\d+\.\d+),\s*(-?\d+(?:\.\d+)?)")
+    def _move_text(self, match: re.Match[str]) -> str:
+        lat, lon = self.point(float(match[1]), float(match[2]))
+        return f"{lat:.7f},{lon:.7f},{match[3]}"
 
 
-def as_text(place: Place) -> str:
+_POSITION = re.compile(r"(-?\d+\.\d+),\s*(-?\d+\.\d+),\s*(-?\d+(?:\.\d+)?)")
+
+
+def format_position(place: Position) -> str:
     """Format a position as `lat,lon,alt`."""
     return f"{place[0]:.7f},{place[1]:.7f},{place[2]:g}"
-
-
-def dump(value: Any) -> str:
-    """Format JSON with indentation."""
-    return json.dumps(value, indent=2) + "\n"

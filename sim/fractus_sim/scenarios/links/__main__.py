@@ -2,27 +2,22 @@
 
 from __future__ import annotations
 
-import json
-import sys
 from pathlib import Path
 
 import click
 
-from fractus_sim.errors import ExperimentError
-from fractus_sim.interruption import break_off_on_signals
-from fractus_sim.report.figure_style import save
-from fractus_sim.report.report_files import PAGE, write_page
-from fractus_sim.scenarios.links.links_evidence import Evidence, Line, read
-from fractus_sim.scenarios.links.links_flight import LOG, fly
-from fractus_sim.scenarios.links.links_report import draw_bandwidth, draw_map, summary
-from fractus_sim.scenarios.links.links_results import Expectation, expectations, gains, report
-from fractus_sim.scenarios.links.links_site import DRONE, Site, read_site
-
-FAILED_EXPECTATIONS = 2
+from fractus_sim.command_line import command_errors, exit_with_expectations
+from fractus_sim.report.report_files import remove_report
+from fractus_sim.scenarios.links.links_flight import fly, read_earlier_run
+from fractus_sim.scenarios.links.links_report import write_links_report
+from fractus_sim.scenarios.links.links_site import read_site
 
 
 @click.command()
-@click.option("--out", type=click.Path(path_type=Path), default=Path("out/links"), show_default=True)
+@click.option(
+    "--out", type=click.Path(path_type=Path), default=Path("out/links"), show_default=True,
+    help="Output folder of the report.",
+)  # fmt: skip
 @click.option(
     "--factor",
     type=click.FloatRange(0.5, 1.5),
@@ -36,43 +31,13 @@ def links(*, out: Path, factor: float, again: bool) -> None:
 
     Exit code: 0 if all expectations hold, 2 if one does not, 1 if the scenario could not be flown.
     """
-    break_off_on_signals()
-    site = read_site(factor)
-    out.mkdir(parents=True, exist_ok=True)
-    try:
-        run = read_again(out) if again else fly(site, out, lambda text: click.echo(f"  {text}"))
-    except (ExperimentError, OSError) as error:
-        raise click.ClickException(str(error)) from None
-    checks = write(site, run, out)
-    failed = [check for check in checks if not check.holds]
-    for check in failed:
-        click.echo(f"NOT AS EXPECTED: {check.text} ({check.seen})", err=True)
-    click.echo(f"{len(checks) - len(failed)} of {len(checks)} expectations hold; see {out / PAGE}")
-    if failed:
-        sys.exit(FAILED_EXPECTATIONS)
-
-
-def read_again(out: Path) -> Evidence:
-    """Read the data of an earlier run.
-
-    Raises:
-        OSError: There is no data.
-    """
-    lines = [Line(*json.loads(line)) for line in (out / LOG).read_text().splitlines()]
-    track = [(at, (p[0], p[1], p[2])) for at, p in json.loads((out / "track.json").read_text())]
-    return read(lines, track, DRONE)
-
-
-def write(site: Site, run: Evidence, out: Path) -> list[Expectation]:
-    """Write the report, and return the checks."""
-    (out / PAGE).unlink(missing_ok=True)
-    table = gains(site, run)
-    checks = expectations(run, table)
-    save(draw_map(site, run), out / "map.png")
-    save(draw_bandwidth(site, run), out / "bandwidth.png")
-    (out / "report.json").write_text(json.dumps(report(site, run, table, checks), indent=2) + "\n")
-    write_page(out, summary(site, run, table, checks))
-    return checks
+    with command_errors():
+        site = read_site(factor)
+        out.mkdir(parents=True, exist_ok=True)
+        evidence = read_earlier_run(out) if again else fly(site, out, lambda line: click.echo(f"  {line}"))
+        remove_report(out)
+        expectations = write_links_report(site, evidence, out)
+    exit_with_expectations(expectations, out)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Gain of link selection rules on a flight: the planner of Fractus, the thesis' rule, and an oracle."""
+"""Gain of link selection rules on a flight: the planner of Fractus, the rule of the thesis, and the maximum possible gain."""
 
 from __future__ import annotations
 
@@ -23,16 +23,21 @@ from fractus_core.linking.range_model import with_contact, with_failure, with_lo
 
 STEP_S = 0.1
 LINK_UP_STEPS = 9
-"""0.92 s until a link is up and measured."""
+"""Steps until a link is up and measured (0.92 s)."""
+
 DECIDE_STEPS = 5
 BEACON_STEPS = 10
+"""Interval of beacons, about one second."""
+
 AHEAD_M = 20.0
+"""Distance ahead of the drone at which the rule of the thesis compares the peers."""
+
 INGRESS = find_heuristic("max", "ingress-bandwidth")
 SETTINGS = LinkSettings()
 
 
 @dataclass(frozen=True, slots=True)
-class Scene:
+class RecordedFlight:
     """A flight with peers, and the actual bandwidth of all paths.
 
     Attributes:
@@ -60,110 +65,116 @@ class Scene:
 
     @property
     def gain_mbps(self) -> float:
-        """Return the gain of a direct link over the cloud path."""
+        """Gain of a direct link over the cloud path, Mbit/s."""
         return self.direct_mbps - self.cloud.ingress_mbps
 
 
-def along(path: Sequence[LocalPosition], speed: float) -> tuple[list[LocalPosition], list[tuple[LocalPosition, ...]]]:
+def constant_speed_flight(
+    path: Sequence[LocalPosition], speed: float
+) -> tuple[list[LocalPosition], list[tuple[LocalPosition, ...]]]:
     """Return positions and remaining waypoints, one every `STEP_S`, for a constant speed along a path."""
-    at = path[0]
-    coming = list(path[1:])
+    position = path[0]
+    remaining = list(path[1:])
     positions = []
     waypoints = []
-    while coming:
-        positions.append(at)
-        waypoints.append(tuple(coming))
-        left = speed * STEP_S
-        while coming and left > 0:
-            away = math.dist(at, coming[0])
-            if away <= left:
-                at = coming.pop(0)
-                left = left - away
+    while remaining:
+        positions.append(position)
+        waypoints.append(tuple(remaining))
+        step_m = speed * STEP_S
+        while remaining and step_m > 0:
+            distance_m = math.dist(position, remaining[0])
+            if distance_m <= step_m:
+                position = remaining.pop(0)
+                step_m -= distance_m
             else:
-                x, y, z = (a + (b - a) * left / away for a, b in zip(at, coming[0], strict=True))
-                at = (x, y, z)
-                left = 0.0
+                share = step_m / distance_m
+                x, y, z = (a + (b - a) * share for a, b in zip(position, remaining[0], strict=True))
+                position = (x, y, z)
+                step_m = 0.0
     return positions, waypoints
 
 
-def oracle(scene: Scene) -> float:
+def best_gain(flight: RecordedFlight) -> float:
     """Return the maximum gain in Mbit over the cloud path for any sequence of links, with the whole flight known."""
-    n = len(scene.positions)
-    up = {node.name: [scene.rate(i, node) > 0 for i in range(n)] for node in scene.peers}
+    n = len(flight.positions)
+    up = {node.name: [flight.rate(i, node) > 0 for i in range(n)] for node in flight.peers}
     value = {"": [0.0] * (n + 1), **{name: [0.0] * (n + 1) for name in up}}
     for i in range(n - 1, -1, -1):
         j = min(i + LINK_UP_STEPS, n)
         new = max((value[name][j] for name in up if all(up[name][i:j])), default=0.0)
         value[""][i] = max(value[""][i + 1], new)
         for name, rows in up.items():
-            stay = scene.gain_mbps * STEP_S + value[name][i + 1] if rows[i] else 0.0
+            stay = flight.gain_mbps * STEP_S + value[name][i + 1] if rows[i] else 0.0
             value[name][i] = max(stay, value[""][i])
     return value[""][0]
 
 
-Rule = Callable[[Scene, int, LinkState, dict[str, LearnedRange]], str]
+Rule = Callable[[RecordedFlight, int, LinkState, dict[str, LearnedRange]], str]
 
 
-def ours(scene: Scene, step: int, link: LinkState, ranges: dict[str, LearnedRange]) -> str:
+def planner_rule(flight: RecordedFlight, step: int, link: LinkState, ranges: dict[str, LearnedRange]) -> str:
     """Select the peer of the receding-horizon plan."""
-    track = Track(scene.positions[step], scene.speed, scene.waypoints[step])
+    track = Track(flight.positions[step], flight.speed, flight.waypoints[step])
     return plan_link(
-        track, scene.peers, scene.cloud, link, step * STEP_S, heuristic=INGRESS, settings=SETTINGS, ranges=ranges
+        track, flight.peers, flight.cloud, link, step * STEP_S, heuristic=INGRESS, settings=SETTINGS, ranges=ranges
     ).peer
 
 
-def thesis(scene: Scene, step: int, _link: LinkState, _reaches: dict[str, LearnedRange]) -> str:
+def thesis_rule(flight: RecordedFlight, step: int, _link: LinkState, _ranges: dict[str, LearnedRange]) -> str:
     """Select the nearest peer in declared range in the direction of the next waypoint (thesis 8.6)."""
-    at = scene.positions[step]
-    goal = scene.waypoints[step][0]
-    share = min(AHEAD_M / max(math.dist(at, goal), 1e-9), 1.0)
-    ahead = tuple(a + (b - a) * share for a, b in zip(at, goal, strict=True))
-    near = [node for node in scene.peers if math.dist(at, node.position) <= node.range_m]
+    position = flight.positions[step]
+    waypoint = flight.waypoints[step][0]
+    share = min(AHEAD_M / max(math.dist(position, waypoint), 1e-9), 1.0)
+    ahead = tuple(a + (b - a) * share for a, b in zip(position, waypoint, strict=True))
+    near = [node for node in flight.peers if math.dist(position, node.position) <= node.range_m]
     return min(near, key=lambda node: math.dist(ahead, node.position)).name if near else ""
 
 
-def carried(scene: Scene, rule: Rule) -> tuple[float, int]:
+def gain_of_rule(flight: RecordedFlight, rule: Rule) -> tuple[float, int]:
     """Return the gain in Mbit of a rule that decides twice a second, and its number of links."""
     link = NO_LINK
     gain = 0.0
     links = 0
-    coming = 0
+    steps_until_up = 0
     ranges: dict[str, LearnedRange] = {}
-    nodes = {node.name: node for node in scene.peers}
-    for step in range(len(scene.positions)):
+    nodes = {node.name: node for node in flight.peers}
+    for step in range(len(flight.positions)):
         now_s = step * STEP_S
         node = nodes.get(link.peer)
-        if node is not None and not scene.rate(step, node):
-            _learn_loss(scene, step, node, link, ranges)
+        if node is not None and not flight.rate(step, node):
+            _learn_loss(flight, step, node, link, ranges)
             link = NO_LINK
         elif link.phase is LinkPhase.CONNECTING:
-            coming -= 1
-            if coming <= 0:
+            steps_until_up -= 1
+            if steps_until_up <= 0:
                 link = LinkState(LinkPhase.UP, link.peer, now_s)
         elif node is not None:
-            gain += scene.gain_mbps * STEP_S
+            gain += flight.gain_mbps * STEP_S
         if step % BEACON_STEPS == 0:
-            _hear(scene, step, ranges)
+            _learn_beacons(flight, step, ranges)
         if step % DECIDE_STEPS == 0:
-            wanted = rule(scene, step, link, ranges)
-            if wanted != link.peer:
-                link = LinkState(LinkPhase.CONNECTING, wanted, now_s) if wanted else NO_LINK
-                coming = LINK_UP_STEPS
-                links = links + bool(wanted)
+            selected = rule(flight, step, link, ranges)
+            if selected != link.peer:
+                link = LinkState(LinkPhase.CONNECTING, selected, now_s) if selected else NO_LINK
+                steps_until_up = LINK_UP_STEPS
+                links += bool(selected)
     return gain, links
 
 
-def _learn_loss(scene: Scene, step: int, node: Peer, link: LinkState, ranges: dict[str, LearnedRange]) -> None:
+def _learn_loss(
+    flight: RecordedFlight, step: int, node: Peer, link: LinkState, ranges: dict[str, LearnedRange]
+) -> None:
+    """Reduce the learned range of a peer after a lost link, or record the failed attempt to connect."""
     known = ranges.get(node.name, LearnedRange())
     if link.phase is LinkPhase.UP:
-        ranges[node.name] = with_loss(known, math.dist(scene.positions[step], node.position) / node.range_m)
+        ranges[node.name] = with_loss(known, math.dist(flight.positions[step], node.position) / node.range_m)
     else:
         ranges[node.name] = with_failure(known, step * STEP_S)
 
 
-def _hear(scene: Scene, step: int, ranges: dict[str, LearnedRange]) -> None:
-    """Interval of peer discovery. A radio receives the beacons of its neighbours about once a second."""
-    for other in scene.peers:
-        if scene.rate(step, other):
-            distance = math.dist(scene.positions[step], other.position) / other.range_m
+def _learn_beacons(flight: RecordedFlight, step: int, ranges: dict[str, LearnedRange]) -> None:
+    """Extend the learned ranges of the peers whose beacons the drone receives at a step."""
+    for other in flight.peers:
+        if flight.rate(step, other):
+            distance = math.dist(flight.positions[step], other.position) / other.range_m
             ranges[other.name] = with_contact(ranges.get(other.name, LearnedRange()), distance, step * STEP_S)

@@ -10,15 +10,16 @@ from fractus_cluster.spec import ClusterSpec, NodeSpec, WifiHardware, load_spec
 from fractus_core.geo import LocalFrame
 from fractus_core.linking import LocalPosition, PathMetrics, Peer
 
-from fractus_sim.demo.demo_clusters import ROOT, documents
+from fractus_sim.testbeds.embedded_cluster import ROOT, read_objects
 
 EXAMPLE = ROOT / "examples" / "links"
 DRONE = "drone-1"
 UPLINK_MBPS = 8.0
 UPLINK_MS = 60.0
 WIFI_MBPS = 12.0
-WIFI_MS = 2.0
 """TCP throughput of the simulated radio within the range of a station, Mbit/s."""
+
+WIFI_MS = 2.0
 
 
 @dataclass(frozen=True)
@@ -31,6 +32,8 @@ class Site:
         edges: All edge nodes.
         path: Waypoints.
         factor: Actual range divided by declared range.
+        frame: Local frame with its origin at the drone's home.
+        ground_m: Altitude of the home above mean sea level.
     """
 
     cluster: ClusterSpec
@@ -42,13 +45,13 @@ class Site:
     ground_m: float
 
     def position(self, lat: float, lon: float, alt: float) -> LocalPosition:
-        """Return the position of degrees and metres above mean sea level."""
+        """Convert degrees and metres above mean sea level to a local position."""
         east, north = self.frame.xy(lat, lon)
         return east, north, alt - self.ground_m
 
     @property
     def cloud(self) -> PathMetrics:
-        """Return the path over the drone's mobile uplink."""
+        """Path over the drone's mobile uplink."""
         return PathMetrics(UPLINK_MBPS, UPLINK_MBPS, UPLINK_MS, UPLINK_MS)
 
 
@@ -60,7 +63,7 @@ def read_site(factor: float = 1.0, folder: Path = EXAMPLE) -> Site:
         folder: Folder of the example.
     """
     spec = load_spec(folder / "cluster.yaml")
-    spec = spec.model_copy(update={"nodes": tuple(_reaching(node, factor) for node in spec.nodes)})
+    spec = spec.model_copy(update={"nodes": tuple(_with_range_factor(node, factor) for node in spec.nodes)})
     drone = next(node for node in spec.nodes if node.name == DRONE)
     home = drone.place()
     assert home is not None
@@ -73,24 +76,24 @@ def read_site(factor: float = 1.0, folder: Path = EXAMPLE) -> Site:
             continue
         east, north = frame.xy(place.lat, place.lon)
         edges[node.name] = (east, north, place.alt - home.alt)
-        interface = node.wifi()
-        if interface is not None:
+        wifi = node.wifi()
+        if wifi is not None:
             offers = PathMetrics(WIFI_MBPS, WIFI_MBPS, WIFI_MS, WIFI_MS, direct=True)
-            peers.append(Peer(node.name, edges[node.name], interface[1] / factor, offers))
-    (application,) = documents(folder / "application.yaml")
-    path = tuple((*frame.xy(point["lat"], point["lon"]), float(point["alt"])) for point in _path(application))
+            peers.append(Peer(node.name, edges[node.name], wifi[1] / factor, offers))
+    (application,) = read_objects(folder / "application.yaml")
+    path = tuple((*frame.xy(point["lat"], point["lon"]), float(point["alt"])) for point in _waypoints(application))
     return Site(spec, tuple(peers), edges, path, factor, frame, home.alt)
 
 
-def _reaching(node: NodeSpec, factor: float) -> NodeSpec:
+def _with_range_factor(node: NodeSpec, factor: float) -> NodeSpec:
     """Return the node with its radio range scaled by the factor."""
-    found = node.wifi()
-    if found is None:
+    wifi = node.wifi()
+    if wifi is None:
         return node
-    hardware = node.hardware.model_copy(update={"wifi": WifiHardware(device=found[0], range=found[1] * factor)})
+    hardware = node.hardware.model_copy(update={"wifi": WifiHardware(device=wifi[0], range=wifi[1] * factor)})
     return node.model_copy(update={"hardware": hardware})
 
 
-def _path(application: dict[str, Any]) -> list[dict[str, float]]:
+def _waypoints(application: dict[str, Any]) -> list[dict[str, float]]:
     driver = next(c for c in application["spec"]["components"] if c.get("class") == "driver")
     return [point for task in driver["controlPoints"] for point in task["path"]]

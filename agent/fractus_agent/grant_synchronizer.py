@@ -32,8 +32,10 @@ REVIEW_INTERVAL_S = 60.0
 DISK_INTERVAL_S = 5.0
 """Seconds after which failed disk operations are repeated."""
 UNVERIFIED_TIMEOUT_S = 120.0
-"""Seconds for which a stored Grant stays valid while its replacement has an unknown authority: a change of authorities
-takes this long to reach every node."""
+"""Seconds for which a stored Grant stays valid while its replacement has an unknown authority.
+
+A new authority reaches every node within this time.
+"""
 
 
 class GrantDirectory:
@@ -49,8 +51,8 @@ class GrantDirectory:
     def open(self) -> None:
         """Create the directory, and remove temporary files of a killed agent."""
         self._path.mkdir(parents=True, exist_ok=True, mode=0o700)
-        for left in self._path.glob(".*.tmp"):
-            left.unlink()
+        for temporary in self._path.glob(".*.tmp"):
+            temporary.unlink()
 
     def names(self) -> set[str]:
         """Return the names of the stored Grants."""
@@ -99,7 +101,7 @@ def serialize_grant(grant: Grant) -> bytes:
 
 
 def mission_outcome(grant: Grant, missions: Mapping[str, Outcome]) -> tuple[GrantPhase, str] | None:
-    """Return phase and reason of the end of a Grant's mission, None while the mission is running."""
+    """Return the final phase of a Grant and the reason, None while its mission is running."""
     outcome = missions.get(grant.spec.mission_key)
     return (_OUTCOMES[outcome.kind], outcome.reason) if outcome is not None else None
 
@@ -120,7 +122,7 @@ def grant_report(grant: Grant, missions: Mapping[str, Outcome], problem: str | N
 
 
 def keep_final_phase(report: ReportedGrant, reported: ReportedGrant | None) -> ReportedGrant:
-    """Return the report, or the previous report if that has a final phase: a final phase is never taken back."""
+    """Return the report. If the previous report has a final phase, return that one, because a final phase never changes."""
     if reported is None or reported.phase not in ENDED:
         return report
     return reported.model_copy(update={"observed_generation": report.observed_generation})
@@ -154,13 +156,13 @@ class GrantVerifier:
         """Verify a Grant.
 
         Raises:
-            BadSignature: The operator did not sign the Grant as it is.
+            BadSignature: The operator did not sign this content of the Grant.
             UnknownAuthority: The authority of the Grant is unknown on this node.
         """
         try:
             authorities = read_authorities(self._path.read_bytes())
         except (OSError, ValueError) as error:
-            raise UnknownAuthority(f"the node has no authority to check its signature by ({error})") from None
+            raise UnknownAuthority(f"the node has no authority to verify the signature with ({error})") from None
         verify(grant, authorities)
 
 
@@ -237,7 +239,7 @@ class GrantSynchronizer:
         self._directory.open()
         async for grant_list in self._store.grants():
             self.apply(grant_list)
-            del grant_list
+            del grant_list  # frees the unpacked Grants, because the next event may be hours away
 
     def apply(self, grant_list: GrantList) -> None:
         """Update the files to a list of Grants."""
@@ -247,8 +249,8 @@ class GrantSynchronizer:
         if grant_list.grants is not None:
             names = {body["metadata"]["name"] for body in grant_list.grants}
             known = self._directory.names().union(self._grants, self._unusable, self._unverified)
-            for gone in known - names:
-                self._remove(gone)
+            for removed in known - names:
+                self._remove(removed)
             for body in grant_list.grants:
                 # Skip unchanged Grants, because parsing, verifying and storing one takes about 15 ms.
                 name = body["metadata"]["name"]
@@ -271,11 +273,12 @@ class GrantSynchronizer:
 
     async def report_once(self) -> None:
         """Report all Grants if a report has changed."""
-        wanted = {
+        current = {
             name: grant_report(grant, self._missions, self._unstored.get(name)) for name, grant in self._grants.items()
         } | self._unusable
         reports = {
-            report.uid: keep_final_phase(report, self._reported.get(report.uid)) for _, report in sorted(wanted.items())
+            report.uid: keep_final_phase(report, self._reported.get(report.uid))
+            for _, report in sorted(current.items())
         }
         if self._generation == self._reported_generation and reports == self._reported:
             return
@@ -292,7 +295,7 @@ class GrantSynchronizer:
         try:
             grant = Grant.from_body(body)
         except InvalidObject as error:
-            # Fail closed: its limits are unknown, so it is not stored. Without a Grant the services fly the drone home.
+            # Fail closed: the limits of the Grant are unknown, so it is not stored. Without a Grant the services fly the drone home.
             log.error("grants: invalid Grant, not stored (grant=%s error=%s)", name, error)  # noqa: TRY400
             self._remove(name)
             self._report_unusable(body, "Failed", f"The agent of {self._node} cannot parse the Grant: {error}")
@@ -365,7 +368,7 @@ class GrantSynchronizer:
             except OSError:
                 if not self._remove_outdated(grant):
                     raise
-                stored = self._directory.write(grant)  # the removal may have freed space
+                stored = self._directory.write(grant)  # again, because the removal may have freed space
             if stored:
                 log.info("grants: stored (grant=%s identity=%s)", grant.name, grant.spec.identity)
             self._written[grant.name] = grant.spec.unsigned

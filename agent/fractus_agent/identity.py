@@ -196,7 +196,7 @@ class NodeIdentity:
         return self._inspected[1]
 
     def _follow_authority(self, authority: bytes, validity: ValidityPeriod) -> ValidityPeriod | None:
-        """Store a changed authority. Return None if it did not issue the certificate, which must then be requested again."""
+        """Store a changed authority. Return None if the certificate must be requested again, because it has another issuer."""
         current = read_set(self._directory, CERTIFICATE_FILES)
         if current is None or current["ca.crt"] == authority:
             return validity

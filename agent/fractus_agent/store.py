@@ -1,6 +1,6 @@
 """Kubernetes access of the agent: the node's objects, Grants, DirectLinks and signing requests.
 
-No other module of the agent talks to the API server.
+No other module of the agent sends requests to the API server.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ class GrantList:
 
 
 LinkEnd = Literal["drone", "node"]
-"""End of a direct link, by the name of its spec field: the drone requests pairing, the node accepts it."""
+"""End of a direct link, by the name of its spec field. The drone requests pairing, and the node accepts it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,7 +135,7 @@ class _WatchTarget:
 
 
 def _parse_status(body: Object) -> NodeGrantsStatus:
-    """Parse the status of a NodeGrants. If it is invalid, for example of another release, everything is reported again."""
+    """Parse the status of a NodeGrants. An invalid status, for example of another release, counts as empty."""
     try:
         return NodeGrantsStatus.model_validate(body.get("status") or {})
     except ValidationError as error:
@@ -235,7 +235,7 @@ class Store:
         return text.encode() if text else None
 
     async def request_certificate(self, name: str, request_pem: bytes, lifetime_s: int) -> None:
-        """Create a signing request. An existing request with the same name is the same request."""
+        """Create a signing request. If the name exists, nothing is created, because the name contains a hash of the request."""
         body: Object = {
             **_SIGNING_REQUEST.header(name, labels={NODE_LABEL: self._node}),
             "spec": {

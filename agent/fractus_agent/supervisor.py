@@ -41,13 +41,14 @@ class Supervisor:
 
 
 async def repeat(name: str, step: Callable[[], Awaitable[float]], changed: asyncio.Event) -> None:
-    """Repeat a step until cancelled: after the delay that it returns, or when something changed.
+    """Repeat a step until cancelled, each time after the delay that it returned, or earlier when something changed.
 
-    While the API server fails, the delay grows and changes wait, so that a fleet does not overload a recovering server.
+    While the API server fails, the delay grows and changes do not shorten it, so that a fleet does not overload a recovering
+    server.
 
     Args:
         name: Name of the step, for the log.
-        step: Does what is due, and returns the seconds until it is due again.
+        step: Does the work that is due. Returns the seconds until more work is due.
         changed: Event that is set when something changed.
     """
     backoff = Backoff(_FIRST_RETRY_S, _MAX_RETRY_S)

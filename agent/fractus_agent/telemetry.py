@@ -124,7 +124,7 @@ def parse_telemetry(message: Telemetry) -> TelemetrySnapshot:
 
 
 class TelemetryFeed:
-    """Keeps the latest telemetry, or the reason why there is none.
+    """Keeps the latest telemetry, or the reason why it is unavailable.
 
     Args:
         address: Host and port of the mobility service.

@@ -1,4 +1,4 @@
-"""The active plan of each Application: as decided in this process, else as stored in its DeploymentPlan."""
+"""The active plan of each Application: the plan decided in this process, otherwise the stored DeploymentPlan."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class PlanListener(Protocol):
     """An index that depends on active plans."""
 
     def plan_changed(self, key: Key, old: OwnedPlan | None, new: OwnedPlan | None) -> None:
-        """Handle a change of the active plan of an Application. None means no active plan."""
+        """Handle a change of the active plan of an Application. A plan is None if there is no active plan."""
 
 
 class ActivePlans:
@@ -63,7 +63,7 @@ class ActivePlans:
         return plan.spec if plan is not None and plan.uid == uid else None
 
     def flight_host(self, plan: DeploymentPlanSpec | None) -> tuple[Submitted | None, DeploymentPlanSpec | None]:
-        """Return the Application whose flight a plan shares, and its active plan. Both are None if they do not exist."""
+        """Return the Application whose flight a plan shares, and its active plan. Each is None if it does not exist."""
         if plan is None or plan.drone is None or plan.drone.shared_with is None:
             return None, None
         namespace, _, name = plan.drone.shared_with.partition("/")
@@ -72,12 +72,12 @@ class ActivePlans:
         return host, self.get(key, host.uid) if host is not None else None
 
     def wake_guests(self, host: Key) -> None:
-        """Wake the Applications that share the flight of another one, because they may have lost it."""
+        """Wake the Applications that share the flight of `host`, because that flight may have ended or changed."""
         for key in self._guests.get("/".join(host), ()):
             self._wake(key)
 
     def decide(self, key: Key, uid: str, plan: DeploymentPlanSpec) -> None:
-        """Make a new plan active at once, so that the next planning takes its claims and bookings into account."""
+        """Make a new plan active at once, so that its claims and bookings count when the next Application is planned."""
         self._decided[key] = OwnedPlan(uid, plan)
         self.application_changed(key)
         self.wake_guests(key)
@@ -101,7 +101,7 @@ class ActivePlans:
         self.wake_guests(key)
 
     def application_changed(self, key: Key) -> None:
-        """Handle a change of an Application, which decides whether its plan is active and what its instances request."""
+        """Update the active plan and the requests of its instances after a change of the Application or its plan."""
         latest = self._latest(key)
         self._index_host(key, latest)
         new = latest if latest is not None and self._is_active(key, latest) else None

@@ -1,4 +1,4 @@
-"""Controller of Applications: observes, decides, applies the difference, reports the status, and tears down at the end."""
+"""Controller of Applications: plans and deploys an Application, reports its status, and removes its objects at the end."""
 
 from __future__ import annotations
 
@@ -147,10 +147,10 @@ class ApplicationController:
                 await inputs.changed(next_s, pause_s=min(_PAUSE_FACTOR * took_s, _MAX_PAUSE_S))
 
     async def reconcile(self, key: Key) -> float:
-        """Take one step towards the desired state. The operator may be killed at any point, and the step repeated.
+        """Take one step towards the desired state. If the operator is killed at any point, the step can be repeated.
 
         Returns:
-            Seconds until the next step if no input changes before.
+            Seconds until the next step, unless an input changes earlier.
 
         Raises:
             BeingDeleted: The Application is being deleted.
@@ -175,7 +175,7 @@ class ApplicationController:
         """Delete every Grant of an Application that is being deleted, and then its other objects.
 
         When its Grant is deleted, the services of the drone return it to its depot. The garbage collector deletes owned
-        objects that are missing in a stale cache. Pods without an owner are searched for.
+        objects that are missing in a stale cache. Pods without an owner are listed at the API server.
 
         Raises:
             KubeError: The API server refused a deletion, or could not be reached.
@@ -216,7 +216,7 @@ class ApplicationController:
             await self._grants.refresh(observed)
             update, next_s = await self._deploy(self._cache.observe(submitted), state)
         except Blocked as blocked:
-            # Without an await before this line, so that resources released by other Applications from now on cause a wake-up.
+            # No await before this line, so that no release of resources by another Application after planning is missed.
             self._cache.subscriptions.set_placed(observed.key, placed=False, full=blocked.full)
             await self._reporter.report(submitted, status.blocked(blocked, present))
             if observed.plan is not None:
@@ -226,7 +226,11 @@ class ApplicationController:
         return next_s
 
     async def _clean_up_finished(self, observed: ObservedApplication) -> float | None:
-        """Clean up if the mission is over. Return the seconds until the next step, or None if a new mission may begin."""
+        """Remove the objects of a finished mission.
+
+        Returns:
+            Seconds until the next step, or None if the mission is not over or a new one may begin.
+        """
         reported = self._reporter.last(observed.submitted)
         if reported.get("phase") not in SETTLED:
             return None
@@ -234,7 +238,7 @@ class ApplicationController:
         application = submitted.application
         reported_generation = reported.get("observedGeneration") == submitted.metadata.generation
         flown = self._cache.plans.latest(observed.key, observed.uid)
-        # An invalid Application names no other mission. The record of the last mission stays until it is valid.
+        # An invalid manifest describes no new mission. The record of the last mission stays until the manifest is valid.
         same_mission = observed.plan is None and (application is None or not mission_changed(application, flown))
         if reported_generation or same_mission:
             next_s = await self._finish(submitted) if observed.plan is None else RESYNC_S
@@ -248,7 +252,7 @@ class ApplicationController:
             return next_s
         if observed.plan is not None:
             return None
-        # Otherwise the old plan would claim its drone for the next mission, and exempt it from checks.
+        # A remaining plan of the last mission would claim its drone, and exempt the next mission from checks.
         removed = await self._start_over(observed.key)
         # The Grants of the last mission must be deleted before a new one begins.
         return 1.0 if removed else None
@@ -349,7 +353,11 @@ class ApplicationController:
         return removed or pods
 
     async def _finish(self, submitted: Submitted) -> float:
-        """Delete the objects of a finished mission, except its plan and its kept pods. Return the seconds until the next step."""
+        """Delete the objects of a finished mission, except its plan and the pods that are kept for their logs.
+
+        Returns:
+            Seconds until the next step.
+        """
         key = submitted.key
         rights = await self._objects.remove(key, *_RIGHTS)
         pods = await self._finished_pods.stop(submitted)

@@ -21,7 +21,7 @@ from fractus_operator.store import Conflict, KubeError, NotFound
 log = logging.getLogger(__name__)
 
 REFUSALS = frozenset({400, 403, 422})
-"""HTTP statuses with which the API server refuses an object itself. The user has to change something."""
+"""HTTP statuses with which the API server refuses the content of an object. A retry helps only after a change by the user."""
 
 Inputs = tuple[object, ...]
 """Versions of the inputs of Grants, and of the Grants themselves."""
@@ -101,8 +101,8 @@ class ApplicationGrants:
     def _valid_grants(self, observed: ObservedApplication) -> tuple[list[Grant], Inputs]:
         """Return the Grants that the operator signed for this Application, and their versions.
 
-        Grants of another uid are never signed again.
+        Grants for another uid are excluded, so that they are never signed again.
         """
-        own = (grant for grant in observed.grants if grant.spec.application.uid == observed.uid)
-        valid = [grant for grant in own if self._signer.problem(grant) is None]
+        grants = (grant for grant in observed.grants if grant.spec.application.uid == observed.uid)
+        valid = [grant for grant in grants if self._signer.problem(grant) is None]
         return valid, tuple(sorted((g.name, g.metadata.uid or "", g.metadata.resource_version or "") for g in valid))

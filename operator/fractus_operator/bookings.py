@@ -63,14 +63,12 @@ class Bookings:
             self._nodes[application] = set(by_node)
         return [node for node, booked in before.items() if booked != by_node.get(node)]
 
-    def on(self, node: str, own: Key | None = None, pods: Iterable[PodView] = ()) -> Amounts:
-        """Return the booked amounts on a node, without those of the Application `own`, which is being planned.
-
-        Planned instances whose pods are not bound yet are included.
+    def on(self, node: str, requester: Key | None = None, pods: Iterable[PodView] = ()) -> Amounts:
+        """Return the booked amounts on a node, including planned instances whose pods are not bound yet.
 
         Args:
             node: Name of the node.
-            own: Namespace and label value of the Application that is being planned.
+            requester: Namespace and label value of the Application that is being planned. Its own bookings do not count.
             pods: Pods of that Application on the node.
         """
         extra: Amounts = {}
@@ -78,7 +76,7 @@ class Bookings:
             if not pod.finished:
                 add(extra, pod.requests, -1)
         for application, requests in self._planned.members(("", node)).items():
-            for request in requests if application != own else ():
+            for request in requests if application != requester else ():
                 if (application[0], request.instance, node) not in self._bound:
                     add(extra, request.amounts)
         booked = {**self._booked.get(node, {})}
@@ -98,16 +96,16 @@ class BookedHosts(Mapping[str, Host]):
     Args:
         hosts: All Nodes.
         bookings: Booked resources.
-        own: Namespace and label value of the Application that is being planned. Its own bookings do not count.
+        requester: Namespace and label value of the Application that is being planned. Its own bookings do not count.
         pods: Pods of that Application.
     """
 
     def __init__(
-        self, hosts: CachedObjects[Host], bookings: Bookings, own: Key | None, pods: Iterable[PodView]
+        self, hosts: CachedObjects[Host], bookings: Bookings, requester: Key | None, pods: Iterable[PodView]
     ) -> None:
         self._hosts = hosts
         self._bookings = bookings
-        self._own = own
+        self._requester = requester
         self._pods: dict[str, list[PodView]] = {}
         for pod in pods:
             if pod.node is not None:
@@ -122,7 +120,7 @@ class BookedHosts(Mapping[str, Host]):
         host = self._hosts.get(("", name))
         if host is None:
             raise KeyError(name)
-        booked = self._bookings.on(name, self._own, self._pods.get(name, ()))
+        booked = self._bookings.on(name, self._requester, self._pods.get(name, ()))
         return Host(host.name, host.labels, host.allocatable, booked, ready=host.ready, schedulable=host.schedulable)
 
     def __iter__(self) -> Iterator[str]:

@@ -41,14 +41,14 @@ _WITHOUT_STATUS = frozenset({kinds.DEPLOYMENT, kinds.DIRECT_LINK})
 
 @dataclass(frozen=True, slots=True)
 class ObservedApplication:
-    """An Application with the inputs of its next step, read at the same time. Valid until the next await.
+    """An Application with the inputs of its next step, all read at the same time. The object is valid until the next await.
 
     Attributes:
         plan: The active plan, if any.
         pods: Pods of the current mission.
-        grants: All Grants under its name, including those of an earlier Application of this name.
-        host: The Application whose flight it shares, and the active plan of that one.
-        in_flight: The drone of its plan while it is in flight.
+        grants: All Grants under its name, including Grants of an earlier Application with the same name.
+        host: The host, which is the Application whose flight it shares, and the active plan of the host.
+        in_flight: The drone of its plan while that drone is in flight.
         rules: Revision of the inputs of Grants.
     """
 
@@ -158,16 +158,16 @@ class ClusterCache:
         )
 
     def snapshot(self, key: Key, uid: str, flights: Mapping[str, Flight] | None = None) -> Inventory:
-        """Return the input of planning and of Grants. It is valid until the next await.
+        """Return the input for planning an Application and for compiling its Grants. The result is valid until the next await.
 
         Args:
-            key: Application that is being planned. Resources of its own pods count as free.
-            uid: Its uid. Claims under its name with another uid belong to another holder.
+            key: The Application. Resources of its own pods count as free.
+            uid: Uid of the Application. A claim under its name with another uid belongs to another Application.
             flights: Flights of claimed drones that the Application may share.
         """
-        own = label_key(key)
+        label = label_key(key)
         return Inventory(
-            hosts=BookedHosts(self.hosts, self._bookings, own, self._pods.of(own)),
+            hosts=BookedHosts(self.hosts, self._bookings, label, self._pods.of(label)),
             drones=ByName(self.drones),
             edge_nodes=ByName(self.edge_nodes),
             depots=self.depots_by_name(),
@@ -183,15 +183,15 @@ class ClusterCache:
     def planning_input(
         self, observed: ObservedApplication, radius_m: float
     ) -> tuple[Inventory, tuple[str, str] | None]:
-        """Return the input of planning for an Application, and why its plan lost its drone, if it did.
+        """Return the input for planning an Application, and the reason if its plan has lost its drone.
 
         Args:
-            observed: The Application, observed without an await since.
+            observed: The Application. There was no await since it was observed.
             radius_m: Maximum distance of a drone from its path, in metres.
 
         Returns:
-            The inventory. Reason (CamelCase) and sentence, if another Application holds the drone, or if the shared flight
-            is over or has another route.
+            The inventory, and None or a CamelCase reason with a sentence. A plan has lost its drone if another Application
+            holds the drone, or if the shared flight is over or has another route.
         """
         application = observed.submitted.application
         plan = observed.plan
@@ -227,7 +227,7 @@ class ClusterCache:
         return [pod for pod in self._pods.of(label_key(key)) if (pod.finished_at is not None) == kept]
 
     def grants_of(self, key: Key) -> list[Grant]:
-        """Return the Grants of an Application, including those of an earlier Application of this name."""
+        """Return the Grants of an Application, including Grants of an earlier Application with the same name."""
         return list(self._grants.of(key))
 
     def forget(self, key: Key) -> None:
@@ -271,7 +271,7 @@ class ClusterCache:
         if _rules_differ(old, new):
             self._rules_changed()
         elif old is not None and new is not None and _planning_inputs(old) != _planning_inputs(new):
-            # A takeoff releases nothing: neither the drone, nor a longer part of a flight to share.
+            # A takeoff releases no drone, and offers no longer part of its flight to Applications that could share it.
             took_off = new.in_air and not old.in_air and _ready(old) == _ready(new)
             if not took_off:
                 self.subscriptions.wake_waiting()
@@ -284,7 +284,7 @@ class ClusterCache:
             self.subscriptions.wake_for_capacity(node)
 
     def _wake_applications_on(self, drone: str) -> None:
-        """Wake the Applications on a drone, including those that share its flight."""
+        """Wake the Applications on a drone, including Applications that share its flight."""
         for application in self.fleet.applications_on(drone):
             self.subscriptions.wake(application)
 
@@ -329,7 +329,7 @@ class ClusterCache:
             self.torn_down.pop(key, None)
         if old is None or new is None or old.settled_generation != new.settled_generation:
             self.plans.wake_guests(key)
-            # A new Application releases nothing.
+            # A new Application releases no resources.
             if old is not None:
                 self.subscriptions.wake_waiting()
         self.subscriptions.wake(key, urgent=_changed_by_user(old, new))

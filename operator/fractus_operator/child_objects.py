@@ -82,7 +82,7 @@ class ChildObjects:
     def of(self, key: Key, kind: Kind) -> list[Body]:
         """Return the child objects of one kind of an Application, without EndpointSlices that Kubernetes manages."""
         children = self._caches[kind].of(key)
-        return [body for body in children if _is_ours(body)] if kind is kinds.ENDPOINT_SLICE else children
+        return [body for body in children if _is_managed(body)] if kind is kinds.ENDPOINT_SLICE else children
 
     # -- applying --
 
@@ -127,7 +127,7 @@ class ChildObjects:
             self._caches[kind].record_write(key, await self._store.patch(kind, key, fields, ContentType.MERGE))
 
     async def write_secret(self, application: Application, instance: str, body: Body, reason: SecretWrite) -> bool:
-        """Write the Secret of an instance. Return False if its Deployment belongs to another owner.
+        """Write the Secret of an instance, unless its Deployment belongs to another owner. Return True if it is written.
 
         Raises:
             KubeError: The API server refused the write, or could not be reached.
@@ -263,12 +263,16 @@ class ChildObjects:
         return removed
 
     async def remove_at_once(self, key: Key, kind: Kind) -> set[str]:
-        """Delete all child objects of a kind with all that they own. Return the uids of those that no finalizer keeps."""
+        """Delete all child objects of a kind and the objects that they own.
+
+        Returns:
+            The uids of the deleted objects, except objects that a finalizer keeps.
+        """
         existing = [body for body in self.of(key, kind) if "uid" in body["metadata"]]
         return {body["metadata"]["uid"] for body in existing if await self._delete(kind, body)}
 
     async def revoke(self, key: Key) -> None:
-        """Delete every Grant of an Application, including those that are not in the cache yet."""
+        """Delete every Grant of an Application, including Grants that are not in the cache yet."""
         namespace, name = key
         selector = f"{MANAGED_SELECTOR},{NAMESPACE_LABEL}={namespace},{APPLICATION_LABEL}={label_value(name)}"
         for grant in await self._store.list(kinds.GRANT, selectors={"labelSelector": selector}):
@@ -338,8 +342,8 @@ def _is_child(application: Application, kind: Kind, body: Body) -> bool:
     return any(owner.get("uid") == application.metadata.uid for owner in owners)
 
 
-def _is_ours(endpoint_slice: Body) -> bool:
-    """Return True if the operator manages an EndpointSlice. Those of Kubernetes also have the labels of their Service."""
+def _is_managed(endpoint_slice: Body) -> bool:
+    """Return True if the operator manages an EndpointSlice. Slices of Kubernetes also have the labels of their Service."""
     return bool(endpoint_slice["metadata"]["labels"].get(SLICE_LABEL) == SLICES_BY)
 
 

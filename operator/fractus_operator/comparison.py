@@ -26,8 +26,8 @@ def stamped(desired: Body) -> Body:
 def is_current(desired: Body, observed: Body | None) -> bool:
     """Return True if applying the stamped object would change nothing.
 
-    This is the case if the digest equals that of the last apply, so that no field was dropped since, and if every field
-    still has the applied value, so that nobody else changed one.
+    Two conditions must hold. The digest equals the digest of the last apply, so no field was removed from the desired object
+    since. Every desired field has its value in the observed object, so no other client changed one.
     """
     if observed is None:
         return False

@@ -93,14 +93,14 @@ def _parse(encoded: str) -> tuple[x509.CertificateSigningRequest, frozenset[tupl
         key = request.public_key()
         extension = request.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
         names = frozenset((type(name), name.value) for name in extension)
-        genuine = request.is_signature_valid
+        self_signed = request.is_signature_valid
     except x509.ExtensionNotFound:
         raise UnacceptableRequest("WrongNames", "the request has no subject alternative names") from None
     except Exception as error:
         raise UnacceptableRequest(
             "Malformed", f"the request cannot be parsed: {error or type(error).__name__}"
         ) from error
-    if not genuine:
+    if not self_signed:
         raise UnacceptableRequest("Malformed", "the request is not signed with its own key")
     if not isinstance(key, ec.EllipticCurvePublicKey) or not isinstance(key.curve, ec.SECP256R1):
         raise UnacceptableRequest("WrongKey", "the key must be P-256")
@@ -127,7 +127,7 @@ class CsrController:
     async def reconcile(self, key: Key) -> None:
         """Deny one request with the reason, or approve and sign it.
 
-        An approved request is reviewed as well, because others may approve requests.
+        A request that is approved already is reviewed as well, because other clients may approve requests.
         """
         body = self._read(key)
         if body is None:
@@ -147,10 +147,10 @@ class CsrController:
                 await self._store.replace(SIGNING_REQUEST, {**body, "status": status}, subresource="status")
                 log.info("csr controller: certificate signed (node=%s request=%s)", reviewed.node, key[1])
             elif "Approved" in conditions:
-                # Another approver approved a request that this signer does not sign.
+                # Another client approved a request that this signer must not sign.
                 await self._conclude(body, "Failed", reviewed, "status")
         except (Conflict, NotFound):
-            # It was changed or deleted meanwhile. The watch reports the new state.
+            # The request was changed or deleted meanwhile. The watch reports the new state.
             return
 
     async def _conclude(self, body: Body, verdict: str, reviewed: Review, subresource: str) -> Body:

@@ -50,7 +50,7 @@ class Claim:
 
 @dataclass(frozen=True, slots=True)
 class ActiveMission:
-    """An Application whose active plan has a drone of its own.
+    """An Application whose active plan has its own drone, and does not share the flight of another Application.
 
     Attributes:
         in_flight: True if the drone is in flight.
@@ -65,9 +65,9 @@ class ActiveMission:
 def claims(plans: Mapping[Key, OwnedPlan], grants: Iterable[Grant]) -> dict[str, Claim]:
     """Return the claims by node name.
 
-    An Application with a Grant on a node and a plan of its own for it comes before Applications with only a Grant. Among
-    equals, the oldest Grant decides. Without any Grant, the plans decide. An Application that shares another flight claims
-    nothing, and its remaining Grants take no drone from the Application that flies it.
+    An Application that has both a Grant for a node and a plan that flies it comes before Applications that have only a Grant.
+    Among equals, the oldest Grant decides. Without any Grant, the plans decide. An Application that shares another flight claims
+    no drone. Its remaining Grants do not count against the Application that flies the drone.
 
     Args:
         plans: Active plans.
@@ -188,7 +188,7 @@ class Fleet:
         return drone if drone is not None and self.is_in_flight(drone) else None
 
     def applications_on(self, node: str) -> list[Key]:
-        """Return the Applications with an active plan for a drone, including those that share its flight."""
+        """Return the Applications with an active plan for a drone, including Applications that share its flight."""
         return list(self._plans.members(("", node)))
 
     def applications_in_flight(self) -> Iterator[Key]:
@@ -216,7 +216,7 @@ class Fleet:
         return self._claims
 
     def active_missions(self) -> Iterator[ActiveMission]:
-        """Iterate over the Applications whose active plans have a drone of their own."""
+        """Iterate over the Applications that have their own drone."""
         for node, claim in self.claims().items():
             plan = self._plans.members(("", node)).get(claim.key)
             drone = self._drones.get(("", node))

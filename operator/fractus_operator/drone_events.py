@@ -21,9 +21,9 @@ from fractus_operator.work_queue import WorkQueue
 EVENT_BURST = 20
 """Number of Events of one drone without a pause, enough for some flights."""
 EVENT_PERIOD_S = 60.0
-"""Seconds until one more Event is allowed after a burst. The pause summarises the changes of a drone that flaps."""
+"""Seconds until one more Event is allowed after a burst. Changes of a flapping drone during this pause are summarised."""
 MAX_LATE = timedelta(seconds=60)
-"""A report that is older than the last one by up to this time arrived late. Beyond it, the drone's clock was set back."""
+"""Maximum age difference between two reports of which the older one arrived late. Beyond it, the drone's clock was set back."""
 _PAUSE = timedelta(seconds=2 * DRONE_REPORT_S)
 """Time between two reports from which the time of a change between them is unknown."""
 
@@ -39,7 +39,7 @@ class FlightReport:
         controller: Holder of the control authority, or an empty string if unknown.
         reason: Why no driver has the control authority, or an empty string if unknown.
         interval: Times of the reports before and after a takeoff or landing if there was a pause, else an empty string.
-        missions: Applications that have flown the drone since they may.
+        missions: Applications that have a Grant for the drone and have flown it under this Grant.
     """
 
     uid: str
@@ -75,7 +75,7 @@ def parse_flight_report(drone: Drone, before: FlightReport | None) -> FlightRepo
 def flight_events(
     name: str, posted: FlightReport, current: FlightReport, outcome: Callable[[str], str]
 ) -> Iterator[tuple[str, str, FlightReport]]:
-    """Return the Events for the changes since the last Events, in the order of what happened.
+    """Return the Events for the changes since the last Events, in the order in which the changes happened.
 
     Args:
         name: Name of the drone.
@@ -88,9 +88,12 @@ def flight_events(
     """
     for application in posted.missions:
         if application not in current.missions:
+            message = f"{application} no longer flies {name}"
             ended = outcome(application)
+            if ended:
+                message += f": {ended}"
             posted = replace(posted, missions=tuple(m for m in posted.missions if m != application))
-            yield "MissionOver", f"{application} does not fly {name} any more{f': {ended}' if ended else ''}", posted
+            yield "MissionOver", message, posted
     if current.in_air and not posted.in_air:
         flown_by = f", flown by {controller_name(current.controller)}" if current.controller else ""
         posted = replace(posted, in_air=True, controller=current.controller)
@@ -173,7 +176,7 @@ class DroneEventRecorder:
         posted = self._posted.get(name)
         if current is None:
             return
-        # A mission lasts from the takeoff until the Grant is deleted. A drone that does not fly has no Event.
+        # A mission lasts from the takeoff until the Grant is deleted. A Grant under which the drone never flies causes no Event.
         flown = posted.missions if posted is not None else ()
         missions = tuple(m for m in self._granted_applications(name) if current.in_air or m in flown)
         current = replace(current, missions=missions)
@@ -204,7 +207,7 @@ class DroneEventRecorder:
         )
 
     def _wait_s(self, name: str, events: int) -> float:
-        """Return the seconds until a number of Events of a drone is allowed. If it is 0, they are counted."""
+        """Return the seconds until a number of Events of a drone is allowed. If the result is 0, the Events count as created."""
         now_s = asyncio.get_running_loop().time()
         allowed, counted_s = self._budgets.get(name, (float(EVENT_BURST), now_s))
         allowed = min(allowed + (now_s - counted_s) / EVENT_PERIOD_S, EVENT_BURST)

@@ -62,12 +62,12 @@ def _register(registry: kopf.OperatorRegistry, applications: Controller, oldest_
     async def probe_watches(**_: object) -> float:
         """Return the seconds since the last message of the most silent watch, for the liveness endpoint.
 
-        It is a coroutine, because kopf runs plain functions in a thread without an event loop.
+        This function is a coroutine, because kopf runs plain functions in a thread without an event loop.
         """
         return round(oldest_contact_s(), 1)
 
-    # With explicit ids: kopf stores the progress in annotations named by the id. The default id of a nested function is no
-    # valid annotation name, so that one failure would make the Application undeletable.
+    # kopf stores the progress in an annotation that has the id of the handler as its name. The default id of a nested function
+    # is no valid name, and one failure would then make the Application undeletable. Therefore the ids are explicit.
     @kopf.daemon(
         group,
         version,
@@ -106,7 +106,7 @@ class KopfConnection(kopf.ConnectionInfo):
 
 
 def _with_address(info: kopf.ConnectionInfo | None) -> kopf.ConnectionInfo | None:
-    """Return the connection with the IP address of the API server, as the store uses it, so that no DNS is needed."""
+    """Return the connection with the IP address of the API server instead of its name, so that no DNS is needed."""
     host = os.environ.get("KUBERNETES_SERVICE_HOST")
     port = os.environ.get("KUBERNETES_SERVICE_PORT")
     if info is None or host is None or port is None:
@@ -117,10 +117,10 @@ def _with_address(info: kopf.ConnectionInfo | None) -> kopf.ConnectionInfo | Non
 
 
 class InMemoryProgress(kopf.AnnotationsProgressStorage):
-    """Progress of failed handlers, read from memory and written to annotations.
+    """Progress of failed handlers, stored in memory and also written to annotations.
 
-    The change of an annotation wakes kopf. The annotations are never read, because users who may edit an Application could
-    write them, and skip or delay its teardown. After a restart of the operator, handlers are retried at once.
+    The change of an annotation wakes kopf. The annotations are never read. Users who may edit an Application could otherwise
+    skip or delay its teardown by writing them. After a restart of the operator, handlers are retried at once.
     """
 
     def __init__(self, prefix: str) -> None:
@@ -133,8 +133,8 @@ class InMemoryProgress(kopf.AnnotationsProgressStorage):
 
     def store(self, *, key: kopf.HandlerId, record: kopf.ProgressRecord, body: kopf.Body, patch: kopf.Patch) -> None:
         """Store the record of a handler."""
-        # Without None values, as annotations would return it. Otherwise the record seems to change each time, and kopf waits
-        # for the event of a patch that changes nothing instead of for the time of the next attempt.
+        # Annotations cannot contain None values. A record with such values would differ from the stored one each time, and
+        # kopf would wait for the event of a patch that changes nothing, and not for the time of the next attempt.
         kept = {name: value for name, value in record.items() if value is not None}
         self._records[_uid(body), key] = cast(kopf.ProgressRecord, kept)
         super().store(key=key, record=record, body=body, patch=patch)

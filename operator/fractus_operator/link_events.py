@@ -15,7 +15,7 @@ from fractus_operator.store import Informer, Store
 from fractus_operator.work_queue import WorkQueue
 
 LINK_EVENT_PERIOD_S = 10.0
-"""Minimum time between Events of one link, in seconds. After it, only the current state and the number of changes are posted."""
+"""Minimum time between Events of one link, in seconds. Events then describe the current state and count the changes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +62,7 @@ def link_changes(posted: LinkReport, current: LinkReport) -> Iterator[tuple[str,
         if current.up:
             events.append(("LinkUp", f"{current.drone} is linked to {current.node}{details}"))
         else:
-            events.append(("LinkDown", f"{current.drone} is not linked to {current.node} any more{details}"))
+            events.append(("LinkDown", f"{current.drone} is no longer linked to {current.node}{details}"))
     if current.direct != posted.direct:
         if current.direct:
             events.append(

@@ -1,6 +1,6 @@
-"""Controller of the condition OnMission of Drones: whether a drone may take off without a report.
+"""Controller of the condition OnMission of Drones, which is True while an Application may fly the drone.
 
-Admission policies use the condition while the last report of a drone is old.
+While the last report of a drone is old, admission policies use the condition to decide if the drone may be in the air.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ _REPORTS = 2
 class MissionConditionController:
     """Writes the condition OnMission of Drones.
 
-    The condition is True while there is a Grant for the drone. Then it is Unknown until the drone has reported twice: it may
-    have taken off out of reach, and the first report that arrives may have been written before the Grant was deleted.
-    Reports are distinguished by their time, which is compared with no other clock.
+    The condition is True while there is a Grant for the drone. After the deletion of the Grant it is Unknown until the drone
+    has reported twice. The drone may have taken off while it was out of reach, and the first report that arrives may be older
+    than the deletion. Reports are distinguished by their times, which are compared with no other clock.
 
-    The controller also records if a user overrides the protection of a drone with the annotation fractus.dev/grounded.
+    The controller also records when a user overrides the protection of a drone with the annotation fractus.dev/grounded.
     """
 
     def __init__(
@@ -95,8 +95,8 @@ class MissionConditionController:
             times.add(last_seen)
         if len(times) > _REPORTS:
             return ConditionUpdate(ON_MISSION, "False", "NoGrant", "no Application may fly it", progress=True)
-        message = "no Application may fly it any more, but it has not reported twice since"
-        return ConditionUpdate(ON_MISSION, "Unknown", "NotHeardOf", message, progress=True)
+        message = "no Application may fly it, but it has not reported twice since its last Grant was deleted"
+        return ConditionUpdate(ON_MISSION, "Unknown", "AwaitingReports", message, progress=True)
 
     async def _record_override(self, drone: Drone) -> None:
         last_seen = drone.status.last_seen if drone.status is not None else None

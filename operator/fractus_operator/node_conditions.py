@@ -57,7 +57,7 @@ class NodeConditionWriter:
             else:
                 transitions = await self._write_status(kind, name, update, change, now)
         except (Conflict, NotFound):
-            # Its agent wrote first, or the node was deleted. The next step uses the new state.
+            # The agent of the node wrote first, or the node was deleted. The next step uses the new state.
             return
         regarding = kind.header(name, uid=node.metadata.uid)
         await create_events(self._store, regarding, (update for update in transitions if update.warning), now)

@@ -113,9 +113,9 @@ class NodeLabelController:
 class NodeGrantsController:
     """Maintains the objects of each node in the namespace of nodes, and the status of Grants that its agent reports.
 
-    Nodes are the Drones, the EdgeNodes, and all nodes that a Grant names. An agent does not take a missing NodeGrants object
-    for a revocation. So a node without Grants has an empty object, which stays while its Node exists, because the node may
-    be offline.
+    Nodes are the Drones, the EdgeNodes, and all nodes that a Grant names. An agent does not treat a missing NodeGrants object as
+    a revocation. So a node without Grants has an empty object. The object stays while the Node exists, because an offline node
+    must still receive the empty list.
 
     Args:
         store: The API server.
@@ -196,7 +196,7 @@ class NodeGrantsController:
         if not self._is_node(node) and self._cache.node_objects.node_grants_of(node) is None:
             return
         grants = self._cache.node_objects.grants_of(node)
-        # A thread may read the objects, because the cache replaces them and never changes them.
+        # Reading in a thread is safe, because the cache replaces objects and never changes them.
         packed, count = await asyncio.to_thread(pack_oldest, grants)
         known = self._cache.node_objects.node_grants_of(node)
         if known is not None and known.contains(packed, count):
@@ -219,7 +219,7 @@ class NodeGrantsController:
 
     async def _reconcile_reports(self, key: Key) -> None:
         known = self._cache.node_objects.node_grants_of(key[1])
-        # An agent may report only about the Grants of its own node.
+        # An agent may report only Grants of its node.
         grants = {body["metadata"].get("uid"): body for body in self._cache.node_objects.grants_of(key[1])}
         for report in known.reports if known is not None else ():
             grant = grants.get(report.uid)

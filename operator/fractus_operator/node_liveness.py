@@ -92,7 +92,7 @@ class StaleNodeDetector:
     def stale_nodes(self, nodes: Iterable[Drone | EdgeNode], now_s: float) -> list[Drone | EdgeNode]:
         """Return the nodes whose last report is too old.
 
-        A node that never reported is not stale, because nothing outdated is shown of it.
+        A node that never reported is not stale, because its status contains no outdated state.
 
         Args:
             nodes: All nodes.
@@ -138,7 +138,7 @@ class NodeLivenessController:
 
     async def _mark(self, node: Drone | EdgeNode) -> None:
         last_seen = node.status.last_seen if node.status is not None else None
-        message = f"the last report of its agent is of {last_seen:%Y-%m-%d %H:%M:%S} UTC"
+        message = f"its agent last reported at {last_seen:%Y-%m-%d %H:%M:%S} UTC"
         if isinstance(node, Drone) and node.status is not None:
             last = node.status.last_flight_state or node.status.flight_state
             message += f", when the drone was {last}; its current state is unknown"

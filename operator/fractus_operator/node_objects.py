@@ -52,11 +52,11 @@ def _content(kind: Kind, node: str) -> Body:
     if kind is SERVICE_ACCOUNT:
         return {"automountServiceAccountToken": False}
     if kind is ROLE:
-        own = {"apiGroups": [GROUP], "resourceNames": [node]}
+        target = {"apiGroups": [GROUP], "resourceNames": [node]}
         return {
             "rules": [
-                {**own, "resources": [NODE_GRANTS.plural], "verbs": ["get", "list", "watch"]},
-                {**own, "resources": [f"{NODE_GRANTS.plural}/status"], "verbs": ["patch", "update"]},
+                {**target, "resources": [NODE_GRANTS.plural], "verbs": ["get", "list", "watch"]},
+                {**target, "resources": [f"{NODE_GRANTS.plural}/status"], "verbs": ["patch", "update"]},
             ]
         }
     return {
@@ -102,7 +102,7 @@ def parse_known(body: Body) -> KnownGrants:
 
 
 class NodeObjects:
-    """These objects of all nodes, and all Grants by node.
+    """The NodeGrants objects and accounts of all nodes, and all Grants by node.
 
     Args:
         store: The API server.
@@ -153,7 +153,7 @@ class NodeObjects:
         return len(account) == len(self.accounts) and all(account.values()) and self.node_grants_of(node) is not None
 
     def grants_of(self, node: str) -> list[Body]:
-        """Return the Grants of a node, except those that are being deleted."""
+        """Return the Grants of a node, except Grants that are being deleted."""
         return [body for body in self._grants.of(("", node)) if "deletionTimestamp" not in body["metadata"]]
 
     def grant_changed(self, key: Key, old: Body | None, new: Body | None) -> None:

@@ -63,7 +63,7 @@ class MetricsSource:
 
     Args:
         lease_s: Returns for how many seconds this operator may still act. 0 if it is not the leader.
-        watches: Returns, by plural of the kind, if the watch is open, and seconds since the last message of the API server.
+        watches: Returns by plural of the kind True if the watch is open, and the seconds since the last message.
         phases: Returns the phases of all Applications.
         states: Returns the flight states of all Drones.
         expires_s: Expiry of the certificate authority in Unix time, if known.

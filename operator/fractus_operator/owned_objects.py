@@ -67,7 +67,7 @@ class OwnedObjects(Informer[Body]):
 
 
 def application_label_key(body: Body) -> Key:
-    """Return the namespace of the Application of an object, and the value of its Application label."""
+    """Return the key of the Application of an object, with the name as a label value."""
     metadata = body["metadata"]
     labels = metadata.get("labels") or {}
     return metadata.get("namespace") or labels.get(NAMESPACE_LABEL, ""), labels.get(APPLICATION_LABEL, "")

@@ -147,7 +147,7 @@ def parse_plan(body: Body) -> OwnedPlan | None:
 
 
 def optional_parser(model: type[R]) -> Callable[[Body], R | None]:
-    """Return a parser whose result is None for an invalid object."""
+    """Return a parser that logs an invalid object and returns None for it."""
 
     def parse(body: Body) -> R | None:
         try:
@@ -165,7 +165,7 @@ def optional_parser(model: type[R]) -> Callable[[Body], R | None]:
 
 
 def tolerant_parser(model: type[R]) -> Callable[[Body], R | Unreadable]:
-    """Return a parser whose result is `Unreadable` for an invalid object, which must not be ignored."""
+    """Return a parser that returns `Unreadable` for an invalid object, for kinds whose invalid objects must not be ignored."""
 
     def parse(body: Body) -> R | Unreadable:
         try:

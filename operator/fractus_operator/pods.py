@@ -24,7 +24,7 @@ from fractus_operator.labels import (
 _MAX_LOG = 400
 """Maximum length of the kept log lines of a failed container, and of a message why pods cannot be created."""
 FINISHED_DEADLINE_S = 1
-"""Value of `activeDeadlineSeconds` that stops a running pod: the shortest one that is valid, counted from its start."""
+"""Value of `activeDeadlineSeconds` that stops a running pod. It is the minimum, and the time counts from the start of the pod."""
 _CANNOT_START = frozenset({"ImagePullBackOff", "ErrImagePull", "InvalidImageName", "CreateContainerConfigError"})
 REPLICA_FAILURE = "ReplicaFailure"
 """Condition type of a Deployment whose pods cannot be created (reason REFUSED) or deleted."""
@@ -131,7 +131,7 @@ def parse_pod(body: Body) -> PodView:
 
 
 def _stops(spec: Body, status: Body) -> bool:
-    """Return True if a pod has ended or is being stopped. The label alone is not sufficient, because a labelled pod may still run."""
+    """Return True if a pod has ended or is being stopped. A pod that has only the label may still run."""
     return status.get("phase") in _ENDED or spec.get("activeDeadlineSeconds") == FINISHED_DEADLINE_S
 
 
@@ -149,9 +149,8 @@ def _failure(status: Body) -> str:
     for container in status.get("containerStatuses") or ():
         ended = (container.get("state") or {}).get("terminated") or (container.get("lastState") or {}).get("terminated")
         if ended and ended.get("exitCode"):
-            lines = " | ".join(str(ended.get("message") or ended.get("reason") or "").split("\n"))[-_MAX_LOG:].strip(
-                " |"
-            )
+            output = str(ended.get("message") or ended.get("reason") or "")
+            lines = " | ".join(output.split("\n"))[-_MAX_LOG:].strip(" |")
             return f"exit code {ended['exitCode']}" + (f": {lines}" if lines else "")
         waiting = (container.get("state") or {}).get("waiting") or {}
         if waiting.get("reason") in _CANNOT_START:

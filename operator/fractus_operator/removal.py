@@ -61,12 +61,12 @@ def unwiped(nodes: Sequence[Body], pods: Sequence[Body]) -> list[str]:
 
 
 @contextmanager
-def _recording(problems: list[str], what: str) -> Iterator[None]:
-    """Record a refused request, so that the rest is removed."""
+def _recording(problems: list[str], subject: str) -> Iterator[None]:
+    """Record a refused request in `problems`, so that the removal continues."""
     try:
         yield
     except KubeError as error:
-        problems.append(f"{what}: {error}")
+        problems.append(f"{subject}: {error}")
 
 
 async def still_installed(store: Store, namespace: str, timeout_s: float = _CHECK_TIMEOUT_S) -> str:
@@ -82,7 +82,7 @@ async def still_installed(store: Store, namespace: str, timeout_s: float = _CHEC
     except NotFound:
         return ""
     except KubeError as error:
-        # The same Role contains this right and the rights to remove the objects.
+        # One Role permits this request and the removal. If the request is forbidden, the removal is forbidden as well.
         if error.status == HTTPStatus.FORBIDDEN:
             return ""
         return f"nothing was removed, because it is unknown whether Fractus is still installed ({error})"
@@ -122,10 +122,10 @@ async def remove(store: Store, namespace: str, *, keep_authority: bool = False) 
     problems: list[str] = []
 
     async def delete(kind: Kind, key: tuple[str, str]) -> None:
-        what = f"{kind.name} {'/'.join(filter(None, key))}"
-        with _recording(problems, what):
+        subject = f"{kind.name} {'/'.join(filter(None, key))}"
+        with _recording(problems, subject):
             await store.delete(kind, key)
-            print(f"removed {what}")
+            print(f"removed {subject}")
 
     if not keep_authority:
         await delete(SECRET, (namespace, AUTHORITY))
@@ -137,12 +137,12 @@ async def remove(store: Store, namespace: str, *, keep_authority: bool = False) 
             await delete(SIGNING_REQUEST, ("", request["metadata"]["name"]))
     with _recording(problems, "location labels of nodes"):
         for node in await store.list(NODE):
-            ours = [label for label in node["metadata"].get("labels") or {} if is_location_label(label)]
-            if ours:
-                what = f"location labels of the node {node['metadata']['name']}"
-                with _recording(problems, what):
-                    await store.set_labels(NODE, node["metadata"]["name"], dict.fromkeys(ours))
-                    print(f"removed the {what}")
+            labels = [label for label in node["metadata"].get("labels") or {} if is_location_label(label)]
+            if labels:
+                subject = f"location labels of the node {node['metadata']['name']}"
+                with _recording(problems, subject):
+                    await store.set_labels(NODE, node["metadata"]["name"], dict.fromkeys(labels))
+                    print(f"removed the {subject}")
     return problems
 
 
@@ -160,10 +160,10 @@ async def await_wiped(store: Store, namespace: str, timeout_s: float = _WIPING_S
         late = time.monotonic() > end
         try:
             nodes = await store.list(NODE, selectors={"labelSelector": f"{CLASS_LABEL} in (drone, edge)"})
-            ours = {"labelSelector": "app.kubernetes.io/component=wipe"}
-            left = unwiped(nodes, (await store.list_whole(POD, namespace=namespace, selectors=ours)).items)
-            if late or not left:
-                return left
+            selectors = {"labelSelector": "app.kubernetes.io/component=wipe"}
+            remaining = unwiped(nodes, (await store.list_whole(POD, namespace=namespace, selectors=selectors)).items)
+            if late or not remaining:
+                return remaining
         except KubeError:
             if late:
                 raise
@@ -177,17 +177,17 @@ async def _removed(store: Store, namespace: str, wiped: str, keep_authority: boo
         problems.append(f"some objects of Fractus were not removed: {', '.join(refused)}")
     if wiped:
         try:
-            left = await await_wiped(store, namespace, timeout_s)
+            remaining = await await_wiped(store, namespace, timeout_s)
         except KubeError as error:
             problems.append(f"it is unknown on which nodes {wiped} was wiped ({error}): check them (rm -rf {wiped})")
         else:
-            if left:
-                problems.append(f"{wiped} was not wiped on {', '.join(left)}: remove it there (rm -rf {wiped})")
+            if remaining:
+                problems.append(f"{wiped} was not wiped on {', '.join(remaining)}: remove it there (rm -rf {wiped})")
     return problems
 
 
 async def run(namespace: str, wiped: str, *, keep_authority: bool = False, timeout_s: float = _WIPING_S) -> str:
-    """Remove all objects. The DaemonSet that wipes nodes is always deleted, because it would wipe the next installation.
+    """Remove all objects. The DaemonSet that wipes nodes is deleted in any case, because it would wipe the next installation.
 
     Args:
         namespace: Namespace of the Fractus services.
@@ -196,7 +196,7 @@ async def run(namespace: str, wiped: str, *, keep_authority: bool = False, timeo
         timeout_s: Maximum time in which nodes delete their data, in seconds.
 
     Returns:
-        What was not removed and what to do, as a sentence, or an empty string.
+        A sentence about the objects that were not removed and how to remove them, or an empty string.
 
     Raises:
         Unconfigured: There are no credentials.
@@ -224,12 +224,12 @@ def main() -> int:
     # Sent at the deadline of the Job, or when its node is drained.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit("ended before all was removed"))
     try:
-        left = asyncio.run(run(arguments.namespace, arguments.wiped, keep_authority=arguments.keep_authority))
+        problem = asyncio.run(run(arguments.namespace, arguments.wiped, keep_authority=arguments.keep_authority))
     except Unconfigured as error:
-        left = f"the objects of Fractus were not removed: {error}"
-    if left:
-        print(left, file=sys.stderr)
-    return 1 if left else 0
+        problem = f"the objects of Fractus were not removed: {error}"
+    if problem:
+        print(problem, file=sys.stderr)
+    return 1 if problem else 0
 
 
 if __name__ == "__main__":

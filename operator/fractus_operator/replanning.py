@@ -1,4 +1,4 @@
-"""Choice of the plan of an Application: the active plan while it fits, else a new one. Pure."""
+"""Choice of the plan of an Application: the active plan while it fits, otherwise a new plan. Pure."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ class Choice:
 
     Attributes:
         plan: The active plan, or a new one.
-        reason: Why there is a new plan. None if the active plan is kept.
-        fits: True if the active plan is kept because it fits, and not because there is no other.
+        reason: CamelCase reason for a new plan, or None if the active plan is kept.
+        fits: True if the active plan is kept because it fits. False if it is kept because there is no other plan.
     """
 
     plan: DeploymentPlanSpec
@@ -37,7 +37,7 @@ class Choice:
 
     @property
     def suits(self) -> bool:
-        """True if the plan is what the Application requires. It then waits only for free capacity on full nodes."""
+        """True if the plan meets the requirements of the Application, which then waits only for free capacity on full nodes."""
         return self.fits or self.reason is not None
 
 
@@ -50,7 +50,7 @@ def choose_plan(
     stuck: Mapping[str, str],
     in_flight: str | None,
 ) -> Choice:
-    """Return the active plan while it fits, else a new plan that moves as few instances as possible.
+    """Return the active plan while it fits, otherwise a new plan that moves as few instances as possible.
 
     Args:
         application: The Application.
@@ -99,7 +99,7 @@ def mission_changed(application: Application | None, plan: DeploymentPlanSpec | 
 
 
 def flown_generation(application: Application | None, plan: DeploymentPlanSpec | None) -> int | None:
-    """Return the generation of a plan if the current generation is another mission, else None."""
+    """Return the generation of a plan if the current manifest describes another mission, otherwise None."""
     return plan.application_generation if plan is not None and mission_changed(application, plan) else None
 
 
@@ -128,7 +128,10 @@ def waits_for_landing(application: Application, plan: DeploymentPlanSpec, in_fli
 
 
 def _with_names_of(previous: DeploymentPlanSpec, decided: DeploymentPlanSpec) -> DeploymentPlanSpec:
-    """Return a plan in which instances that stay keep their names, even names of another release. A new name restarts them."""
+    """Return a plan in which unmoved instances keep their names, because a new name restarts an instance.
+
+    Another release may have given them names that this release would not give.
+    """
     names = {(p.component, p.node, p.location): p.instance for p in previous.placements}
     kept = tuple(
         p.model_copy(update={"instance": names.get((p.component, p.node, p.location), p.instance)})

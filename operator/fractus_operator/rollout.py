@@ -1,4 +1,4 @@
-"""Rollout of a plan: applies the child objects of an Application in order, and keeps what runs up to date."""
+"""Rollout of a plan: applies the child objects of an Application in order, and updates addresses and certificates later."""
 
 from __future__ import annotations
 
@@ -45,8 +45,8 @@ _AFTER_DEPLOYMENTS = (
 class Rollout:
     """Applies the child objects of Applications.
 
-    The order is: plan, deletion of stale objects, Grants, Deployments, Secrets, everything else. Grants come before
-    Deployments, so that a webhook that does not respond to Deployments delays no revocation.
+    The order is: plan, deletion of stale objects, Grants, Deployments, Secrets, other objects. Grants come before Deployments,
+    so that a webhook that does not respond to Deployments does not delay a revocation.
 
     Attributes:
         in_progress: Number of Applications that are being rolled out.
@@ -193,7 +193,7 @@ class Rollout:
             log.warning("rollout: certificates not renewed (application=%s/%s error=%s)", *key, error)
 
     async def update_addresses(self, key: Key, plan: DeploymentPlanSpec, pods: Sequence[PodView]) -> None:
-        """Update the addresses of pods in EndpointSlices and DirectLinks, and change nothing else.
+        """Update only the addresses of pods in EndpointSlices and DirectLinks.
 
         Raises:
             KubeError: The API server refused a change, or could not be reached.
@@ -212,7 +212,7 @@ class Rollout:
     async def renew_certificates(
         self, application: Application, plan: DeploymentPlanSpec, pods: Sequence[PodView]
     ) -> None:
-        """Renew the certificates of a running plan, and change nothing else.
+        """Renew only the certificates of a running plan.
 
         Raises:
             KubeError: The API server refused a write, or could not be reached.

@@ -1,6 +1,7 @@
-"""Cache of route checks: what policies say about the routes of active plans, computed in a worker thread.
+"""Cache of route checks: the policy engine judges the routes of active plans in a worker thread.
 
-With many zones one check takes about a second, which would block the event loop (docs/decisions/0023-route-checks-in-a-worker-thread.md).
+With many zones one check takes about a second and would block the event loop
+(docs/decisions/0023-route-checks-in-a-worker-thread.md).
 """
 
 from __future__ import annotations
@@ -49,7 +50,7 @@ class RouteCheckCache:
         self._clock = clock
         self._checks: dict[Key, _Check] = {}
         self._running: dict[Key, asyncio.Task[None]] = {}
-        self._turn = asyncio.Semaphore(1)
+        self._one_check = asyncio.Semaphore(1)
 
     def checked(
         self,
@@ -61,7 +62,7 @@ class RouteCheckCache:
         inventory: Inventory,
         settings: Settings,
     ) -> DeploymentPlanSpec:
-        """Return a plan with the latest result of its check. If there is none, or it is too old, start a check.
+        """Return a plan with the latest result of its check. If there is no result or it is too old, start a check.
 
         Args:
             key: Key of the Application.
@@ -106,7 +107,7 @@ class RouteCheckCache:
         check: Callable[[], DeploymentPlanSpec],
     ) -> None:
         before = self._checks.get(key)
-        async with self._turn:
+        async with self._one_check:
             try:
                 with phase("routes"):
                     result = await asyncio.to_thread(check)

@@ -62,7 +62,7 @@ def next_step(
         fleet: Number of nodes that have services.
         ready: Returns the number of nodes with a ready pod of the required revision of a DaemonSet.
     """
-    # An unreachable node says nothing about the release.
+    # Services that do not start on an unreachable node are no evidence against the release.
     starting = [node for node in nodes if node.starting and (node.obstacle or ("",))[0] != "NodeUnreachable"]
     stuck = [node for node in starting if node.starting_s > STUCK_S]
     failed = Counter(daemon_set for node in stuck for daemon_set in node.starting)
@@ -118,7 +118,7 @@ class ServiceRollout:
         self._monotonic = monotonic
         self._unsettled: set[str] = set()
         """Nodes that are not in the desired state, or whose condition is not written yet."""
-        self._owed: dict[str, set[str]] = {}
+        self._awaited: dict[str, set[str]] = {}
         """By node, the DaemonSets whose deleted pods have no ready successor yet."""
         self._starting: dict[str, tuple[Mapping[str, str], float]] = {}
         """By node, the starting pods, and since when in seconds."""
@@ -155,11 +155,11 @@ class ServiceRollout:
             outdated = tuple(p for p in pods if not p.terminating and not services.is_current(p))
             present = [p for p in pods if not p.terminating and p not in outdated]
             self._settle(node, {p.daemon_set for p in present if p.ready})
-            if not pods and node not in self._owed:
+            if not pods and node not in self._awaited:
                 self._unsettled.discard(node)
                 continue
             existing = {p.daemon_set for p in (*present, *outdated)}
-            starting = {name: name for name in self._owed.get(node, set()) - existing}
+            starting = {name: name for name in self._awaited.get(node, set()) - existing}
             starting |= {
                 str(p.daemon_set): p.name for p in pods if p.terminating or (p not in outdated and not p.ready)
             }
@@ -176,10 +176,10 @@ class ServiceRollout:
         return now_s - since_s if known == starting else 0.0
 
     def _settle(self, node: str, ready: set[str | None]) -> None:
-        """Drop owed pods that are ready, or whose DaemonSet or node was deleted."""
-        owed = {d for d in self._owed.pop(node, ()) if d not in ready and self._cache.services.has_revision(d)}
-        if owed and self._cache.hosts.get(("", node)) is not None:
-            self._owed[node] = owed
+        """Stop waiting for successors that are ready, or whose DaemonSet or node was deleted."""
+        awaited = {d for d in self._awaited.pop(node, ()) if d not in ready and self._cache.services.has_revision(d)}
+        if awaited and self._cache.hosts.get(("", node)) is not None:
+            self._awaited[node] = awaited
 
     def _obstacle(self, node: str, holder: kinds.Key | None) -> tuple[str, str] | None:
         host = self._cache.hosts.get(("", node))
@@ -199,7 +199,7 @@ class ServiceRollout:
         for pod in node.outdated:
             log.info("service rollout: replacing pod (node=%s pod=%s)", node.node, pod.name)
             # Recorded before the deletion, because a request without a response may take effect.
-            self._owed.setdefault(node.node, set()).add(str(pod.daemon_set))
+            self._awaited.setdefault(node.node, set()).add(str(pod.daemon_set))
             await self._store.delete(kinds.POD, (pod.namespace, pod.name))
 
     async def _report(self, updates: Mapping[str, ConditionUpdate]) -> None:

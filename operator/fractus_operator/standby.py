@@ -1,4 +1,4 @@
-"""Start of an operator that does not act yet: it waits for its kinds, and answers health checks until it is the leader."""
+"""Standby of an operator before it is the leader: waits for the custom resource kinds, and responds to health checks."""
 
 from __future__ import annotations
 
@@ -22,7 +22,8 @@ _REQUEST_TIMEOUT_S = 5.0
 async def wait_for_kinds(store: Store) -> None:
     """Wait until the API server serves every kind, because decisions need all of them.
 
-    Health checks fail meanwhile, so that a rolling update keeps the pods of the previous release, which can decide.
+    Health checks fail meanwhile, so that a rolling update keeps the pods of the previous release, which works without the new
+    kinds.
     """
     logged = False
     while missing := await _missing_kinds(store):
@@ -45,7 +46,7 @@ async def _missing_kinds(store: Store) -> list[str]:
 
 @asynccontextmanager
 async def health_endpoint(health: str) -> AsyncIterator[None]:
-    """Answer health checks while the context lasts. Afterwards, kopf serves the same port.
+    """Respond to health checks while the context lasts. Afterwards, kopf serves the same port.
 
     Args:
         health: URL of the endpoint.

@@ -117,9 +117,9 @@ def flight(name: str, drone: Drone | None, reported: Mapping[str, Any]) -> Fligh
     in_air = status is not None and status.in_air
     begun = in_air or (reported.get("drone") == name and _has_begun(reported))
     if status is None or status.flight_state == "unknown":
-        last = (
-            _ACTIVITY[status.last_flight_state] if status is not None and status.last_flight_state else "on the ground"
-        )
+        last = "on the ground"
+        if status is not None and status.last_flight_state:
+            last = _ACTIVITY[status.last_flight_state]
         return FlightStatus("Unknown", f"{name} is in an unknown state, at its last report it was {last}", None, begun)
     if not in_air:
         if begun:
@@ -141,13 +141,14 @@ def controller_name(controller: str | None) -> str | None:
 def mission_outcome(uid: str | None, grants: Iterable[Grant]) -> Outcome | None:
     """Return the mission outcome of the Application with this uid, or None while its mission continues.
 
-    The node of its driver reports the outcome, or that of the component whose points of interest the system visits.
+    The node of the driver reports the outcome. Without a driver, the node of the component reports it whose points of interest
+    the system visits.
     """
     for grant in grants:
         spec = grant.spec
         status = grant.status
-        leads = spec.class_ == "driver" or spec.tour
-        if not leads or spec.application.uid != uid or status is None:
+        reports_outcome = spec.class_ == "driver" or spec.tour
+        if not reports_outcome or spec.application.uid != uid or status is None:
             continue
         match status.phase:
             case "Complete":
@@ -192,9 +193,9 @@ def deployed(
     missing: list[str] = []
     ready = 0
     for placed in plan.placements:
-        ready_here = min(sum(pod.ready for pod in alive if pod.instance == placed.instance), placed.replicas)
-        ready += ready_here
-        if ready_here < placed.replicas:
+        ready_pods = min(sum(pod.ready for pod in alive if pod.instance == placed.instance), placed.replicas)
+        ready += ready_pods
+        if ready_pods < placed.replicas:
             missing.append(placed.instance)
     desired = sum(placed.replicas for placed in plan.placements)
     if missing:

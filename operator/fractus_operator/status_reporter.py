@@ -41,7 +41,7 @@ class StatusReporter:
         self._written: dict[Key, tuple[str, Body]] = {}
 
     def last(self, submitted: Submitted) -> Body:
-        """Return the last status of an Application that was written here, else the observed status."""
+        """Return the status of an Application that this reporter wrote last, otherwise the observed status."""
         uid, status = self._written.get(submitted.key, ("", {}))
         return status if uid and uid == submitted.uid else dict(submitted.body.get("status") or {})
 
@@ -64,7 +64,7 @@ class StatusReporter:
                 log.warning("status reporter: status not written (application=%s/%s error=%s)", *submitted.key, error)
 
     async def report_failure(self, submitted: Submitted | None, attempts: int, error: KubeError) -> None:
-        """Report that an Application cannot be reconciled, if this persists. A failed report is repeated the next time.
+        """Report that an Application cannot be reconciled, if this persists. If the report fails, the next failure repeats it.
 
         Args:
             submitted: The Application, or None if it does not exist any more.

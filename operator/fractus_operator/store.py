@@ -121,10 +121,10 @@ class Store(Client):
                 return
 
     async def set_labels(self, kind: Kind, name: str, labels: Mapping[str, str | None]) -> None:
-        """Set labels of a cluster-scoped object of another owner, and remove labels whose value is None.
+        """Set labels of a cluster-scoped object that another client manages, and remove labels whose value is None.
 
         Raises:
-            NotFound: The object does not exist. An apply would create it.
+            NotFound: The object does not exist. Unlike an apply, this request does not create it.
         """
         await self.patch(kind, ("", name), {"metadata": {"labels": dict(labels)}}, ContentType.MERGE)
 
@@ -173,15 +173,15 @@ class Store(Client):
 
 
 def _applied_entries(entries: Sequence[Body]) -> list[Body] | None:
-    """Return metadata.managedFields with all fields of this operator as applied. None if they are already."""
-    own = [e for e in entries if e.get("manager") == FIELD_MANAGER and not e.get("subresource")]
-    if all(entry["operation"] == "Apply" for entry in own):
+    """Return metadata.managedFields in which all fields of this operator are applied fields, or None if they are already."""
+    managed = [e for e in entries if e.get("manager") == FIELD_MANAGER and not e.get("subresource")]
+    if all(entry["operation"] == "Apply" for entry in managed):
         return None
     fields: Body = {}
-    for entry in own:
+    for entry in managed:
         _merge_fields(fields, entry.get("fieldsV1") or {})
-    others = [entry for entry in entries if entry not in own]
-    return [*others, {**own[0], "operation": "Apply", "fieldsV1": fields}]
+    others = [entry for entry in entries if entry not in managed]
+    return [*others, {**managed[0], "operation": "Apply", "fieldsV1": fields}]
 
 
 def _merge_fields(fields: Body, more: Body) -> None:

@@ -92,7 +92,7 @@ async def check() -> str:
 
 
 async def _all(store: Store, kind: Kind) -> list[Body]:
-    """Return all objects of a kind. If the kind was deleted, there are none, so that Fractus can be removed after its kinds."""
+    """Return all objects of a kind. The result is empty if the kind was deleted, so that Fractus can be removed after its kinds."""
     try:
         return await store.list(kind)
     except NotFound:

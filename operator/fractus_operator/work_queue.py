@@ -1,4 +1,4 @@
-"""Queues and subscriptions that start reconciliations: of keys, of periodic steps, and of Applications."""
+"""Start of reconciliations: periodic steps, queues of keys, and subscriptions of Applications to their inputs."""
 
 from __future__ import annotations
 
@@ -35,15 +35,10 @@ async def run_periodically(name: str, step: Callable[[], Awaitable[None]], perio
             backoff.succeeded()
         except Exception as error:
             pause_s = backoff.delay_s()
-            expected = isinstance(error, KubeError)
-            log.log(
-                logging.INFO if expected else logging.WARNING,
-                "%s: step failed (retry_s=%.1f error=%s)",
-                name,
-                pause_s,
-                error if expected else repr(error),
-                exc_info=None if expected else error,
-            )
+            if isinstance(error, KubeError):
+                log.info("%s: step failed (retry_s=%.1f error=%s)", name, pause_s, error)
+            else:
+                log.warning("%s: step failed (retry_s=%.1f error=%r)", name, pause_s, error, exc_info=True)
         await asyncio.sleep(pause_s)
 
 
@@ -139,16 +134,13 @@ class WorkQueue:
         except Exception as error:
             backoff = self.failures.setdefault(key, Backoff(_FIRST_RETRY_S, _MAX_RETRY_S))
             pause_s = backoff.delay_s()
-            expected = isinstance(error, KubeError)
-            log.log(
-                logging.INFO if expected and backoff.attempts <= 2 else logging.WARNING,
-                "work queue: reconcile failed (kind=%s name=%s retry_s=%.1f error=%s)",
-                self.name,
-                "/".join(filter(None, key)),
-                pause_s,
-                error if expected else repr(error),
-                exc_info=None if expected else error,
-            )
+            name = "/".join(filter(None, key))
+            message = "work queue: reconcile failed (kind=%s name=%s retry_s=%.1f error=%s)"
+            if isinstance(error, KubeError):
+                level = logging.INFO if backoff.attempts <= 2 else logging.WARNING
+                log.log(level, message, self.name, name, pause_s, error)
+            else:
+                log.warning(message, self.name, name, pause_s, repr(error), exc_info=True)
             if key not in self._waiting:
                 self._retries[key] = asyncio.get_running_loop().call_later(pause_s, self.add, key)
         else:

@@ -69,7 +69,7 @@ def run_of(site: Site, *more: LogLine) -> Evidence:
             "links: decided (on=default/links peer=edge-1): BetterPath: the direct link scores 11.8, the present path 8",
         ),
         agent(25.0, "links: decided (on=default/links peer=edge-1): Leaving: the drone leaves its reach"),
-        agent(26.0, "links: none (peer=edge-1 reason=no link is wanted)"),
+        agent(26.0, "links: none (peer=edge-1 reason=no peer is selected)"),
     ]
     pictures = [line for n in range(1, 41) for line in picture(n, n - 1.0, "edge-1" if 10 <= n - 1 < 25 else "cloud-1")]
     return read_evidence([*links, *pictures, *more], flight(site), DRONE)

@@ -204,7 +204,7 @@ def test_complete_mission_keeps_only_its_plan(world: World, operator: OperatorPr
     assert flight_events(world) == [
         "TookOff: drone-1 took off",
         f"MissionBegun: {namespace}/traffic flies drone-1",
-        f"MissionOver: {namespace}/traffic does not fly drone-1 any more: all control points were returned",
+        f"MissionOver: {namespace}/traffic no longer flies drone-1: all control points were returned",
         "Landed: drone-1 landed",
     ], "nothing of planning and deploying, which costs enough requests, and nothing twice"
 

@@ -320,7 +320,7 @@ def test_stale_drone_has_unknown_state(guarded: World, permitted: OperatorProces
     wait_for(lambda: condition(guarded, "drone-1", "Ready").get("status") == "Unknown", permitted.log)
     assert condition(guarded, "drone-1", "Ready")["reason"] == "AgentSilent"
     assert (
-        "the last report of its agent is of 2026-01-01 00:00:00 UTC, when the drone was flying"
+        "its agent last reported at 2026-01-01 00:00:00 UTC, when the drone was flying"
         in condition(guarded, "drone-1", "Ready")["message"]
     )
     status = (guarded.api.get(path) or {})["status"]

@@ -37,7 +37,7 @@ def redirector(world: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> I
     monkeypatch.setattr(module, "LEASE_S", 60.0)  # a client may take long to start
     conntrack = Conntrack(world.netlink("drone"))
     (tmp_path / "pod").symlink_to(world.path("dpod"))
-    found = Redirector(world.maps("drone"), conntrack, PodNamespaces(tmp_path, own=world.path("drone")))
+    found = Redirector(world.maps("drone"), conntrack, PodNamespaces(tmp_path, node_namespace=world.path("drone")))
     found.set_services([VIP])
     yield found
     found.close()

@@ -59,7 +59,7 @@ def world() -> Iterator[Rig]:
 def redirector(world: Rig, tmp_path: Path) -> Iterator[Redirector]:
     (tmp_path / "pod").symlink_to(world.path("dpod"))
     conntrack = Conntrack(world.netlink("drone"))
-    found = Redirector(world.maps("drone"), conntrack, PodNamespaces(tmp_path, own=world.path("drone")))
+    found = Redirector(world.maps("drone"), conntrack, PodNamespaces(tmp_path, node_namespace=world.path("drone")))
     found.set_services([VIP])
     yield found
     found.close()

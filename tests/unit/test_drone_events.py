@@ -108,7 +108,7 @@ async def test_events_of_a_complete_flight(cluster: Cluster) -> None:
         "the system has control of drone-1 instead of Navigator: policy campus forbids it",
         "Navigator has control of drone-1",
         "a pilot has control of drone-1 instead of Navigator",
-        "city/traffic does not fly drone-1 any more: all control points were returned",
+        "city/traffic no longer flies drone-1: all control points were returned",
         "drone-1 landed",
     ]
 
@@ -132,7 +132,7 @@ async def test_restarted_operator_posts_only_new_events(cluster: Cluster) -> Non
     assert cluster.posted == before
     cluster.holders = []
     assert await cluster.see(drone("landing", DRIVER, at_s=15)) == ["MissionOver"], "it flew when the operator started"
-    assert cluster.sentences()[-1].endswith("any more: it was deleted")
+    assert cluster.sentences()[-1].endswith("no longer flies drone-1: it was deleted")
     cluster.start()
     assert await cluster.see(drone("inactive", at_s=16)) == []
 

@@ -410,12 +410,12 @@ async def test_mission_condition_ends_after_two_reports(cache: ClusterCache) -> 
     assert api.asked == [("PATCH", "d1")], "it takes one request, and no look before"
     assert cache.drones.get(("", "d1")).may_take_off  # type: ignore[union-attr]
     granted(cache, "ns.a", None)
-    assert await said() == "NotHeardOf"
-    assert await said() == "NotHeardOf"
-    assert await said(lastSeen=at(30), flightState="unknown") == "NotHeardOf"
+    assert await said() == "AwaitingReports"
+    assert await said() == "AwaitingReports"
+    assert await said(lastSeen=at(30), flightState="unknown") == "AwaitingReports"
     assert cache.drones.get(("", "d1")).may_take_off  # type: ignore[union-attr]
     for _ in range(2):
-        assert await said(lastSeen=at(31), flightState="inactive") == "NotHeardOf", (
+        assert await said(lastSeen=at(31), flightState="inactive") == "AwaitingReports", (
             "it may be older than the Grant's end"
         )
     assert await said(lastSeen=at(59)) == "NoGrant"
@@ -453,7 +453,7 @@ async def test_condition_is_updated_if_patch_is_forbidden(
     api.forbidden = {"PATCH"}
     missions = MissionConditionController(api, cache, reported(cache, api), lambda: datetime(2026, 1, 1, tzinfo=UTC))
     cache.add_listener(GRANT, lambda key: bool(missions.grant_changed(key)))
-    for name, reason in (("ns.a", "Granted"), (None, "NotHeardOf"), (None, "NotHeardOf")):
+    for name, reason in (("ns.a", "Granted"), (None, "AwaitingReports"), (None, "AwaitingReports")):
         granted(cache, "ns.a", "d1" if name else None)
         await missions.reconcile(("", "d1"))
         assert told(api, "d1", "OnMission") == reason

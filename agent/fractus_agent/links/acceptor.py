@@ -26,7 +26,7 @@ from fractus_agent.links.pairing import (
 log = logging.getLogger(__name__)
 
 MAX_PENDING = 8
-"""Limit of concurrent handshakes: each costs a signature, and anyone in range can start one."""
+"""Limit of concurrent handshakes. Each one costs a signature, and anyone in range can start one."""
 
 _ACCEPT_RETRY_S = 0.2
 
@@ -129,7 +129,7 @@ class Acceptor:
             await session.receive(HANDSHAKE_TIMEOUT_S)
             reason = self._refusal(session.peer)
             if not reason:
-                # The node counts as linked from here on. If it has an old session, it has lost that one.
+                # The node counts as linked from here on. A node that pairs again has lost its old session.
                 if (old := self._sessions.get(session.peer)) is not None:
                     old.cancel()
                 self._sessions[session.peer] = _this_task()

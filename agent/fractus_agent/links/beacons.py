@@ -55,7 +55,7 @@ def decode(data: bytes) -> str | None:
 
 
 class Beacons(asyncio.DatagramProtocol):
-    """Sends the beacons of this node, and receives those of other nodes.
+    """Sends the beacons of this node, and receives the beacons of other nodes.
 
     Args:
         node: Name of this node.
@@ -74,7 +74,7 @@ class Beacons(asyncio.DatagramProtocol):
             self._on_beacon(node)
 
     def error_received(self, exc: Exception) -> None:
-        """Handle a beacon that was not sent: the device may be down, or may have been replaced by one with its name."""
+        """Handle a beacon that was not sent. The device may be down, or another device may have its name now."""
         log.debug("links: beacon not sent (error=%s)", exc)
         self._broken.set()
 

@@ -19,10 +19,12 @@ PROBE_TIMEOUT_S = 2.0
 SILENT_S = 4.0
 """Time without a response after which the path counts as unreachable, in seconds."""
 STEADY_S = 5.0
-"""Time with responses after which an unreachable path counts as reachable again, so that a flapping path moves no
-traffic, in seconds."""
+"""Time with responses after which an unreachable path counts as reachable again, in seconds.
+
+A path that flaps faster moves no traffic.
+"""
 LATENCY_SAMPLES = 10
-"""The latency is the minimum of this many samples. Other samples include a handshake, or queueing behind pictures."""
+"""Number of samples whose minimum is the latency. Larger samples include a handshake, or queueing behind pictures."""
 
 _LATENCY_MS = {"Ethernet": 1.0, "WiFi": 5.0, "5G": 15.0, "4G": 60.0, "BLE": 60.0}
 """Expected one-way latency to the cloud by technology, until it is measured."""
@@ -106,7 +108,11 @@ def declared_metrics(node: Node | None, latency_ms: float | None = None) -> Path
     interfaces = node.spec.interfaces if node is not None else ()
     direct = direct_interface(interfaces)
     best = max((each for each in interfaces if each is not direct), key=lambda each: each.bandwidth_mbps, default=None)
-    rate_mbps = best.bandwidth_mbps if best is not None else _DEFAULT_MBPS
+    rate_mbps = _DEFAULT_MBPS
+    default_latency_ms = _LATENCY_MS["4G"]
+    if best is not None:
+        rate_mbps = best.bandwidth_mbps
+        default_latency_ms = _LATENCY_MS[best.technology]
     if latency_ms is None:
-        latency_ms = _LATENCY_MS[best.technology if best is not None else "4G"]
+        latency_ms = default_latency_ms
     return PathMetrics(rate_mbps, rate_mbps, latency_ms, latency_ms)

@@ -1,4 +1,4 @@
-"""Requesting end of pairing: keeps the one direct link of a drone with the wanted peer."""
+"""Requesting end of pairing: keeps the direct link of a drone to the selected peer."""
 
 from __future__ import annotations
 
@@ -20,15 +20,17 @@ from fractus_agent.links.pairing import LinkLost, PairingFailed, Session, pair
 log = logging.getLogger(__name__)
 
 ARP_FLUSH_S = 0.8
-"""Time without a response after which the ARP entry of the peer is flushed, because its address may have belonged to other
-hardware. TCP repeats its SYN after one second."""
+"""Time without a response after which the ARP entry of the peer is flushed, in seconds.
+
+The address of the peer may have belonged to other hardware. TCP repeats its SYN after one second.
+"""
 
 
 class Connector:
-    """Pairs with the wanted peer, and keeps the session until another peer is wanted or the link is lost.
+    """Pairs with the selected peer, and keeps the session until another peer is selected or the link is lost.
 
-    The connector does not retry by itself. After a failure the link is down, and the next decision on the wanted peer
-    takes the failure into account.
+    The connector does not retry. After a failure the link is down, and the next selection of a peer takes the failure into
+    account.
 
     Args:
         node: Name of this node.
@@ -68,7 +70,7 @@ class Connector:
         """
         if peer == self.link.peer and self.link.phase is not LinkPhase.NONE:
             return
-        await self.close("another peer is wanted" if peer else "no link is wanted")
+        await self.close("another peer is selected" if peer else "no peer is selected")
         if peer:
             self._set(LinkState(LinkPhase.CONNECTING, peer, time.monotonic()), "pairing")
             self._task = asyncio.create_task(self._connect(peer, description or {}))
@@ -100,7 +102,7 @@ class Connector:
             flush.cancel()
         try:
             self._set(LinkState(LinkPhase.UP, peer, time.monotonic()), "paired")
-            # Report the loss before closing the session: on a lost link closing takes a while, and traffic must not wait.
+            # The loss is reported before the session is closed, because closing takes a while on a lost link.
             self._set(NO_LINK, await self._hold(session))
         finally:
             await session.close()

@@ -49,7 +49,7 @@ class DeviceAddresses:
         self._device = device
 
     async def other_traffic(self) -> str:
-        """Return evidence that the device carries traffic other than direct links, empty if there is none.
+        """Return evidence that the device carries traffic other than direct links, or an empty string.
 
         Raises:
             NoDevice: The device does not exist.
@@ -68,7 +68,7 @@ class DeviceAddresses:
         return ""
 
     async def set(self, address: IPv4Address) -> None:
-        """Bring the device up with this link-local address. Remove other ones, which a crash may have left.
+        """Bring the device up with this link-local address. Remove other link-local addresses, which a crash may have left.
 
         Raises:
             NoDevice: The device does not exist.
@@ -80,10 +80,8 @@ class DeviceAddresses:
             link = (await route.link("get", index=index))[0]
             if not link["flags"] & _IFF_UP:
                 alias = _alias(link).removesuffix(RAISED) + RAISED
-                # If the owner's alias leaves no room for the suffix, the device stays up in the end.
-                mark = (
-                    {"ifalias": alias} if len(alias.encode()) < _MAX_ALIAS_BYTES else {}
-                )  # pyroute2 appends a NUL byte
+                # pyroute2 appends a NUL byte. Without room for the suffix the device is not marked, so it stays up in the end.
+                mark = {"ifalias": alias} if len(alias.encode()) < _MAX_ALIAS_BYTES else {}
                 await route.link("set", index=index, state="up", **mark)
             # Other addresses go first, because deleting a primary address deletes the secondary ones with it.
             for other in await _addresses(route, index):

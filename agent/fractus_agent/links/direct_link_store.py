@@ -1,4 +1,4 @@
-"""DirectLinks of the node: from the API server and on disk, so that a drone offline can restart."""
+"""DirectLinks of the node: received from the API server and stored on disk, so that an offline drone can restart."""
 
 from __future__ import annotations
 
@@ -56,8 +56,8 @@ class DirectLinkStore:
     def restore(self) -> None:
         """Read the files, and remove temporary ones."""
         self._directory.mkdir(parents=True, exist_ok=True, mode=0o700)
-        for left in self._directory.glob(".*.tmp"):
-            left.unlink()
+        for temporary in self._directory.glob(".*.tmp"):
+            temporary.unlink()
         for path in self._directory.glob("*.json"):
             try:
                 self._read(json.loads(path.read_bytes()))
@@ -72,8 +72,8 @@ class DirectLinkStore:
         match event:
             case Listed(bodies):
                 names = {body["metadata"]["name"] for body in bodies}
-                for gone in {*self._links, *(path.stem for path in self._directory.glob("*.json"))} - names:
-                    self._remove(gone)
+                for removed in {*self._links, *(path.stem for path in self._directory.glob("*.json"))} - names:
+                    self._remove(removed)
                 for body in bodies:
                     self._put(body)
             case Changed(body):
@@ -154,7 +154,7 @@ def allowed_callers(links: Iterable[DirectLink]) -> dict[Endpoint, frozenset[IPv
 
 
 def isolated_pods(links: Iterable[DirectLink]) -> dict[Endpoint, frozenset[IPv4Address]]:
-    """Return the pods on the edge node that accept only calls over a link, as guarded endpoints without callers."""
+    """Return the pods of the edge node that accept only calls over a link, as guarded endpoints without callers."""
     pods = (pod_endpoint(s) for link in links for s in link.spec.services if s.callers is not None)
     return {pod: frozenset() for pod in pods if pod is not None}
 

@@ -50,7 +50,7 @@ DECISION_INTERVAL_S = 0.5
 PROBE_INTERVAL_S = 3.0
 """Seconds between two bandwidth measurements of a link that is up."""
 PROBE_SAMPLES = 3
-"""The best of this many measurements counts, because a probe that competes with traffic measures only the rest."""
+"""Number of measurements of which the best counts. A probe that competes with traffic measures only the unused bandwidth."""
 MIN_LEAVE_S = 2.0
 """Shortest time before the predicted end of a link's range at which traffic moves back to the cloud path, in seconds."""
 SHUTDOWN_DRAIN_S = 2.0
@@ -152,7 +152,7 @@ class DroneLinkController:
 
     async def _step(self) -> None:
         """Make one decision and execute it."""
-        # Include services that are no longer planned as long as their traffic takes the link.
+        # A service that is no longer planned is included until its traffic has left the link.
         services = {*virtual_endpoints(self._links), *self._redirector.redirects}
         self._redirector.set_services(services, allowed_callers(self._links))
         situation = self._situation()

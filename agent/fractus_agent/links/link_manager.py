@@ -126,7 +126,7 @@ class LinkManager:
         self._on_change()
 
     def _report_interface(self) -> None:
-        """Report the conditions that no link controller sets: those of an edge node and of an unusable interface."""
+        """Report the conditions that no link controller sets: for an edge node, and for an unusable interface."""
         links = self._direct_links.links
         if self._end == "node":
             drones = self._edge_controller.drones if self._edge_controller is not None else frozenset()
@@ -187,15 +187,16 @@ class LinkManager:
         ports = ruleset.Ports(udp=beacons.BEACON_PORT, tcp=pairing.PAIRING_PORT)
         is_drone = self._end == "drone"
         controller = _interface_controller(interface, self._node)
-        # The packet filter closes the device before it gets an address. If the device is not usable, it is left alone,
-        # but pods are isolated anyway.
+        # The packet filter closes the device before it gets an address. A device that is not usable is not changed, but pods are
+        # isolated in any case.
         device = interface.device if await self._check_usable(controller) else ruleset.NO_DEVICE
 
         def make_table(callers: Callers) -> None:
             ruleset.create(device, ports, clients=is_drone, callers=callers)
 
         # The new table replaces that of an earlier agent, and contains its guards from the beginning.
-        guards = (allowed_callers if is_drone else isolated_pods)(self._direct_links.links)
+        guarded_endpoints = allowed_callers if is_drone else isolated_pods
+        guards = guarded_endpoints(self._direct_links.links)
         make_table(guards)
         netlink = Netlink(NETLINK_NETFILTER)
         conntrack = Conntrack(netlink)
@@ -209,7 +210,7 @@ class LinkManager:
             nonlocal controller, device
             while device == ruleset.NO_DEVICE:
                 await asyncio.sleep(INTERFACE_CHECK_INTERVAL_S)
-                # The device must exist to find out if it is a radio.
+                # The kind of the interface is known only when the device exists.
                 controller = _interface_controller(interface, self._node)
                 if await self._check_usable(controller):
                     device = controller.device

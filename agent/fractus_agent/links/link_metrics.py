@@ -19,7 +19,7 @@ _GAUGES = {
         "path",
         "Bandwidth of a path: measured for the link that is up, otherwise expected. cloud is the cloud path.",
     ),
-    "fractus_path_latency_milliseconds": ("path", "One-way latency of a path: measured or expected."),
+    "fractus_path_latency_milliseconds": ("path", "One-way latency of a path, measured or expected."),
     "fractus_path_quality": (
         "path",
         "Share of its bandwidth that a link is expected to offer at the position of the drone.",

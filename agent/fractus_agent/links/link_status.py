@@ -72,9 +72,11 @@ def drone_status(report: DroneLinkReport, direct_link: DirectLink) -> tuple[dict
     if phase is LinkPhase.UP and report.measured is not None:
         status["bandwidth"] = round(report.measured.ingress_mbps, 1)
         status["latency"] = round(report.measured.ingress_latency_ms, 1)
-    up = phase is LinkPhase.UP
+    linked = ConditionUpdate(LINKED, "False", reason, message)
+    if phase is LinkPhase.UP:
+        linked = ConditionUpdate(LINKED, "True", "Up")
     return status, [
-        ConditionUpdate(LINKED, "True" if up else "False", "Up" if up else reason, "" if up else message),
+        linked,
         ConditionUpdate(TRAFFIC_DIRECT, "True" if direct else "False", reason, message),
     ]
 
@@ -120,9 +122,9 @@ def edge_condition(direct_link: DirectLink, problem: tuple[str, str] | None, lin
 
 @dataclass(slots=True)
 class _TrackedStatus:
-    """Wanted and written status of one DirectLink."""
+    """Desired and written status of one DirectLink."""
 
-    wanted: Object
+    desired: Object
     uid: str | None
     written: Object | None = None
     written_s: float = 0.0
@@ -181,10 +183,10 @@ class LinkStatusReporter:
         for name, tracked in tuple(self._statuses.items()):
             due_s = self._due_s(tracked)
             if due_s <= 0:
-                tracked.written = tracked.wanted
+                tracked.written = tracked.desired
                 tracked.written_s = time.monotonic()
                 try:
-                    await self._store.apply_status("DirectLink", name, tracked.wanted, self._end)
+                    await self._store.apply_status("DirectLink", name, tracked.desired, self._end)
                 except BaseException:
                     tracked.written = None
                     raise
@@ -199,7 +201,7 @@ class LinkStatusReporter:
             tracked.traffic = status["traffic"]
             tracked.switches += 1
             tracked.last_switch = timestamp(self._wall())
-        kept = {k: tracked.wanted[k] for k in ("bandwidth", "latency") if k in tracked.wanted}
+        kept = {k: tracked.desired[k] for k in ("bandwidth", "latency") if k in tracked.desired}
         counted = {"switches": tracked.switches} | ({"lastSwitch": tracked.last_switch} if tracked.last_switch else {})
         self._set(link, kept | status | counted, conditions)
 
@@ -215,22 +217,24 @@ class LinkStatusReporter:
         tracked.conditions, _ = merge_conditions(tracked.conditions, conditions, generation, self._wall())
         if self._end == "drone" and generation is not None:
             status = {**status, "observedGeneration": generation}
-        wanted = {**status, "conditions": [condition.to_dict() for condition in tracked.conditions]}
-        if wanted != tracked.wanted:
-            tracked.wanted = wanted
+        desired = {**status, "conditions": [condition.to_dict() for condition in tracked.conditions]}
+        if desired != tracked.desired:
+            tracked.desired = desired
             self._changed.set()
 
     def _forget(self, links: Iterable[DirectLink]) -> None:
-        for gone in self._statuses.keys() - {link.name for link in links}:
-            del self._statuses[gone]
+        for removed in self._statuses.keys() - {link.name for link in links}:
+            del self._statuses[removed]
 
     @staticmethod
     def _due_s(tracked: _TrackedStatus) -> float:
         if tracked.written is None:
             return 0.0
-        if tracked.written == tracked.wanted:
+        if tracked.written == tracked.desired:
             return VALUES_INTERVAL_S
-        interval_s = URGENT_INTERVAL_S if _urgent(tracked.written) != _urgent(tracked.wanted) else VALUES_INTERVAL_S
+        interval_s = VALUES_INTERVAL_S
+        if _urgent(tracked.written) != _urgent(tracked.desired):
+            interval_s = URGENT_INTERVAL_S
         return interval_s - (time.monotonic() - tracked.written_s)
 
 

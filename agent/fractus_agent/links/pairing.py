@@ -22,13 +22,18 @@ PAIRING_PORT = 46811
 HANDSHAKE_TIMEOUT_S = 3.0
 HEARTBEAT_S = 0.1
 LOSS_TIMEOUT_S = 0.6
-"""The link counts as lost after this time without a message, in seconds. Traffic must be back on the cloud path within
-a second, and the rest of that second covers a peer whose process was not scheduled."""
+"""The link counts as lost after this time without a message, in seconds.
+
+Traffic must be back on the cloud path within a second. The rest of that second covers a peer whose process was not scheduled.
+"""
 
 MAX_LINE_BYTES = 64 * 1024
 PROBE_BYTES = (6_000, 12_000, 24_000, 48_000)
-"""Sizes of the bursts of a probe. The next size is used only if the previous burst was so fast that the larger one cannot
-delay heartbeats. Otherwise the same size is repeated, because one burst may have competed with a picture."""
+"""Sizes of the bursts of a probe.
+
+The next size is used only if the previous burst was so fast that the larger burst cannot delay heartbeats. Otherwise the same
+size is repeated, because one burst may have competed with a picture.
+"""
 ACKNOWLEDGEMENT_TIMEOUT_S = 2.0
 BURST_LIMIT_S = 0.15
 SMOOTHING = 0.2

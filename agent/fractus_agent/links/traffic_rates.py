@@ -12,13 +12,13 @@ from dataclasses import dataclass
 from fractus_agent.redirector.nft_maps import Endpoint
 
 WINDOW_S = 0.1
-"""Length of a window in seconds. Pictures come in bursts, so a longer window would show less than the link delivers."""
+"""Length of a window in seconds. Pictures arrive in bursts, so a longer window would show less than the link can carry."""
 WINDOWS = 30
 """Number of windows that are kept."""
 CONFIRMING_SHARE = 0.8
-"""Traffic at this share of the measured bandwidth confirms the measurement. A probe would only disturb the traffic."""
+"""Share of the measured bandwidth from which traffic confirms the measurement, so that no probe disturbs the traffic."""
 MAX_CONFIRMATIONS = 3
-"""Limit of confirmations in a row, because traffic below the bandwidth of the link looks like a slower link."""
+"""Limit of successive confirmations. Traffic that does not fill the link would otherwise hide a higher bandwidth."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -204,19 +204,19 @@ class PodNamespaces:
 
     Args:
         directory: Directory of the namespaces, /run/netns. None if this node has no clients.
-        own: The node's own namespace, for clients in the host network.
+        node_namespace: The node's own namespace, for clients in the host network.
     """
 
-    def __init__(self, directory: Path | None, *, own: Path = Path("/proc/self/ns/net")) -> None:
+    def __init__(self, directory: Path | None, *, node_namespace: Path = Path("/proc/self/ns/net")) -> None:
         self._directory = directory
-        self._own = own
+        self._node_namespace = node_namespace
         self._open: dict[Path, TcpSockets] = {}
 
     def refresh(self) -> Collection[TcpSockets]:
         """Open new namespaces, close removed ones, and return the sockets of all."""
         if self._directory is None:
             return ()
-        paths = {self._own}
+        paths = {self._node_namespace}
         try:
             paths.update(self._directory.iterdir())
         except OSError as error:  # the runtime has created no namespace yet
@@ -285,8 +285,8 @@ def destroy_connection(sockets: TcpSockets, connection: TcpConnection) -> bool:
 class Conntrack:
     """Deletes conntrack entries of redirected connections.
 
-    Entries are deleted by mark: one message that the kernel handles by itself. Deleting them one by one would take
-    seconds among thousands of other entries.
+    One message deletes all entries with a mark in the kernel. To find and delete them one by one would take seconds among
+    thousands of other entries.
 
     Args:
         netlink: Netfilter socket in the node's network namespace.

@@ -282,6 +282,6 @@ def _read_counters(netlink: Netlink, name: str) -> dict[int, int]:
 
 def _nested_value(data: bytes, *kinds: int) -> bytes:
     """Return the value of an attribute inside nested attributes, empty if it is missing."""
-    for wanted in kinds:
-        data = next((value for kind, value in attributes(data) if kind == wanted), b"")
+    for outer in kinds:
+        data = next((value for kind, value in attributes(data) if kind == outer), b"")
     return data

@@ -54,13 +54,13 @@ class SwitchResult:
 
 
 @dataclass(frozen=True, slots=True)
-class _LeftPath:
+class _OldPath:
     """Path that a service has left.
 
     Attributes:
         service: Endpoint that clients connect to.
-        number: Service number of the connections opened on this path, and of no others.
-        connections: Identities of connections on the path when it was left, except those on paths left before.
+        number: Service number that only the connections opened on this path have.
+        connections: Identities of the connections on the path when the service left it, except connections on earlier paths.
     """
 
     service: Endpoint
@@ -92,7 +92,7 @@ class Redirector:
         self._numbers: dict[Endpoint, int] = {}
         self._peers: frozenset[IPv4Address] = frozenset()
         self._callers = NO_GUARDS
-        self._left: list[_LeftPath] = []
+        self._old_paths: list[_OldPath] = []
         self._draining: set[int] = set()
         self._last_number = 0
 
@@ -137,21 +137,21 @@ class Redirector:
             NetlinkError: The kernel refused the transaction. Nothing has changed.
             RedirectFailed: The table cannot be created.
         """
-        wanted = set(services)
-        if wanted == self._numbers.keys() and callers == self._callers:
+        desired = set(services)
+        if desired == self._numbers.keys() and callers == self._callers:
             return
         numbers: dict[Endpoint, int] = {}
-        for service in sorted(wanted):
+        for service in sorted(desired):
             # A service keeps its number, because its connections carry it as their mark.
             numbers[service] = self._numbers.get(service) or self._new_number(numbers)
         # Connections of removed services on the cloud path stay open.
-        removed = self._redirects.keys() - wanted
-        ended = self._left_paths({service: self._numbers[service] for service in removed})
+        removed = self._redirects.keys() - desired
+        ended = self._old_paths_of({service: self._numbers[service] for service in removed})
         redirects = {virtual: target for virtual, target in self._redirects.items() if virtual in numbers}
         self._write(redirects, numbers, callers)
         self._callers = dict(callers)
-        self._left += ended
-        self._close_left(ended)
+        self._old_paths += ended
+        self._close_old_paths(ended)
 
     def set_targets(self, targets: Mapping[Endpoint, Endpoint]) -> None:
         """Redirect incoming connections to pods of this node at once. Connections to previous targets are closed.
@@ -160,8 +160,8 @@ class Redirector:
             NetlinkError: The kernel refused the transaction. Nothing has changed.
             RedirectFailed: The table cannot be created.
         """
-        _, left = self._redirect(targets)
-        self._close_left(left)
+        _, old_paths = self._redirect(targets)
+        self._close_old_paths(old_paths)
 
     async def run(self) -> None:
         """Keep the redirects alive until cancelled. After that new connections take the cloud path at once."""
@@ -171,7 +171,7 @@ class Redirector:
                 try:
                     # Write the marks as well, because someone may have removed the table with its elements.
                     self._write(self._redirects, self._numbers)
-                    self._close_left([left for left in self._left if left.number not in self._draining])
+                    self._close_old_paths([path for path in self._old_paths if path.number not in self._draining])
                 except (NetlinkError, RedirectFailed) as error:
                     log.warning("redirector: redirects not refreshed (error=%s)", error)
         finally:
@@ -189,22 +189,22 @@ class Redirector:
             NetlinkError: The kernel refused the transaction. Nothing has changed.
             RedirectFailed: The table was removed, and cannot be created again.
         """
-        moved, left = self._redirect(targets)
+        moved, old_paths = self._redirect(targets)
         if not moved:
             return SwitchResult()
-        old = {path.number for path in left}
+        old = {path.number for path in old_paths}
         drained = 0
         try:
             if planned:
                 self._draining |= old
-                drained = await self._drain({identity for path in left for identity in path.connections}, moved)
+                drained = await self._drain({identity for path in old_paths for identity in path.connections}, moved)
         finally:
             self._draining -= old
-            cut = self._close_left(left)
+            cut = self._close_old_paths(old_paths)
         log.info("redirector: switched (services=%d planned=%s drained=%d cut=%d)", len(moved), planned, drained, cut)
         return SwitchResult(drained, cut)
 
-    def _redirect(self, targets: Mapping[Endpoint, Endpoint | None]) -> tuple[list[Endpoint], list[_LeftPath]]:
+    def _redirect(self, targets: Mapping[Endpoint, Endpoint | None]) -> tuple[list[Endpoint], list[_OldPath]]:
         """Redirect new connections. Return the services that moved, and the paths that they left."""
         before = self._redirects
         after = {v: t for v, t in (before | dict(targets)).items() if t is not None and v in self._numbers}
@@ -217,13 +217,13 @@ class Redirector:
             numbers[virtual] = self._new_number(numbers)
         self._write(after, numbers)
         # From here on new connections take the new path and carry the new number.
-        left = self._left_paths(old)
-        self._left += left
-        return moved, left
+        old_paths = self._old_paths_of(old)
+        self._old_paths += old_paths
+        return moved, old_paths
 
     def _new_number(self, taken: Mapping[Endpoint, int]) -> int:
-        """Return a number that no service and no left path has."""
-        used = {*taken.values(), *self._numbers.values(), *(left.number for left in self._left)}
+        """Return a number that no service and no old path has."""
+        used = {*taken.values(), *self._numbers.values(), *(path.number for path in self._old_paths)}
         while True:
             self._last_number = self._last_number % MAX_NUMBER + 1
             if self._last_number not in used:
@@ -246,24 +246,24 @@ class Redirector:
         if numbers is not None:
             self._numbers = dict(numbers)
 
-    def _left_paths(self, numbers: Mapping[Endpoint, int]) -> list[_LeftPath]:
+    def _old_paths_of(self, numbers: Mapping[Endpoint, int]) -> list[_OldPath]:
         """Return the paths of services with these numbers, with their current connections."""
         connections: dict[Endpoint, set[bytes]] = {service: set() for service in numbers}
-        # Connections of a path that was left before are still on that path, which may work.
-        older = frozenset[bytes]().union(*(left.connections for left in self._left))
+        # Connections on an earlier path stay on that path, which may still work.
+        older = frozenset[bytes]().union(*(path.connections for path in self._old_paths))
         for _, connection in self._namespaces.list_connections(connections):
             if connection.identity not in older:
                 connections[connection.peer].add(connection.identity)
-        return [_LeftPath(service, number, frozenset(connections[service])) for service, number in numbers.items()]
+        return [_OldPath(service, number, frozenset(connections[service])) for service, number in numbers.items()]
 
-    def _close_left(self, paths: Iterable[_LeftPath]) -> int:
-        """Close the remaining connections of left paths, and return how many were closed. Failures are retried later."""
-        paths = [left for left in paths if left in self._left]
+    def _close_old_paths(self, paths: Iterable[_OldPath]) -> int:
+        """Close the remaining connections of old paths, and return the number of closed ones. Failures are retried later."""
+        paths = [path for path in paths if path in self._old_paths]
         try:
             cut = self._namespaces.cut({p.service for p in paths}, {c for p in paths for c in p.connections})
-            for left in paths:
-                self._conntrack.delete(left.number)
-                self._left.remove(left)
+            for path in paths:
+                self._conntrack.delete(path.number)
+                self._old_paths.remove(path)
         except NetlinkError as error:
             log.warning("redirector: old paths not cleaned up, retrying (paths=%d error=%s)", len(paths), error)
             return 0

@@ -32,7 +32,7 @@ _DEGREE_M = 111_320.0
 STARTUP_GRACE_S = 5.0
 """Seconds after its start during which the agent writes no status before the first telemetry of a drone."""
 GPS_NOISE_M = 2.0
-"""Movement in metres that is not reported, because it is GPS noise of a drone on the ground."""
+"""Movement up to this distance in metres is not reported, because a drone on the ground has GPS noise of this size."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -200,7 +200,14 @@ def report_intervals(kind: str, status: Object) -> ReportIntervals:
 
 
 def due_s(old: Object | None, new: Object, since_s: float, intervals: ReportIntervals) -> float:
-    """Return the seconds until the new status is due, given the one written `since_s` ago. 0 means now."""
+    """Return the seconds until the new status is due, or 0 if it is due now.
+
+    Args:
+        old: Status as last written, None for none.
+        new: Current status.
+        since_s: Seconds since the old status was written.
+        intervals: Minimum seconds between writes.
+    """
     if old is None:
         return 0.0
     if _urgent(old) != _urgent(new):
@@ -213,11 +220,11 @@ def due_s(old: Object | None, new: Object, since_s: float, intervals: ReportInte
 
 
 def _urgent(status: Object) -> tuple[object, ...]:
-    facts: Sequence[Object] = status.get("conditions") or ()
+    conditions: Sequence[Object] = status.get("conditions") or ()
     return (
         status.get("flightState"),
         status.get("controller"),
-        tuple((c["type"], c["status"], c["reason"], c.get("observedGeneration")) for c in facts),
+        tuple((c["type"], c["status"], c["reason"], c.get("observedGeneration")) for c in conditions),
     )
 
 

@@ -46,7 +46,7 @@ def children(
             if component.placement == "hybrid":
                 desired[kinds.ENDPOINT_SLICE].append(endpoint_slice(application, component, plan, pods))
     if plan.drone is not None:
-        # Prevents evictions, such as those of kubectl drain, on the drone.
+        # Prevents evictions on the drone, for example by kubectl drain.
         on_drone = {labels.APPLICATION_LABEL: label_value(application.name), labels.PLACEMENT_LABEL: "drone"}
         budget = {"maxUnavailable": 0, "selector": {"matchLabels": on_drone}}
         name = application.name

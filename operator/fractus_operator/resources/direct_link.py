@@ -84,7 +84,7 @@ def _services(
 ) -> Iterable[LinkedService]:
     """Return the ports of an instance behind the address of its component's Service.
 
-    Each has the instances on the drone that may call it, or None if all may.
+    Each port lists the instances on the drone that may call it, or None if every instance may.
     """
     component = application.spec.component(placed.component)
     address = cluster_ip(service_name(application.name, component))
@@ -92,14 +92,16 @@ def _services(
         return
     components = application.spec.callers(placed.component)
     callers = [p.instance for p in plan.placements if p.component in components and p.placement == "drone"]
-    target = _target(placed.instance, pods)
+    allowed = _addressed(callers, pods) if components else None
+    pod_address = _target(placed.instance, pods)
     for port in component.container.ports:
+        target = TargetAddress(address=pod_address, port=port.port) if pod_address is not None else None
         yield LinkedService(
             component=component.name,
             instance=placed.instance,
             virtual=VirtualAddress(address=address, port=port.port, protocol=port.protocol),
-            target=TargetAddress(address=target, port=port.port) if target is not None else None,
-            callers=_addressed(callers, pods) if components else None,
+            target=target,
+            callers=allowed,
         )
 
 
@@ -108,7 +110,7 @@ def _addressed(instances: Iterable[str], pods: Sequence[PodView]) -> tuple[Calle
 
 
 def _source(instance: str, pods: Iterable[PodView]) -> str | None:
-    """Return the address of the pod of an instance, even if it is not ready. Pods that do not terminate come first."""
+    """Return the address of an instance's pod, even if the pod is not ready. Prefer pods that do not terminate."""
     present = [pod for pod in pods if pod.instance == instance and pod.ip and not pod.finished]
     return min(present, key=lambda pod: (pod.terminating, pod.ip)).ip if present else None
 
@@ -129,5 +131,5 @@ def retargeted(services: Iterable[Body], pods: Sequence[PodView]) -> list[Body]:
 
 
 def _target(instance: str, pods: Iterable[PodView]) -> str | None:
-    """Return the address of the pod of an instance that takes calls. Of several, the lowest, so that it stays the same."""
+    """Return the lowest address of the instance's pods that take calls, so that the result is stable, or None."""
     return min((pod.ip for pod in pods if pod.instance == instance and pod.takes_calls and pod.ip), default=None)

@@ -20,8 +20,8 @@ from fractus_core.api import DirectLink, Drone, EdgeNode, InvalidObject, NodeGra
 from fractus_core.api.grants import NODE_GRANTS_NAMESPACE, NodeGrantsStatus, ReportedGrant, unpack
 from fractus_core.api.model import API_VERSION, GROUP
 from fractus_core.api.names import NODE_SIGNER
+from fractus_runtime.backoff import Backoff
 from fractus_runtime.kubernetes import (
-    Backoff,
     Body,
     Client,
     Conflict,

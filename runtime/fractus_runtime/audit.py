@@ -12,7 +12,7 @@ import os
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
@@ -88,7 +88,7 @@ class AuditLog:
         segment_bytes: Size at which the file is closed and the next one begins.
         keep: Number of closed segments to keep.
         tls: Directory of the node's key and certificate, which sign checkpoints. None for a log without checkpoints.
-        on_entry: Called with each entry, including time and kind, before the entry is written. Must not block.
+        listeners: Called in order with each entry, including time and kind, before the entry is written. They must not block.
     """
 
     def __init__(
@@ -99,9 +99,9 @@ class AuditLog:
         segment_bytes: int = MAX_SEGMENT_BYTES,
         keep: int = MAX_SEGMENTS,
         tls: Path | None = None,
-        on_entry: Callable[[dict[str, Any]], None] = lambda _entry: None,
+        listeners: Sequence[Callable[[dict[str, Any]], None]] = (),
     ) -> None:
-        self._on_entry = on_entry
+        self._listeners = tuple(listeners)
         self._path = path
         self._clock = clock
         self._segment_bytes = segment_bytes
@@ -166,7 +166,8 @@ class AuditLog:
         entry = _PendingEntry(self._timestamp(), kind, _finite_json(content))
         # Raises in the caller instead of the thread if the content is not JSON.
         canonical(entry.content)
-        self._on_entry({"time": entry.time, "kind": kind, **entry.content})
+        for listener in self._listeners:
+            listener({"time": entry.time, "kind": kind, **entry.content})
         with self._changed:
             if len(self._waiting) >= MAX_WAITING:
                 self._lost += 1

@@ -48,7 +48,10 @@ _Stamp = tuple[tuple[int, int, int], ...]
 def backoff(
     first_s: float = 0.1, cap_s: float = MAX_RETRY_DELAY_S, rng: random.Random | None = None
 ) -> Iterator[float]:
-    """Yield delays in seconds that double from `first_s` to `cap_s`, each reduced by a random jitter of up to 50 %."""
+    """Yield delays in seconds that double from `first_s` to `cap_s`, each reduced by a random jitter of up to 50 %.
+
+    `fractus_runtime.backoff` has the same delays for services, agent and operator. The SDK imports only the generated stubs.
+    """
     draw = (rng or random).uniform
     delay = first_s
     while True:

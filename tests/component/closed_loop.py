@@ -32,7 +32,7 @@ from fractus_services.mobility.mavlink.fence import MissionFence
 from fractus_services.mobility.mavlink.mavlink_autopilot import MavlinkAutopilot
 from fractus_services.mobility.mavlink.rtl_parameters import RtlParameters
 from fractus_services.mobility.mavlink.vehicle_identification import KnownVehicleFile
-from fractus_services.mobility.rpc.components import MobilityComponents
+from fractus_services.mobility.rpc.mobility_components import MobilityComponents
 from fractus_vehicle.earth import Place
 from fractus_vehicle.simulation import Simulation
 from fractus_vehicle.state import CONTROL_STEP_S, VehicleConfig, VehicleState

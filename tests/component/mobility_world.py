@@ -27,7 +27,7 @@ from fractus_services.mobility.mavlink.failsafes import MavlinkFailsafes
 from fractus_services.mobility.mavlink.mavlink_autopilot import MavlinkAutopilot
 from fractus_services.mobility.mavlink.rtl_parameters import RtlParameters
 from fractus_services.mobility.mavlink.timing import PROBE_S
-from fractus_services.mobility.rpc.components import MobilityComponents
+from fractus_services.mobility.rpc.mobility_components import MobilityComponents
 from parameter_vehicle import FAILSAFES, MOVEMENT, told
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 

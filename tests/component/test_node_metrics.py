@@ -21,8 +21,8 @@ from fractus_core.linking import NO_LINK, PathMetrics, Peer
 from fractus_runtime.audit import AuditLog
 from fractus_runtime.metrics import metrics_text
 from fractus_services.grant_files import GrantFiles
-from fractus_services.metrics import MAX_POLICIES, ServiceMetrics, common_metrics
 from fractus_services.mobility.rpc.flight_metrics import flight_metrics
+from fractus_services.service_metrics import MAX_POLICIES, ServiceMetrics, common_metrics
 from mobility_world import World, spec
 from prometheus_client import Metric
 from scraping import assert_documented, values
@@ -71,7 +71,7 @@ def test_decision_metrics_limit_the_number_of_policy_labels() -> None:
 
 def test_mobility_service_metrics_equal_their_documentation(tmp_path: Path) -> None:
     metrics = ServiceMetrics()
-    audit = AuditLog(tmp_path / "audit.jsonl", lambda: 1_780_000_000.0, on_entry=metrics.take_entry)
+    audit = AuditLog(tmp_path / "audit.jsonl", lambda: 1_780_000_000.0, listeners=(metrics.take_entry,))
     grants = cast(GrantFiles, SimpleNamespace(active={"a": None, "b": None}))
     problem = [""]
     metrics.add_callback(lambda: common_metrics(lambda: 2e9, grants, audit, lambda: problem[0]))

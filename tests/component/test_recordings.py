@@ -592,7 +592,7 @@ def test_agent_reads_recording_problems_of_services(tmp_path: Path, monkeypatch:
 
 async def test_audit_entries_are_passed_to_the_recorder(tmp_path: Path) -> None:
     copied: list[dict[str, Any]] = []
-    log = AuditLog(tmp_path / "audit.jsonl", lambda: 1_780_000_000.0, on_entry=copied.append)
+    log = AuditLog(tmp_path / "audit.jsonl", lambda: 1_780_000_000.0, listeners=(copied.append,))
     log.append("control", {"action": "takenOver"})
     await log.close()
     assert copied == [{"time": "2026-05-28T20:26:40.000+00:00", "kind": "control", "action": "takenOver"}]

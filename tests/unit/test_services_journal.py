@@ -11,12 +11,12 @@ from typing import Any
 
 import pytest
 from fractus_core.control import Mission, Outcome, OutcomeKind
-from fractus_services.mobility.authority.journal import Journal, Record
+from fractus_services.mobility.authority.journal import Journal, JournalContent
 
 
-def record(**changes: Any) -> Record:
+def record(**changes: Any) -> JournalContent:
     """Return a record with one mission, which is active."""
-    return Record({"k": replace(Mission("k", "id", home=(39.0, 22.0, 10.0)), **changes)}, "k")
+    return JournalContent({"k": replace(Mission("k", "id", home=(39.0, 22.0, 10.0)), **changes)}, "k")
 
 
 async def saved_journal(directory: Path) -> Journal:
@@ -54,7 +54,7 @@ async def test_journal_reads_format_version_1(tmp_path: Path, stored: str, outco
     body = {"version": 1, "active": "k", "missions": [{**mission, "home": [39, 22, 10]}]}
     (tmp_path / "journal.json").write_text(json.dumps(body))
     found = Journal(tmp_path).record
-    assert found == Record({"k": Mission("k", "id", outcome, 2, 3, True, (39.0, 22.0, 10.0), True)}, "k")
+    assert found == JournalContent({"k": Mission("k", "id", outcome, 2, 3, True, (39.0, 22.0, 10.0), True)}, "k")
 
 
 @pytest.mark.parametrize("odd", ["lost in space", {"kind": "lost", "reason": ""}, {"kind": "failed"}, 7, ["failed"]])
@@ -70,7 +70,7 @@ async def test_journal_logs_loss_of_both_copies(tmp_path: Path, caplog: pytest.L
     await saved_journal(tmp_path)
     for name in ("journal.json", "journal.last.json"):
         (tmp_path / name).write_bytes(b"{")
-    assert Journal(tmp_path).record == Record()
+    assert Journal(tmp_path).record == JournalContent()
     assert "remove Grants that must not fly again" in caplog.text
 
 

@@ -8,7 +8,6 @@ from fractus_runtime.kubernetes.access import (
     kubeconfig,
     with_certificate,
 )
-from fractus_runtime.kubernetes.backoff import Backoff
 from fractus_runtime.kubernetes.blocking import BlockingClient
 from fractus_runtime.kubernetes.client import POD, Client, Page
 from fractus_runtime.kubernetes.connection import ContentType
@@ -21,7 +20,6 @@ __all__ = [
     "LEASE",
     "POD",
     "Access",
-    "Backoff",
     "BlockingClient",
     "Body",
     "Client",

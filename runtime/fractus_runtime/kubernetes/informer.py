@@ -9,7 +9,7 @@ import random
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping
 from typing import Generic, TypeVar
 
-from fractus_runtime.kubernetes.backoff import Backoff
+from fractus_runtime.backoff import Backoff
 from fractus_runtime.kubernetes.client import Client
 from fractus_runtime.kubernetes.errors import Expired, KubeError
 from fractus_runtime.kubernetes.objects import Body, Key, Kind, key_of, version_number, version_of

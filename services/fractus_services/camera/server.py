@@ -38,11 +38,11 @@ from fractus_services.decision_log import log_decision
 from fractus_services.grant_files import GrantFiles
 from fractus_services.grant_verifier import GrantVerifier
 from fractus_services.grpc_server import CallAdmission, run_until, serve_grpc
-from fractus_services.metrics import ServiceMetrics, common_metrics, telemetry_age
 from fractus_services.node_description import NodeDescription
 from fractus_services.options import CannotServe
 from fractus_services.recording.recorder import Recorder
 from fractus_services.recording.segment_directory import segments_in
+from fractus_services.service_metrics import ServiceMetrics, common_metrics, telemetry_age
 
 log = logging.getLogger(__name__)
 
@@ -109,12 +109,9 @@ async def run(settings: CameraSettings, stop: asyncio.Event) -> None:
     )
     metrics = ServiceMetrics()
 
-    def on_audit_entry(entry: dict[str, Any]) -> None:
-        metrics.take_entry(entry)
-        recorder.take_entry(entry)
-        log_decision(entry)
-
-    audit = AuditLog(settings.audit, clock, tls=settings.tls, on_entry=on_audit_entry)
+    audit = AuditLog(
+        settings.audit, clock, tls=settings.tls, listeners=(metrics.take_entry, recorder.take_entry, log_decision)
+    )
     grants = GrantFiles(
         settings.grants, node, GrantVerifier(settings.tls, settings.grant_memory), refused=audit.refused_grant
     )

@@ -19,6 +19,8 @@ from fractus_core.policy.decision_types import STATIONARY_MPS, Airframe, Attitud
 from fractus_core.policy.return_route import ReturnBounds
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from fractus_services.grant_files import ActiveGrant
+
 Permit = Callable[[], None]
 """Called before each transmission of a command. Raises an exception if the command must no longer be sent."""
 
@@ -388,6 +390,22 @@ class Fence(Protocol):
 
     async def hold(self) -> tuple[str, ...]:
         """Restore what another station changed of the mission's fence, and return the changes as sentences."""
+
+
+@dataclass(frozen=True, slots=True)
+class Safeguards:
+    """Protection by the autopilot itself if this service fails in flight.
+
+    Attributes:
+        failsafes: Failsafes of the autopilot.
+        fence: Fence of the vehicle.
+        limit_return: Limits altitude and speed of the autopilot's own return to what a Grant allows, and returns the changes as
+            sentences.
+    """
+
+    failsafes: Failsafes
+    fence: Fence
+    limit_return: Callable[[ActiveGrant], Awaitable[tuple[str, ...]]]
 
 
 Approach = Callable[[TaskKind, Callable[[], bool], int], Awaitable[FlightMode]]

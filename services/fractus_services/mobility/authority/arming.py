@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import math
-from collections.abc import AsyncGenerator, Awaitable, Callable
+from collections.abc import AsyncGenerator, Callable
 
 from fractus_core.control import Mission
 from fractus_core.control.events import ArmingPrepared, ArmingRequested, MotorStart
@@ -15,7 +15,7 @@ from fractus_core.geo import LocalFrame
 from fractus_services.errors import AutopilotError, PreconditionFailed, Refused, Unavailable
 from fractus_services.grant_files import ActiveGrant
 from fractus_services.mobility.authority.control_store import ControlStore
-from fractus_services.mobility.autopilot import BEING_SET, Checked, Failsafes, Fence, Permit
+from fractus_services.mobility.autopilot import BEING_SET, Checked, Permit, Safeguards
 from fractus_services.mobility.settings import SETTINGS
 
 _TRANSIENT_CODES = frozenset(
@@ -30,22 +30,12 @@ class Arming:
 
     Args:
         control: Control state.
-        failsafes: Failsafes of the autopilot.
-        fence: Fence of the vehicle.
-        limit_return: Limits altitude and speed of the autopilot's own return to what a grant allows.
+        safeguards: Failsafes, fence and return limits of the autopilot.
     """
 
-    def __init__(
-        self,
-        control: ControlStore,
-        failsafes: Failsafes,
-        fence: Fence,
-        limit_return: Callable[[ActiveGrant], Awaitable[tuple[str, ...]]],
-    ) -> None:
+    def __init__(self, control: ControlStore, safeguards: Safeguards) -> None:
         self._control = control
-        self._failsafes = failsafes
-        self._fence = fence
-        self._limit_return = limit_return
+        self._safeguards = safeguards
 
     async def arm(
         self, grant: ActiveGrant, permit: Permit, judge: Callable[[], object], patience_s: float
@@ -155,22 +145,24 @@ class Arming:
         """
         at_home = self._control.autopilot.vehicle.distance_m(home[0], home[1]) <= SETTINGS.at_home_m
         checked = self._require_verified()
-        checked = self._update_checked(checked, await self._failsafes.choose_return(checked, retrace=at_home))
+        checked = self._update_checked(
+            checked, await self._safeguards.failsafes.choose_return(checked, retrace=at_home)
+        )
         try:
             async with asyncio.timeout(SETTINGS.fence_timeout_s):
-                await self._fence.raise_around(grant.spec, retraces=self._control.retraces)
+                await self._safeguards.fence.raise_around(grant.spec, retraces=self._control.retraces)
         except (AutopilotError, OSError) as error:
             problem = str(error) or f"timeout after {SETTINGS.fence_timeout_s:.0f} s"
             reason = f"the vehicle's own fence cannot be raised around the operation area: {problem}"
             raise PreconditionFailed("FenceNotRaised", reason) from error
         self._require_verified(checked)
         try:
-            lowered = await self._limit_return(grant)
+            lowered = await self._safeguards.limit_return(grant)
         except (AutopilotError, OSError) as error:
             reason = f"cannot limit speed and altitude of the autopilot's return: {error}"
             raise PreconditionFailed("ReturnNotLimited", reason) from error
-        if lowered or not self._fence.missing:
-            checked = self._update_checked(checked, await self._failsafes.learn_return(checked))
+        if lowered or not self._safeguards.fence.missing:
+            checked = self._update_checked(checked, await self._safeguards.failsafes.learn_return(checked))
         return checked
 
     def _update_checked(self, before: Checked, after: Checked) -> Checked:

@@ -19,7 +19,7 @@ _FIELDS = frozenset(field.name for field in fields(Mission))
 
 
 @dataclass(frozen=True, slots=True)
-class Record:
+class JournalContent:
     """Content of the journal.
 
     Attributes:
@@ -66,19 +66,19 @@ def _stored(mission: Mission) -> dict[str, Any]:
     return asdict(replace(mission, outcome=None)) | {"outcome": stored}
 
 
-def _read(path: Path) -> Record:
+def _read(path: Path) -> JournalContent:
     try:
         stored = json.loads(path.read_bytes())
     except RecursionError:
         raise ValueError("nested too deeply") from None
     missions = {m["key"]: _mission(m) for m in stored["missions"]}
     # Earlier releases did not record who armed.
-    return Record(missions, stored["active"], bool(stored.get("armed_by_others", False)))
+    return JournalContent(missions, stored["active"], bool(stored.get("armed_by_others", False)))
 
 
-def record_of(state: ControlState) -> Record:
+def record_of(state: ControlState) -> JournalContent:
     """Return the part of the control state that the journal stores."""
-    return Record(state.missions, state.active, state.armed_by_others)
+    return JournalContent(state.missions, state.active, state.armed_by_others)
 
 
 class Journal:
@@ -98,7 +98,7 @@ class Journal:
         self._lock = asyncio.Lock()
         self._queued: asyncio.Task[None] | None = None
         self._tasks: set[asyncio.Task[None]] = set()
-        self.record = Record()
+        self.record = JournalContent()
         self.failure = ""
         directory.mkdir(parents=True, exist_ok=True)
         remove_temporary(self._path)
@@ -121,7 +121,7 @@ class Journal:
                 "journal: previous missions are unknown, including ended ones; remove Grants that must not fly again"
             )
 
-    async def save(self, record: Record, timeout_s: float | None = None) -> None:
+    async def save(self, record: JournalContent, timeout_s: float | None = None) -> None:
         """Write the record. When this returns, it is on disk or `failure` is set.
 
         The write continues if the caller is cancelled or the time is over.
@@ -133,7 +133,7 @@ class Journal:
         except TimeoutError:
             self.failure = f"the journal {self._path} was not written within {timeout_s:g} s"
 
-    def save_soon(self, record: Record) -> asyncio.Task[None]:
+    def save_soon(self, record: JournalContent) -> asyncio.Task[None]:
         """Write in the background. At most one write runs and one waits. The waiting one writes the latest record."""
         self.record = record
         if self._queued is None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import logging
 import math
-from collections.abc import Awaitable, Callable
 from contextlib import suppress
 from dataclasses import replace
 
@@ -15,7 +14,7 @@ from fractus_core.policy.decision_types import Verdict
 from fractus_services.errors import AutopilotError
 from fractus_services.grant_files import ActiveGrant
 from fractus_services.mobility.authority.control_store import ControlStore
-from fractus_services.mobility.autopilot import BEING_SET, Failsafes, Fence
+from fractus_services.mobility.autopilot import BEING_SET, Safeguards
 from fractus_services.mobility.settings import SETTINGS
 
 log = logging.getLogger(__name__)
@@ -26,22 +25,12 @@ class VehicleObserver:
 
     Args:
         control: Control state.
-        failsafes: Failsafes of the autopilot, set when it connects and verified in flight.
-        fence: Fence of the vehicle, verified in flight.
-        limit_return: Limits altitude and speed of the autopilot's own return to what a grant allows.
+        safeguards: Failsafes, fence and return limits of the autopilot.
     """
 
-    def __init__(
-        self,
-        control: ControlStore,
-        failsafes: Failsafes,
-        fence: Fence,
-        limit_return: Callable[[ActiveGrant], Awaitable[tuple[str, ...]]],
-    ) -> None:
+    def __init__(self, control: ControlStore, safeguards: Safeguards) -> None:
         self._control = control
-        self._failsafes = failsafes
-        self._fence = fence
-        self._limit_return = limit_return
+        self._safeguards = safeguards
         self._preparing: asyncio.Task[None] | None = None
         self._changed = asyncio.Event()
         self._verified_at = -math.inf
@@ -104,11 +93,11 @@ class VehicleObserver:
         """Handle a parameter change by another station: update the known values and restore required ones."""
         control = self._control
         checked = control.checked
-        if checked is None or not self._failsafes.concerns(name):
+        if checked is None or not self._safeguards.failsafes.concerns(name):
             return
         log.warning("observer: parameter changed by another station (name=%s)", name)
         flying = control.autopilot.vehicle.armed
-        control.checked = self._failsafes.learn(checked) if flying else replace(checked, problem=BEING_SET)
+        control.checked = self._safeguards.failsafes.learn(checked) if flying else replace(checked, problem=BEING_SET)
         self._changed.set()
 
     async def _prepare(self) -> None:
@@ -150,7 +139,7 @@ class VehicleObserver:
         self._verified_at = -math.inf
         if flying and self._unverified_since is None:
             self._unverified_since = control.autopilot.now
-        checked = await self._failsafes.configure(flying=flying, before=before)
+        checked = await self._safeguards.failsafes.configure(flying=flying, before=before)
         if not checked.lost:
             self._unverified_since = None
         if not flying:
@@ -168,7 +157,7 @@ class VehicleObserver:
                 problems.append("" if error.link else str(error))
             except OSError as error:
                 problems.append(f"cannot store the owner's settings: {error}")
-        checked = self._failsafes.learn(checked)
+        checked = self._safeguards.failsafes.learn(checked)
         control.checked = checked
         for setting in restored:
             control.note("restored", f"set back in flight: {setting}", "SettingChanged")
@@ -189,12 +178,12 @@ class VehicleObserver:
     async def _keep_return(self) -> tuple[str, ...]:
         control = self._control
         if control.last_grant is not None:
-            for setting in await self._limit_return(control.last_grant):
+            for setting in await self._safeguards.limit_return(control.last_grant):
                 control.note("limited", f"flight and return of the autopilot: {setting}", "ReturnLimited")
         return ()
 
     async def _keep_fence(self) -> tuple[str, ...]:
-        return await self._fence.hold() if self._fence.raised else ()
+        return await self._safeguards.fence.hold() if self._safeguards.fence.raised else ()
 
     def _verification_due(self) -> bool:
         control = self._control

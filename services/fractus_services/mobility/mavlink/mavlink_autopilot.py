@@ -18,10 +18,10 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fractus_services.errors import AutopilotError
 from fractus_services.mobility.autopilot import COURSE_S, LEG_MPS, Permit, VehicleState, always
+from fractus_services.mobility.mavlink.autopilot_link import AutopilotLink, ignore
 from fractus_services.mobility.mavlink.companion import SYSTEM_ID
 from fractus_services.mobility.mavlink.flight_stack import FlightStack
 from fractus_services.mobility.mavlink.gimbal import point
-from fractus_services.mobility.mavlink.link import Link, ignore
 from fractus_services.mobility.mavlink.parameters import Parameters
 from fractus_services.mobility.mavlink.telemetry_requests import HomePositionMonitor, TelemetryRates
 from fractus_services.mobility.mavlink.timing import Timing
@@ -221,13 +221,13 @@ def moves(velocity: Velocity) -> bool:
     return math.hypot(north, east) >= STATIONARY_MPS or abs(down) >= STATIONARY_MPS
 
 
-class MavlinkAutopilot(Link):
+class MavlinkAutopilot(AutopilotLink):
     """One vehicle behind one link, and its commands. Commands and setpoints appear in the traces of the calls that caused them.
 
     Args:
         url: URL of the autopilot, see `open_link`.
         stack: Firmware of the autopilot.
-        alive, on_found, on_heartbeat, sysid, known_vehicle, received, sent: See `Link`.
+        alive, on_found, on_heartbeat, sysid, known_vehicle, received, sent: See `AutopilotLink`.
         on_parameter: Callback invoked with the name of a parameter that another station changed.
 
     Attributes:

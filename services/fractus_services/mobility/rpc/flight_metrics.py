@@ -8,9 +8,9 @@ from fractus_core.control import Authority
 from fractus_runtime.metrics import gauge
 from prometheus_client import Metric
 
-from fractus_services.metrics import telemetry_age
 from fractus_services.mobility.authority.control_store import ControlStore
 from fractus_services.mobility.authority.supervisor import Supervisor
+from fractus_services.service_metrics import telemetry_age
 
 
 def flight_metrics(control: ControlStore, supervisor: Supervisor) -> Iterator[Metric]:

@@ -19,7 +19,6 @@ from fractus_services.decision_log import log_decision
 from fractus_services.grant_files import GrantFiles
 from fractus_services.grant_verifier import GrantVerifier
 from fractus_services.grpc_server import run_until, serve_grpc
-from fractus_services.metrics import ServiceMetrics, common_metrics
 from fractus_services.mobility.authority.journal import Journal
 from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
 from fractus_services.mobility.mavlink.failsafes import MavlinkFailsafes
@@ -28,14 +27,15 @@ from fractus_services.mobility.mavlink.mavlink_autopilot import MavlinkAutopilot
 from fractus_services.mobility.mavlink.rtl_parameters import RtlParameters
 from fractus_services.mobility.mavlink.startup_heartbeat import VEHICLE_FILE, mark_served
 from fractus_services.mobility.mavlink.vehicle_identification import KnownVehicleFile
-from fractus_services.mobility.rpc.components import MobilityComponents
 from fractus_services.mobility.rpc.flight_metrics import flight_metrics
 from fractus_services.mobility.rpc.handlers import MobilityHandlers
+from fractus_services.mobility.rpc.mobility_components import MobilityComponents
 from fractus_services.node_description import NodeDescription
 from fractus_services.options import CannotServe, MobilityOptions
 from fractus_services.recording.mavlink_messages import MavlinkDecoder
 from fractus_services.recording.recorder import Recorder
 from fractus_services.recording.segment_directory import segments_in
+from fractus_services.service_metrics import ServiceMetrics, common_metrics
 
 log = logging.getLogger(__name__)
 
@@ -141,12 +141,9 @@ async def run(options: MobilityOptions, stop: asyncio.Event) -> None:
     recorder = Recorder(segments_in(options.recordings, options.recordings_mb), node, MavlinkDecoder(node))
     metrics = ServiceMetrics()
 
-    def recorded(entry: dict[str, Any]) -> None:
-        metrics.take_entry(entry)
-        recorder.take_entry(entry)
-        log_decision(entry)
-
-    audit = AuditLog(options.audit, clock, tls=options.tls, on_entry=recorded)
+    audit = AuditLog(
+        options.audit, clock, tls=options.tls, listeners=(metrics.take_entry, recorder.take_entry, log_decision)
+    )
     verifier = GrantVerifier(options.tls, options.grant_memory)
     grants = GrantFiles(options.grants, node, verifier, options.flat_terrain, audit.refused_grant)
     found = asyncio.Event()

@@ -5,10 +5,10 @@ from __future__ import annotations
 import asyncio
 import logging
 import math
-import random
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 
+from fractus_runtime.backoff import Backoff
 from fractus_runtime.mavlink_codec import Endpoint, Message, message
 
 from fractus_services.errors import AutopilotError
@@ -62,7 +62,7 @@ class MessageSubscriptions:
             self._open.remove(subscription)
 
 
-class Link:
+class AutopilotLink:
     """Connection to one vehicle.
 
     Args:
@@ -149,7 +149,7 @@ class Link:
         Raises:
             BadUrl: The URL is invalid.
         """
-        delay = BACKOFF_S[0]
+        backoff = Backoff(*BACKOFF_S)
         logged = ""
         while True:
             try:
@@ -166,11 +166,10 @@ class Link:
                     logged = problem
             else:
                 logged = ""
-                delay = BACKOFF_S[0]
+                backoff.succeeded()
                 await self._serve()
                 log.warning("link: connection to the autopilot broke (url=%s)", self.url)
-            await asyncio.sleep(delay * random.uniform(0.5, 1.0))  # noqa: S311 - jitter
-            delay = min(delay * 2, BACKOFF_S[1])
+            await asyncio.sleep(backoff.delay_s())
 
     async def _serve(self) -> None:
         """Send heartbeats and probes until the connection breaks or the vehicle is silent."""

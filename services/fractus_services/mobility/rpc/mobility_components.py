@@ -15,7 +15,7 @@ from fractus_services.mobility.authority.control_store import ControlStore
 from fractus_services.mobility.authority.journal import Journal
 from fractus_services.mobility.authority.supervisor import Supervisor
 from fractus_services.mobility.authority.vehicle_observer import VehicleObserver
-from fractus_services.mobility.autopilot import Autopilot, Failsafes, Fence, ReturnLimits
+from fractus_services.mobility.autopilot import Autopilot, Failsafes, Fence, ReturnLimits, Safeguards
 from fractus_services.mobility.flight.authorization import CallAuthorizer, PolicyGate
 from fractus_services.mobility.flight.monitor import MotionMonitor
 from fractus_services.mobility.flight.poi_mission import PoiMissions
@@ -71,7 +71,8 @@ class MobilityComponents:
         def limit_return(grant: ActiveGrant) -> Awaitable[tuple[str, ...]]:
             return limits.limit(return_bounds(gate.situation(), control.for_transit(grant)))
 
-        arming = Arming(control, failsafes, fence, limit_return)
+        safeguards = Safeguards(failsafes, fence, limit_return)
+        arming = Arming(control, safeguards)
         transit = TransitFlight(control, arming, gate, routes)
         self.control = control
         self.gate = gate
@@ -80,5 +81,5 @@ class MobilityComponents:
         self.poi_missions = PoiMissions(control, grants, transit.launch, routes, boarding_s)
         self.supervisor = Supervisor(control, fence, limits)
         self.monitor = MotionMonitor(control, gate, audit, self.supervisor, return_flight)
-        self.observer = VehicleObserver(control, failsafes, fence, limit_return)
+        self.observer = VehicleObserver(control, safeguards)
         grants.listen(self.observer.grant_changed)

@@ -1,4 +1,7 @@
-"""Exponential back-off with jitter and a maximum."""
+"""Exponential back-off with jitter and a maximum.
+
+The SDK must not import this package and has a back-off of its own (`fractus.channel.backoff`).
+"""
 
 from __future__ import annotations
 

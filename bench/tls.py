@@ -31,7 +31,7 @@ from fractus_cluster.ports import free_port
 from fractus_core.api import Grant
 from fractus_core.api.names import node_server_name
 from fractus_proto.v1 import camera_pb2, camera_pb2_grpc
-from fractus_services import admission
+from fractus_services import grpc_server
 from fractus_services.auth import Caller
 from fractus_services.commands import camera
 from skimage.data import astronaut
@@ -100,7 +100,7 @@ def serve_plainly(arguments: list[str]) -> None:
         return made
 
     grpc.aio.server = server
-    admission.Callers.of = lambda _self, _context, _urgent: Caller(IDENTITY, math.inf)
+    grpc_server.Callers.of = lambda _self, _context, _urgent: Caller(IDENTITY, math.inf)
     camera(arguments)
 
 

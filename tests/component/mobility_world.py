@@ -20,7 +20,7 @@ from fractus_runtime.mavlink_codec import Message, message
 from fractus_services.errors import Refused
 from fractus_services.grant_files import ActiveGrant
 from fractus_services.mobility.authority.journal import Journal
-from fractus_services.mobility.autopilot import COURSE_S, Checked
+from fractus_services.mobility.autopilot import VELOCITY_HISTORY_S, FailsafeStatus
 from fractus_services.mobility.flight.service import Progress
 from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
 from fractus_services.mobility.mavlink.failsafes import MavlinkFailsafes
@@ -83,7 +83,7 @@ class Plane(MavlinkAutopilot):
         vehicle.position_error_m = 0.5
         vehicle.ready = True
         vehicle.estimated = True
-        vehicle.received_at = math.inf
+        vehicle.gps_at = math.inf
         vehicle.home = Home(39.36, 22.95, GROUND_M)
         self.home_amsl_m = GROUND_M
 
@@ -253,9 +253,9 @@ class Plane(MavlinkAutopilot):
             vehicle.down_mps,
         ) = state  # fmt: skip
         if self.measured:
-            vehicle.courses.append((boot_ms / 1e3, vehicle.north_mps, vehicle.east_mps))
-            while vehicle.courses[0][0] < boot_ms / 1e3 - COURSE_S:
-                vehicle.courses.popleft()
+            vehicle.velocity_history.append((boot_ms / 1e3, vehicle.north_mps, vehicle.east_mps))
+            while vehicle.velocity_history[0][0] < boot_ms / 1e3 - VELOCITY_HISTORY_S:
+                vehicle.velocity_history.popleft()
         vehicle.position_at = self.now - late_s
         vehicle.heartbeat_at = vehicle.landed_at = vehicle.checks_at = vehicle.estimated_at = self.now
         vehicle.landed_state = 2 if vehicle.amsl_m > GROUND_M + 0.2 else 1
@@ -346,7 +346,7 @@ class World:
         self.monitor = parts.monitor
         self.supervisor = parts.supervisor
         self.observer = parts.observer  # fmt: skip
-        self.control.checked = Checked("", (), Airframe(retraces=retraces), 8.0, retraces)
+        self.control.failsafe_status = FailsafeStatus("", (), Airframe(retraces=retraces), 8.0, retraces)
         self.plane.on_parameter = self.observer.parameter
         self._tasks = [asyncio.ensure_future(part) for part in (self.plane.run(), self.monitor.run(), self.tours.run())]
         self.events: list[ControlEvent] = []

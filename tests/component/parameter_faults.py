@@ -99,7 +99,7 @@ async def _wrong(rng: random.Random) -> str:
     expected["accel_mps2"] = min(expected["accel_mps2"], 9.81 * math.tan(math.radians(braking_deg)))
     parameters = _Parameters(values, lost)
     autopilot: Any = SimpleNamespace(
-        stack=ARDUCOPTER, vehicle_parameters=parameters, vehicle=SimpleNamespace(foreign="")
+        stack=ARDUCOPTER, vehicle_parameters=parameters, vehicle=SimpleNamespace(unsupported="")
     )
     checked = await MavlinkFailsafes(autopilot).configure()
     if not known:

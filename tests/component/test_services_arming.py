@@ -11,7 +11,7 @@ from fractus_core.api.grants import GrantSpec
 from fractus_core.control.events import Airborne, ArmingRequested
 from fractus_core.policy.decision_types import Airframe, TakeoffArgs
 from fractus_services.errors import AutopilotError
-from fractus_services.mobility.autopilot import Checked
+from fractus_services.mobility.autopilot import FailsafeStatus
 from mobility_world import BRAKE, World, end, partial, refusal, spec
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from virtual_time import fly
@@ -65,14 +65,14 @@ def test_queued_arming_is_refused_after_driver_returns_control(tmp_path: Path) -
     fly(flight)
 
 
-FRESH = Checked("", (), Airframe(retraces=True), 8.0, remembers=True)
+FRESH = FailsafeStatus("", (), Airframe(retraces=True), 8.0, records_path=True)
 """Failsafe verification after a reconnect, without the return mode chosen for this flight."""
 
 
 @pytest.mark.parametrize("verified", [None, FRESH])
 @pytest.mark.parametrize("during", ["choice", "fence", "mode"])
 def test_arming_is_refused_if_failsafe_verification_changes_meanwhile(
-    tmp_path: Path, during: str, verified: Checked | None
+    tmp_path: Path, during: str, verified: FailsafeStatus | None
 ) -> None:
     async def flight() -> None:
         async with World(tmp_path, retraces=True) as world:
@@ -85,16 +85,16 @@ def test_arming_is_refused_if_failsafe_verification_changes_meanwhile(
             raise_around = world.fence.raise_around
 
             async def chosen(name: str, value: float) -> float:
-                control.checked = verified
+                control.failsafe_status = verified
                 return await write(name, value)
 
             async def raised(grant: GrantSpec, *, retraces: bool) -> None:
-                control.checked = verified
+                control.failsafe_status = verified
                 await raise_around(grant, retraces=retraces)
 
             async def changed(mode: Any, *_: object) -> None:
                 await set_mode(mode)
-                control.checked = verified
+                control.failsafe_status = verified
 
             if during == "choice":
                 control.dispatch(ArmingRequested(grant.key, grant.identity, (39.3604, 22.95, 10.0)))
@@ -116,7 +116,7 @@ def test_arming_is_refused_if_failsafe_verification_changes_meanwhile(
             plane._obey = noted  # type: ignore[method-assign]
             why = await refusal(world.service.arm(grant))
             assert why.verdict.code == "FailsafesNotVerified"
-            assert control.checked is verified, "the newer verification is kept"
+            assert control.failsafe_status is verified, "the newer verification is kept"
             assert 1 not in motors
 
     fly(flight)
@@ -128,7 +128,9 @@ def test_return_mode_is_kept_after_link_reconnects_in_flight(tmp_path: Path) -> 
             control = world.control
             plane = world.plane
             plane.parameters |= {"SRTL_POINTS": 300.0, "SYSID_MYGCS": 244.0, "WPNAV_ACCEL": 100.0}
-            control.checked = Checked("", (), Airframe(retraces=True, accel_mps2=1.0), 8.0, remembers=True)
+            control.failsafe_status = FailsafeStatus(
+                "", (), Airframe(retraces=True, accel_mps2=1.0), 8.0, records_path=True
+            )
             grant = world.grants.put(spec())
             await world.drive(grant)
             control.dispatch(ArmingRequested(grant.key, grant.identity, (39.3604, 22.95, 10.0)))
@@ -137,9 +139,9 @@ def test_return_mode_is_kept_after_link_reconnects_in_flight(tmp_path: Path) -> 
             await end(world.service.take_off(grant, TakeoffArgs(10.0)))
             assert plane.parameters["FS_GCS_ENABLE"] == 1.0
             world.observer.found()
-            assert control.checked.problem
+            assert control.failsafe_status.problem
             assert world.gate.situation().airframe.accel_mps2 == 1.0, "the known acceleration is kept"
-            await world.until(lambda: control.checked is not None and not control.checked.problem, 10)
+            await world.until(lambda: control.failsafe_status is not None and not control.failsafe_status.problem, 10)
             assert plane.parameters["FS_GCS_ENABLE"] == 1.0
             assert not control.retraces
             assert world.gate.situation().airframe.accel_mps2 == 1.0

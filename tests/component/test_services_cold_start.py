@@ -10,7 +10,7 @@ import pytest
 from closed_loop import Account, Drone, Sky, Weather
 from depth import cells
 from fractus_core.control import StreamState
-from fractus_services.mobility.autopilot import Checked
+from fractus_services.mobility.autopilot import FailsafeStatus
 from mobility_world import spec
 
 SLOW = {"WPNAV_ACCEL": 100.0, "PSC_JERK_XY": 3.0, "WPNAV_SPEED": 600.0, "GUID_TIMEOUT": 3.0, "FS_GCS_ENABLE": 0.0}
@@ -21,7 +21,7 @@ async def until(condition: Callable[[], object]) -> None:
         await asyncio.sleep(0.1)
 
 
-async def armed(sky: Sky, directory: Path) -> Checked:
+async def armed(sky: Sky, directory: Path) -> FailsafeStatus:
     """Return the verified vehicle parameters at the time of arming."""
     drone = Drone(directory, Account(0))
     turning = asyncio.ensure_future(sky.turn())
@@ -32,8 +32,8 @@ async def armed(sky: Sky, directory: Path) -> Checked:
             await until(lambda: drone.state is StreamState.GRANTED)
             assert sky.truth.home is not None, "control was granted before the vehicle was ready"
             await drone.service.arm(grant, 120.0)
-        assert drone.control.checked is not None
-        return drone.control.checked
+        assert drone.control.failsafe_status is not None
+        return drone.control.failsafe_status
     finally:
         for task in (following, turning):
             task.cancel()

@@ -200,11 +200,11 @@ def test_failsafe_setup_is_retried_after_missing_parameter(tmp_path: Path) -> No
             plane.parameters |= {"SYSID_MYGCS": 244.0}
             lost = plane.parameters.pop("FS_GCS_ENABLE")
             world.observer.found()
-            await world.until(lambda: control.checked is not None)
-            assert control.checked is not None
-            assert "FS_GCS_ENABLE" in control.checked.problem
+            await world.until(lambda: control.failsafe_status is not None)
+            assert control.failsafe_status is not None
+            assert "FS_GCS_ENABLE" in control.failsafe_status.problem
             plane.parameters["FS_GCS_ENABLE"] = lost
-            await world.until(lambda: control.checked is not None and not control.checked.problem, 10)
+            await world.until(lambda: control.failsafe_status is not None and not control.failsafe_status.problem, 10)
             await world.drive(grant)
             await world.service.arm(grant)
 
@@ -227,7 +227,7 @@ def test_failsafe_setup_is_retried_after_exception(tmp_path: Path) -> None:
 
             plane.vehicle_parameters.read = breaking  # type: ignore[method-assign]
             world.observer.found()
-            await world.until(lambda: control.checked is not None and not control.checked.problem, 10)
+            await world.until(lambda: control.failsafe_status is not None and not control.failsafe_status.problem, 10)
             assert not broken
 
     fly(flight)
@@ -513,7 +513,7 @@ def test_failsafe_parameter_changed_in_flight_is_restored(tmp_path: Path, announ
         async with World(tmp_path) as world:
             world.observer.found()
             grant = world.grants.put(spec())
-            await world.until(lambda: world.control.checked is not None, 10)
+            await world.until(lambda: world.control.failsafe_status is not None, 10)
             await world.up(grant)
             change_parameter(world, "FS_GCS_ENABLE", 0.0, announced=announced)
             await world.until(lambda: world.plane.parameters["FS_GCS_ENABLE"] == 1.0, 1 if announced else 12)
@@ -528,7 +528,7 @@ def test_changed_acceleration_parameter_is_applied_in_flight(tmp_path: Path) -> 
         async with World(tmp_path) as world:
             world.observer.found()
             grant = world.grants.put(spec())
-            await world.until(lambda: world.control.checked is not None, 10)
+            await world.until(lambda: world.control.failsafe_status is not None, 10)
             await world.up(grant)
             assert world.gate.situation().airframe.accel_mps2 == 2.5
             change_parameter(world, "WPNAV_ACCEL", 100.0)
@@ -545,7 +545,7 @@ def test_mission_ends_if_failsafe_parameter_cannot_be_restored(tmp_path: Path) -
         async with World(tmp_path) as world:
             world.observer.found()
             grant = world.grants.put(spec())
-            await world.until(lambda: world.control.checked is not None, 10)
+            await world.until(lambda: world.control.failsafe_status is not None, 10)
             await world.up(grant)
             world.plane.fixed = ("FS_GCS_ENABLE",)
             change_parameter(world, "FS_GCS_ENABLE", 0.0)
@@ -561,12 +561,14 @@ def test_parameter_changed_on_ground_is_verified_before_arming(tmp_path: Path) -
         async with World(tmp_path) as world:
             world.observer.found()
             grant = world.grants.put(spec())
-            await world.until(lambda: world.control.checked is not None, 10)
+            await world.until(lambda: world.control.failsafe_status is not None, 10)
             await world.drive(grant)
             change_parameter(world, "WPNAV_ACCEL", 100.0)
             why = await refusal(world.service.arm(grant))
             assert why.verdict.code == "FailsafesNotVerified"
-            await world.until(lambda: world.control.checked is not None and not world.control.checked.problem, 5)
+            await world.until(
+                lambda: world.control.failsafe_status is not None and not world.control.failsafe_status.problem, 5
+            )
             await world.service.arm(grant)
             assert world.gate.situation().airframe.accel_mps2 == 1.0
 

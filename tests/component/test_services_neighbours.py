@@ -77,7 +77,7 @@ def test_reconnected_link_ignores_heartbeats_of_foreign_components_in_flight(str
 def test_arming_is_refused_while_two_vehicles_are_on_the_link(tmp_path: Path) -> None:
     async def work(sky: Sky, directory: Path) -> None:
         async with ready(sky, directory) as (drone, grant):
-            assert not drone.autopilot.vehicle.unready(drone.autopilot.now)
+            assert not drone.autopilot.vehicle.arming_refusal(drone.autopilot.now)
 
             async def speak(wire: Wire) -> None:
                 while True:
@@ -85,7 +85,7 @@ def test_arming_is_refused_while_two_vehicles_are_on_the_link(tmp_path: Path) ->
                     await asyncio.sleep(1.0)
 
             speaking = asyncio.ensure_future(speak(sky.wires[0]))
-            await until(lambda: drone.autopilot.vehicle.unclear)
+            await until(lambda: drone.autopilot.vehicle.identity_problem)
             with pytest.raises(Refused, match=r"other vehicles are on its link \(MAVLink systems 2\)"):
                 await drone.service.arm(grant)
             assert not sky.truth.armed

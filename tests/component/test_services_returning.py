@@ -138,7 +138,9 @@ def test_mission_parameters_are_held_during_mission_and_restored_after(tmp_path:
         async with World(tmp_path) as world:
             world.plane.parameters |= FLOWN
             world.observer.found()
-            await world.until(lambda: world.control.checked is not None and not world.control.checked.problem)
+            await world.until(
+                lambda: world.control.failsafe_status is not None and not world.control.failsafe_status.problem
+            )
             assert current_values(world) == FLOWN, "unchanged before the mission"
             grant = world.grants.put(spec())
             await world.up(grant, 8.0)

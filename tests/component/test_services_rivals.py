@@ -12,7 +12,7 @@ import virtual_time
 from closed_loop import Account, Oracle, Sky
 from fractus_core.policy.decision_types import TakeoffArgs
 from fractus_runtime.mavlink_codec import Endpoint
-from fractus_services.mobility.autopilot import COURSE_S
+from fractus_services.mobility.autopilot import VELOCITY_HISTORY_S
 from mobility_world import FRAME, World, end, goto, spec, zone
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sky_drone import fly, ready, until
@@ -70,8 +70,8 @@ def test_gust_does_not_brake_hovering_drone_beside_zone(speed_mps: float, stoppe
             plane = world.plane
             plane.commands.clear()
             plane.vehicle.north_mps = speed_mps
-            plane.vehicle.courses.clear()
-            plane.vehicle.courses.extend([(0.0, -speed_mps, 0.0), (COURSE_S, speed_mps, 0.0)])
+            plane.vehicle.velocity_history.clear()
+            plane.vehicle.velocity_history.extend([(0.0, -speed_mps, 0.0), (VELOCITY_HISTORY_S, speed_mps, 0.0)])
             assert plane.vehicle.keeps_place(plane.now) is not stopped
             world.monitor.check()
             assert bool(plane.commands) is stopped

@@ -29,7 +29,7 @@ def test_rebooted_autopilot_gets_failsafes_again_before_arming(tmp_path: Path) -
             before = sky.craft.vehicle
             before.reboot_requested = True
             await until(lambda: sky.craft.vehicle is not before)
-            await until(lambda: drone.autopilot.vehicle.unready(drone.autopilot.now))
+            await until(lambda: drone.autopilot.vehicle.arming_refusal(drone.autopilot.now))
             await drone.service.arm(grant, 120.0)
             assert sky.truth.armed
             assert sky.truth.params["SYSID_MYGCS"] == 244.0

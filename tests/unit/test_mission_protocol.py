@@ -67,7 +67,7 @@ class Keeper(MavlinkAutopilot):
 
 @pytest.fixture(autouse=True)
 def _impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(mission_protocol, "ANSWER_TIMEOUT_S", 0.01)
+    monkeypatch.setattr(mission_protocol, "ITEM_TIMEOUT_S", 0.01)
 
 
 @pytest.mark.parametrize("lost", [(), (1,), (2,), (3, 4), (6,), (8, 9, 10), (11,)])

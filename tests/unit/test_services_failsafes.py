@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 import pytest
 from fractus_core.policy.decision_types import Airframe
 from fractus_runtime.mavlink_codec import message
-from fractus_services.mobility.autopilot import Checked
+from fractus_services.mobility.autopilot import FailsafeStatus
 from fractus_services.mobility.mavlink.companion import SYSTEM_ID
 from fractus_services.mobility.mavlink.failsafes import MavlinkFailsafes
 from parameter_vehicle import MOVEMENT, ParameterVehicle
@@ -38,7 +38,7 @@ def run(work: Coroutine[Any, Any, T]) -> T:
         return runner.run(work)
 
 
-def configured(parameters: Parameters, *, flying: bool = False) -> Checked:
+def configured(parameters: Parameters, *, flying: bool = False) -> FailsafeStatus:
     return run(MavlinkFailsafes(parameters).configure(flying=flying))
 
 

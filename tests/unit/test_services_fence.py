@@ -6,7 +6,7 @@ import asyncio
 from typing import Any
 
 import pytest
-from fractus_services.mobility.mavlink import acknowledgements
+from fractus_services.mobility.mavlink import mavlink_autopilot
 from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
 from fractus_services.mobility.mavlink.mavlink_autopilot import MavlinkAutopilot
 
@@ -17,7 +17,7 @@ class Overtaken(Exception):
 
 @pytest.fixture
 def link(monkeypatch: pytest.MonkeyPatch) -> tuple[MavlinkAutopilot, list[Any]]:
-    monkeypatch.setattr(acknowledgements, "ACK_TIMEOUT_S", 0.01)
+    monkeypatch.setattr(mavlink_autopilot, "ACK_TIMEOUT_S", 0.01)
     autopilot = MavlinkAutopilot("tcp:127.0.0.1:1", ARDUCOPTER)
     sent: list[Any] = []
     monkeypatch.setattr(autopilot, "send", sent.append)

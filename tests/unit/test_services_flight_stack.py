@@ -41,7 +41,7 @@ def test_modes_are_requested_by_number() -> None:
     ],
 )
 def test_failsafe_statustexts_are_recognised(text: str, tells: bool) -> None:
-    assert ARDUCOPTER.tells_failsafe(text) is tells
+    assert ARDUCOPTER.reports_failsafe(text) is tells
 
 
 class TwoNumbers(ArduCopter):

@@ -11,7 +11,7 @@ import pytest
 from depth import examples
 from fractus_core.policy.decision_types import Airframe
 from fractus_runtime.mavlink_codec import message
-from fractus_services.mobility.autopilot import Checked
+from fractus_services.mobility.autopilot import FailsafeStatus
 from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
 from fractus_services.mobility.mavlink.failsafes import MavlinkFailsafes, Reader
 from fractus_services.mobility.mavlink.parameters import ParameterLost
@@ -52,7 +52,7 @@ def run(work: Coroutine[Any, Any, T]) -> T:
         return runner.run(work)
 
 
-async def started(vehicle: ParameterVehicle) -> Checked:
+async def started(vehicle: ParameterVehicle) -> FailsafeStatus:
     return await MavlinkFailsafes(vehicle).configure()
 
 

@@ -55,36 +55,41 @@ def test_position_accuracy_expires_when_no_longer_reported() -> None:
     assert vehicle.position_error_m == 1.5
 
 
-def told(vehicle: Vehicle, now: float, missions: bool = False, heard: int = 0, way_s: float = 0.0) -> Any:
-    autopilot = SimpleNamespace(vehicle=vehicle, now=now, connected=True, downlink_latency_s=way_s)
+def telemetry(
+    vehicle: Vehicle, now: float, missions: bool = False, last_text: int = 0, downlink_latency_s: float = 0.0
+) -> Any:
+    autopilot = SimpleNamespace(vehicle=vehicle, now=now, connected=True, downlink_latency_s=downlink_latency_s)
     ended = Mission("uid", "identity", outcome=Outcome(OutcomeKind.REVOKED, "why"))
     state = ControlState(missions={"uid": ended, "other": Mission("other", "identity")})
     control: Any = SimpleNamespace(
-        autopilot=autopilot, checked=None, state=state, effects=SimpleNamespace(takeover_reason="a pilot took it")
+        autopilot=autopilot,
+        state=state,
+        home_altitude_inconsistent=False,
+        effects=SimpleNamespace(takeover_reason="a pilot took it"),
     )
-    return telemetry_of(control, 0.0, missions=missions, not_ready_reason="", last_text=heard)
+    return telemetry_of(control, 0.0, missions=missions, not_ready_reason="", last_text=last_text)
 
 
 def test_telemetry_contains_no_stale_position() -> None:
     vehicle = Vehicle(stack=ARDUCOPTER)
     fix(vehicle, 3)
     place(vehicle, 39.0, 10.0)
-    fresh = told(vehicle, 10.5)
+    fresh = telemetry(vehicle, 10.5)
     assert fresh.HasField("position")
     assert fresh.position_error_m == pytest.approx(0.6 + 3.0 * 0.5)
     assert fresh.position_age_s == pytest.approx(0.5)
-    stale = told(vehicle, 11.1)
+    stale = telemetry(vehicle, 11.1)
     assert not stale.HasField("position")
     assert not stale.HasField("velocity")
-    assert not told(Vehicle(stack=ARDUCOPTER), math.inf).HasField("position")
+    assert not telemetry(Vehicle(stack=ARDUCOPTER), math.inf).HasField("position")
 
 
 def test_telemetry_reports_age_of_attitude() -> None:
     vehicle = Vehicle(stack=ARDUCOPTER)
     vehicle.take(message("ATTITUDE", roll=0.1, pitch=0.0, yaw=1.0), 10.0)
-    fresh = told(vehicle, 10.4)
+    fresh = telemetry(vehicle, 10.4)
     assert fresh.attitude_age_s == pytest.approx(0.4)
-    stale = told(vehicle, 11.1)
+    stale = telemetry(vehicle, 11.1)
     assert not stale.HasField("attitude")
     assert not stale.HasField("attitude_age_s")
 
@@ -95,7 +100,7 @@ def test_telemetry_ages_include_link_latency(way_s: float) -> None:
     fix(vehicle, 3)
     place(vehicle, 39.0, 10.0)
     vehicle.take(message("ATTITUDE", yaw=1.0), 10.1)
-    fresh = told(vehicle, 10.2, way_s=way_s)
+    fresh = telemetry(vehicle, 10.2, downlink_latency_s=way_s)
     assert fresh.position_age_s == pytest.approx(0.2 + way_s)
     assert fresh.attitude_age_s == pytest.approx(0.1 + way_s)
     assert fresh.position_error_m == pytest.approx(0.6 + 3.0 * 0.2)
@@ -125,7 +130,7 @@ def test_attitude_age_follows_its_timestamp() -> None:
 
 
 def test_mission_items_are_addressed_to_the_node_only() -> None:
-    ours, others = (told(Vehicle(stack=ARDUCOPTER), 0.0, missions=node) for node in (True, False))
+    ours, others = (telemetry(Vehicle(stack=ARDUCOPTER), 0.0, missions=node) for node in (True, False))
     assert dict(ours.missions) == {"uid": MissionOutcome(kind=MissionOutcome.KIND_REVOKED, reason="why")}
     assert ours.controller_reason == "a pilot took it"
     assert (dict(others.missions), others.controller_reason) == ({}, "")
@@ -133,16 +138,16 @@ def test_mission_items_are_addressed_to_the_node_only() -> None:
 
 def test_telemetry_reports_satellites_wind_and_new_statustexts() -> None:
     vehicle = Vehicle(stack=ARDUCOPTER)
-    empty = told(vehicle, 10.0)
+    empty = telemetry(vehicle, 10.0)
     assert not empty.HasField("gps")
     assert not empty.HasField("wind")
     vehicle.take(message("GPS_RAW_INT", fix_type=4, satellites_visible=12), 10.0)
     vehicle.take(message("WIND", direction=90.0, speed=5.0), 10.0)
     for text in (b"PreArm: a", b"PreArm: b"):
         vehicle.take(message("STATUSTEXT", severity=2, text=text), 10.0)
-    full = told(vehicle, 11.0)
+    full = telemetry(vehicle, 11.0)
     assert (full.gps.fix_type, full.gps.satellites) == (4, 12)
     assert (full.wind.from_deg, full.wind.speed_mps) == (90.0, 5.0)
     assert [(text.number, text.text) for text in full.texts] == [(1, "PreArm: a"), (2, "PreArm: b")]
-    assert [text.text for text in told(vehicle, 11.0, heard=1).texts] == ["PreArm: b"]
-    assert not told(vehicle, 21.0).HasField("wind")
+    assert [text.text for text in telemetry(vehicle, 11.0, last_text=1).texts] == ["PreArm: b"]
+    assert not telemetry(vehicle, 21.0).HasField("wind")

@@ -32,20 +32,20 @@ def test_armed_vehicle_without_position_counts_as_airborne() -> None:
 
 @pytest.mark.parametrize(("vx", "forward_mps2"), [((100, 12), 2.4), ((600, -10), -2.0), ((300, 0), 0.0)])
 def test_forward_acceleration_is_derived_from_velocities(vx: tuple[int, int], forward_mps2: float) -> None:
-    vehicle = Vehicle(stack=ARDUCOPTER, located=True, received_at=0.0)
+    vehicle = Vehicle(stack=ARDUCOPTER, located=True, gps_at=0.0)
     assert vehicle.forward_mps2 is None
     for i in range(12):
         told = message("GLOBAL_POSITION_INT", time_boot_ms=i * 50, lat=1, lon=1, vx=vx[0] + i * vx[1])
         vehicle.take(told, i * 0.05)
     assert vehicle.forward_mps2 == pytest.approx(forward_mps2, abs=0.01)
-    assert len(vehicle.courses) < 10, "old ones are forgotten"
+    assert len(vehicle.velocity_history) < 10, "old ones are forgotten"
 
 
 @pytest.mark.parametrize(
     ("unplaced_s", "told", "lost"), [(11, True, False), (14, True, True), (11, False, False), (14, False, True)]
 )
 def test_smart_rtl_path_is_lost_with_position_even_without_statustext(unplaced_s: int, told: bool, lost: bool) -> None:
-    vehicle = Vehicle(stack=ARDUCOPTER, armed=True, placed_at=0.0)
+    vehicle = Vehicle(stack=ARDUCOPTER, armed=True, positioned_at=0.0)
     for at in range(1, unplaced_s):
         if told:
             vehicle.take(message("EKF_STATUS_REPORT", flags=BOOTED), float(at))
@@ -91,23 +91,25 @@ POSITIONED = 831
 
 def test_readiness_depends_on_requirements_of_the_arming_mode() -> None:
     vehicle = Vehicle(stack=ARDUCOPTER)
-    assert "SYS_STATUS" in vehicle.unready(30.0)
+    assert "SYS_STATUS" in vehicle.arming_refusal(30.0)
     vehicle.take(message("SYS_STATUS"), 30.0)
     vehicle.ready = False
     vehicle.take(message("STATUSTEXT", severity=2, text=b"PreArm: AHRS: waiting for home"), 30.0)
-    assert vehicle.unready(30.0) == "PreArm: AHRS: waiting for home"
+    assert vehicle.arming_refusal(30.0) == "PreArm: AHRS: waiting for home"
     vehicle.take(message("SYS_STATUS", **HEALTHY), 31.0)
-    assert "EKF_STATUS_REPORT" in vehicle.unready(31.0), "one that never tells is not ready"
+    assert "EKF_STATUS_REPORT" in vehicle.arming_refusal(31.0), "one that never tells is not ready"
     vehicle.take(message("EKF_STATUS_REPORT", flags=BOOTED), 31.0)
     vehicle.take(message("HOME_POSITION", latitude=393600000, longitude=229500000), 31.0)
-    assert "does not know its position" in vehicle.unready(31.0), "the checks pass in STABILIZE without a position"
+    assert "position estimate is not accurate" in vehicle.arming_refusal(31.0), (
+        "the checks pass in STABILIZE without a position"
+    )
     for flags in (POSITIONED & ~16, POSITIONED & ~512):
         vehicle.take(message("EKF_STATUS_REPORT", flags=flags), 32.0)
-        assert vehicle.unready(32.0)
+        assert vehicle.arming_refusal(32.0)
     vehicle.take(message("EKF_STATUS_REPORT", flags=POSITIONED), 33.0)
-    assert vehicle.unready(33.0) == ""
+    assert vehicle.arming_refusal(33.0) == ""
     vehicle.home = None
-    assert "home" in vehicle.unready(33.0)
+    assert "home" in vehicle.arming_refusal(33.0)
 
 
 @pytest.mark.parametrize("silent", ["SYS_STATUS", "EKF_STATUS_REPORT"])
@@ -118,7 +120,7 @@ def test_stale_reports_make_vehicle_not_ready(silent: str) -> None:
         for told in (message("SYS_STATUS", **HEALTHY), message("EKF_STATUS_REPORT", flags=POSITIONED)):
             if now == 31.0 or told.name != silent:
                 vehicle.take(told, now)
-        assert (silent in vehicle.unready(now)) is (now > 31.0)
+        assert (silent in vehicle.arming_refusal(now)) is (now > 31.0)
 
 
 def test_home_of_zeros_is_unknown() -> None:
@@ -139,8 +141,8 @@ def test_vehicle_reports_satellites_wind_and_statustexts() -> None:
     assert vehicle.wind_at == 3.0
     for number in range(60):
         vehicle.take(message("STATUSTEXT", severity=4, text=f"text {number}".encode()), 5.0)
-    assert len(vehicle.reports) == 50
-    assert vehicle.reports[-1] == (60, 4, "text 59")
+    assert len(vehicle.status_texts) == 50
+    assert vehicle.status_texts[-1] == (60, 4, "text 59")
 
 
 @pytest.mark.parametrize(("flags", "lost"), [(POSITIONED, False), (BOOTED, True)])

@@ -25,12 +25,17 @@ Permit = Callable[[], None]
 """Called before each transmission of a command. Raises an exception if the command must no longer be sent."""
 
 BEING_SET = "they are being set"
-"""Problem of failsafes that are not read back yet."""
+"""Problem of failsafes that have not been read back yet."""
 
 LANDED_MAX_AGE_S = 2.0
-SURELY_M = 1.5
-UNTOLD_M = 0.5
-"""Altitude above which a drone flies although it reports ON_GROUND, and altitude above which it flies if it reports nothing."""
+"""Maximum age of the landed state relative to the other messages."""
+
+ON_GROUND_ALTITUDE_M = 1.5
+"""Altitude above home above which a drone counts as flying although it reports ON_GROUND."""
+
+UNREPORTED_ALTITUDE_M = 0.5
+"""Altitude above home above which a drone counts as flying if its landed state is unknown."""
+
 _IN_AIR = frozenset(
     {mavlink.MAV_LANDED_STATE_IN_AIR, mavlink.MAV_LANDED_STATE_TAKEOFF, mavlink.MAV_LANDED_STATE_LANDING}
 )
@@ -46,14 +51,14 @@ WIND_MAX_AGE_S = 10.0
 READY_MAX_AGE_S = 5.0
 """Maximum age of the reported readiness: at 1 Hz, four messages in a row were lost."""
 
-COURSE_S = 0.3
-"""Period of velocities, on the vehicle's clock, from which the acceleration is computed."""
+VELOCITY_HISTORY_S = 0.3
+"""Period for which velocities are kept to compute the acceleration, in seconds of the vehicle's clock."""
 
 LEG_MPS = 1000.0
-"""Pending speed of a leg, horizontally and vertically. Only the direction of a recently started leg is known."""
+"""Placeholder for the horizontal and the vertical speed of a pending leg, of which only the direction is known."""
 
-SLOW_MPS = 0.1
-"""Below this speed the velocity is noise and gives no course."""
+MIN_COURSE_MPS = 0.1
+"""Speed below which the velocity is noise and has no direction."""
 
 
 @dataclass(slots=True)
@@ -61,7 +66,7 @@ class VehicleState:
     """Latest state that the autopilot reported. Times are monotonic seconds.
 
     Attributes:
-        position_at: Time of the position, corrected for the delay beyond that of the fastest recent message.
+        position_at: Time of the position. The delay relative to the fastest recent message is subtracted.
         yaw_deg: Heading from the position message; `heading_deg` is from the attitude message.
         gimbal: Measured attitude of the camera, yaw from true north. `gimbal_at` is the older of the gimbal's and the vehicle's
             attitude, because the yaw is measured from the vehicle's heading.
@@ -70,9 +75,11 @@ class VehicleState:
         estimated: True if the estimator has and predicts an absolute position, reported at `estimated_at`.
         path_lost: True if the autopilot has stopped recording its path since it was armed.
         satellites: Number of visible satellites; None until it is reported.
-        reports: Number, MAV_SEVERITY and text of recent status texts.
-        unclear: Reason why the drone's own vehicle is not certain; empty if it is certain.
-        silent_s: Interval between the last two heartbeats.
+        velocity_history: Time on the vehicle's clock, and velocity north and east, of the latest positions.
+        texts: Recent status texts.
+        status_texts: Number, MAV_SEVERITY and text of recent status texts.
+        identity_problem: Reason why it is uncertain which vehicle on the link is the drone's own; empty if it is certain.
+        heartbeat_gap_s: Interval between the last two heartbeats.
         located: True if GPS has an accurate three-dimensional fix. Positions without such a fix are ignored.
     """
 
@@ -109,64 +116,64 @@ class VehicleState:
     fix_type: int = mavlink.GPS_FIX_TYPE_NO_GPS
     located: bool = False
     position_error_m: float = DEFAULT_ERROR_M
-    courses: deque[tuple[float, float, float]] = field(default_factory=deque)
+    velocity_history: deque[tuple[float, float, float]] = field(default_factory=deque)
     satellites: int | None = None
     wind_from_deg: float = 0.0
     wind_mps: float = 0.0
     wind_at: float = -math.inf
     texts: list[str] = field(default_factory=list)
-    reports: deque[tuple[int, int, str]] = field(default_factory=lambda: deque(maxlen=50))
+    status_texts: deque[tuple[int, int, str]] = field(default_factory=lambda: deque(maxlen=50))
     path_lost: bool = False
     failsafe_text: str = ""
     failsafe_text_at: float = -math.inf
-    unclear: str = ""
-    silent_s: float = 0.0
+    identity_problem: str = ""
+    heartbeat_gap_s: float = 0.0
 
     @property
-    def standing(self) -> bool:
+    def reports_on_ground(self) -> bool:
         """True if EXTENDED_SYS_STATE reports ON_GROUND and is as recent as the other messages."""
-        told = max(self.heartbeat_at, self.position_at) - self.landed_at <= LANDED_MAX_AGE_S
-        return told and self.landed_state == mavlink.MAV_LANDED_STATE_ON_GROUND
+        recent = max(self.heartbeat_at, self.position_at) - self.landed_at <= LANDED_MAX_AGE_S
+        return recent and self.landed_state == mavlink.MAV_LANDED_STATE_ON_GROUND
 
     @property
     def in_air(self) -> bool:
-        """True if the vehicle flies, or if that is uncertain."""
+        """True if the vehicle is airborne, or if its landed state is unknown."""
         if not self.armed:
             return False
         if self.landed_state in _IN_AIR:
             return True
-        if self.standing:
-            return self.altitude_m > SURELY_M
-        return self.position_at == -math.inf or self.altitude_m > UNTOLD_M
+        if self.reports_on_ground:
+            return self.altitude_m > ON_GROUND_ALTITUDE_M
+        return self.position_at == -math.inf or self.altitude_m > UNREPORTED_ALTITUDE_M
 
     @property
     def speed_mps(self) -> float:
         """Horizontal ground speed."""
         return math.hypot(self.north_mps, self.east_mps)
 
-    def unready(self, now: float) -> str:
-        """Return why the autopilot would refuse to arm in GUIDED, according to recent messages; empty if it would not."""
+    def arming_refusal(self, now: float) -> str:
+        """Return the reason why the autopilot would refuse to arm in GUIDED, from its recent messages; empty if it would not."""
         if now - self.checks_at > READY_MAX_AGE_S:
-            return "it does not tell whether its checks pass (SYS_STATUS)"
+            return "it does not report its pre-arm checks (SYS_STATUS)"
         if not self.ready:
-            told = next((text for text in reversed(self.texts) if text.startswith("PreArm")), "")
-            return told or "its checks fail"
+            reason = next((text for text in reversed(self.texts) if text.startswith("PreArm")), "")
+            return reason or "its pre-arm checks fail"
         if now - self.estimated_at > READY_MAX_AGE_S:
-            return "it does not tell whether it knows its position (EKF_STATUS_REPORT)"
+            return "it does not report the state of its position estimate (EKF_STATUS_REPORT)"
         if not self.estimated:
-            return "it does not know its position well enough yet (EKF_STATUS_REPORT)"
-        return self.unclear if self.home is not None else "it has no home yet (HOME_POSITION)"
+            return "its position estimate is not accurate enough yet (EKF_STATUS_REPORT)"
+        return self.identity_problem if self.home is not None else "it has no home yet (HOME_POSITION)"
 
     def position_fresh(self, now: float) -> bool:
         """Return True if the position is recent enough to judge and to fly by."""
         return now - self.position_at <= MAX_POSITION_AGE_S
 
     def keeps_place(self, now: float) -> bool:
-        """Return True if the vehicle certainly stays above one place."""
+        """Return True if the position is known and the vehicle does not move horizontally."""
         return self.position_fresh(now) and self.speed_mps < STATIONARY_MPS
 
     def at_rest(self, now: float) -> bool:
-        """Return True if the vehicle is certainly stationary, as the policy engine defines it."""
+        """Return True if the position is known and the vehicle is stationary, as the policy engine defines it."""
         return self.keeps_place(now) and abs(self.down_mps) < STATIONARY_MPS
 
     def distance_m(self, lat: float, lon: float) -> float:
@@ -177,15 +184,17 @@ class VehicleState:
 
     @property
     def forward_mps2(self) -> float | None:
-        """Acceleration along the course; None while too few velocities are known."""
-        if len(self.courses) < 2:
+        """Acceleration in the direction of flight; None while too few velocities are known."""
+        if len(self.velocity_history) < 2:
             return None
-        begun, north, east = self.courses[0]
-        (now, *_) = self.courses[-1]
-        if now - begun < COURSE_S / 3:
+        first_s, first_north_mps, first_east_mps = self.velocity_history[0]
+        period_s = self.velocity_history[-1][0] - first_s
+        if period_s < VELOCITY_HISTORY_S / 3:
             return None
-        along = (self.north_mps - north) * self.north_mps + (self.east_mps - east) * self.east_mps
-        return along / max(self.speed_mps, SLOW_MPS) / (now - begun)
+        change_north_mps = self.north_mps - first_north_mps
+        change_east_mps = self.east_mps - first_east_mps
+        projection = change_north_mps * self.north_mps + change_east_mps * self.east_mps
+        return projection / max(self.speed_mps, MIN_COURSE_MPS) / period_s
 
     @property
     def flight_state(self) -> str:
@@ -199,15 +208,15 @@ class VehicleState:
 
 
 @dataclass(frozen=True, slots=True)
-class Checked:
-    """Result of the verification of the failsafes.
+class FailsafeStatus:
+    """Result of a verification of the failsafes.
 
     Attributes:
         problem: Reason why arming is refused; empty if every required failsafe was read back.
         missing: Optional settings that the vehicle does not have.
-        remembers: True if the vehicle can return along its path; `airframe.retraces` shows if its failsafes will.
-        airframe: Dynamics from the vehicle's parameters.
+        airframe: Dynamics from the vehicle's parameters. `retraces` is True if its failsafes return along the path.
         speed_mps: Speed of legs.
+        records_path: True if the vehicle can return along its path.
         changed: Changed settings as sentences.
         lost: True if the only problem is that the vehicle did not answer.
     """
@@ -216,7 +225,7 @@ class Checked:
     missing: tuple[str, ...]
     airframe: Airframe
     speed_mps: float
-    remembers: bool = False
+    records_path: bool = False
     changed: tuple[str, ...] = ()
     lost: bool = False
 
@@ -238,7 +247,7 @@ class Modes(Protocol):
 
 
 class Autopilot(Protocol):
-    """One vehicle and its commands. Commands raise AutopilotError if the vehicle refuses or is silent.
+    """One vehicle and its commands. Commands raise AutopilotError if the vehicle refuses them or does not answer.
 
     Attributes:
         starting: Lock held while the start of the motors is being prepared.
@@ -264,7 +273,10 @@ class Autopilot(Protocol):
 
     @property
     def latency_s(self) -> float:
-        """Upper bound of the time from the known state to the effect of a command sent now, in seconds of the vehicle's clock. Infinite if the link is too slow to fly."""
+        """Upper bound of the time from the known state to the effect of a command that is sent now.
+
+        It is in seconds of the vehicle's clock, and infinite if the link is too slow to fly.
+        """
 
     @property
     def downlink_latency_s(self) -> float:
@@ -272,7 +284,7 @@ class Autopilot(Protocol):
 
     @property
     def pending(self) -> tuple[tuple[float, float, float], ...]:
-        """Velocities (north, east, down) of recent setpoints that the known state may not show yet."""
+        """Velocities (north, east, down) of recent setpoints that the reported state may not reflect yet."""
 
     @property
     def link_problem(self) -> str:
@@ -280,7 +292,7 @@ class Autopilot(Protocol):
 
     @property
     def at_rest(self) -> bool:
-        """True if the vehicle is certainly stationary and has no pending setpoint."""
+        """True if the vehicle is known to be stationary and no setpoint that moves it is pending."""
 
     @property
     def found(self) -> bool:
@@ -291,7 +303,7 @@ class Autopilot(Protocol):
         """True while heartbeats of the vehicle arrive."""
 
     def send_heartbeat(self) -> None:
-        """Send a heartbeat now if the companion works."""
+        """Send a heartbeat now if this service controls the drone."""
 
     async def update(self, timeout_s: float) -> bool:
         """Wait for an update of the vehicle's state; return False after the timeout."""
@@ -317,7 +329,7 @@ class Autopilot(Protocol):
     async def go_to(
         self, lat: float, lon: float, altitude_m: float, yaw_deg: float | None, permit: Permit = ...
     ) -> None:
-        """Start to fly straight to a point; altitude above home. Set the speed after each call, see `set_speed`."""
+        """Start to fly straight to a point. The altitude is above home. Call `set_speed` after each call."""
 
     async def set_speed(self, speed_mps: float, permit: Permit = ...) -> None:
         """Set the horizontal ground speed of the current leg. The next leg may start with the default speed."""
@@ -332,7 +344,7 @@ class Autopilot(Protocol):
         """Brake and hold the position."""
 
     def fly(self, north_mps: float, east_mps: float, down_mps: float, yaw_deg: float | None = None) -> None:
-        """Fly with a velocity over ground until it times out in the autopilot."""
+        """Fly with a velocity over ground. The autopilot stops the drone if no further setpoint arrives in time."""
 
     async def set_rates(self, flying: bool) -> None:
         """Request the message rates, higher in the air."""
@@ -341,19 +353,19 @@ class Autopilot(Protocol):
 class Failsafes(Protocol):
     """The autopilot's own failsafes for a silent companion or a low battery."""
 
-    async def configure(self, *, flying: bool = False, before: Checked | None = None) -> Checked:
+    async def configure(self, *, flying: bool = False, before: FailsafeStatus | None = None) -> FailsafeStatus:
         """Set the failsafes, read each one back, and return them with the vehicle's dynamics."""
 
-    async def choose_return(self, checked: Checked, *, retrace: bool) -> Checked:
-        """Let the failsafes return straight, or along the path if the vehicle supports that."""
+    async def choose_return(self, status: FailsafeStatus, *, retrace: bool) -> FailsafeStatus:
+        """Configure the failsafes to return straight, or along the path if the vehicle records it."""
 
-    async def learn_return(self, checked: Checked) -> Checked:
+    async def learn_return(self, status: FailsafeStatus) -> FailsafeStatus:
         """Update the altitude of the autopilot's own return flight."""
 
     def concerns(self, name: str) -> bool:
         """Return True if a parameter is set or read by the failsafes."""
 
-    def learn(self, checked: Checked) -> Checked:
+    def learn(self, status: FailsafeStatus) -> FailsafeStatus:
         """Update the vehicle's dynamics from the parameters known so far."""
 
 
@@ -362,13 +374,13 @@ class ReturnLimits(Protocol):
 
     @property
     def limited(self) -> bool:
-        """True while the vehicle has values of the service."""
+        """True while the vehicle has values that this service set."""
 
     async def limit(self, bounds: ReturnBounds) -> tuple[str, ...]:
-        """Lower what exceeds the bounds, raise what was lowered more than necessary, and return the changes as sentences."""
+        """Limit the parameters to the bounds, and undo unnecessary limits. Return the changes as sentences."""
 
     async def lift(self, idle: Callable[[], bool]) -> None:
-        """Restore the owner's values if any was changed."""
+        """Restore the owner's values."""
 
 
 class Fence(Protocol):
@@ -380,16 +392,16 @@ class Fence(Protocol):
 
     @property
     def raised(self) -> bool:
-        """True while the vehicle has a fence of the service."""
+        """True while the vehicle has a fence that this service set."""
 
     async def raise_around(self, spec: GrantSpec, *, retraces: bool) -> None:
         """Load the outer bounds of a grant, enable the fence, and verify everything by reading it back."""
 
     async def lower(self, idle: Callable[[], bool]) -> None:
-        """Restore the owner's fence if it was changed."""
+        """Restore the owner's fence."""
 
     async def hold(self) -> tuple[str, ...]:
-        """Restore what another station changed of the mission's fence, and return the changes as sentences."""
+        """Revert changes that another station made to the mission's fence, and return them as sentences."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -409,10 +421,10 @@ class Safeguards:
 
 
 Approach = Callable[[TaskKind, Callable[[], bool], int], Awaitable[FlightMode]]
-"""Fly to a place where the autopilot may land or return by itself, and return the mode for the rest.
+"""Flies to a position from which the autopilot may land or return by itself, and returns the mode for the rest of the flight.
 
-Called with the task (land or return), a function that returns True while the system has control, and the number of refusals by the
-autopilot.
+The arguments are the task (land or return), a function that returns True while the system has control, and the number of refusals
+by the autopilot.
 """
 
 

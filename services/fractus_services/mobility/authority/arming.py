@@ -15,7 +15,7 @@ from fractus_core.geo import LocalFrame
 from fractus_services.errors import AutopilotError, PreconditionFailed, Refused, Unavailable
 from fractus_services.grant_files import ActiveGrant
 from fractus_services.mobility.authority.control_store import ControlStore
-from fractus_services.mobility.autopilot import BEING_SET, Checked, Permit, Safeguards
+from fractus_services.mobility.autopilot import BEING_SET, FailsafeStatus, Permit, Safeguards
 from fractus_services.mobility.settings import SETTINGS
 
 _TRANSIENT_CODES = frozenset(
@@ -84,7 +84,7 @@ class Arming:
     async def _arm(self, grant: ActiveGrant, permit: Permit) -> None:
         self._require_verified()
         autopilot = self._control.autopilot
-        if unready := autopilot.vehicle.unready(autopilot.now):
+        if unready := autopilot.vehicle.arming_refusal(autopilot.now):
             raise PreconditionFailed("NotReady", f"the autopilot is not ready to arm: {unready}")
         mission = self._control.mission(grant)
         if mission.outcome is not None:
@@ -97,11 +97,11 @@ class Arming:
         permit()
         self._control.dispatch(ArmingPrepared(begins=True))
         try:
-            checked = await self._prepare_return(grant, home)
+            status = await self._prepare_return(grant, home)
 
             def still_permitted() -> None:
                 permit()
-                self._require_verified(checked)
+                self._require_verified(status)
 
             still_permitted()
             await self._start(home, still_permitted)
@@ -135,7 +135,7 @@ class Arming:
         finally:
             self._control.dispatch(MotorStart(begins=False, unanswered=unanswered))
 
-    async def _prepare_return(self, grant: ActiveGrant, home: tuple[float, float, float]) -> Checked:
+    async def _prepare_return(self, grant: ActiveGrant, home: tuple[float, float, float]) -> FailsafeStatus:
         """Choose the autopilot's return mode, raise its fence around the mission, and read the altitude of its return.
 
         A vehicle records its path from where it armed last. If it arms away from home, it must not return on that path.
@@ -144,10 +144,8 @@ class Arming:
             The verified failsafes. Failsafes that are set later were not chosen for this flight.
         """
         at_home = self._control.autopilot.vehicle.distance_m(home[0], home[1]) <= SETTINGS.at_home_m
-        checked = self._require_verified()
-        checked = self._update_checked(
-            checked, await self._safeguards.failsafes.choose_return(checked, retrace=at_home)
-        )
+        status = self._require_verified()
+        status = self._update_status(status, await self._safeguards.failsafes.choose_return(status, retrace=at_home))
         try:
             async with asyncio.timeout(SETTINGS.fence_timeout_s):
                 await self._safeguards.fence.raise_around(grant.spec, retraces=self._control.retraces)
@@ -155,33 +153,33 @@ class Arming:
             problem = str(error) or f"timeout after {SETTINGS.fence_timeout_s:.0f} s"
             reason = f"the vehicle's own fence cannot be raised around the operation area: {problem}"
             raise PreconditionFailed("FenceNotRaised", reason) from error
-        self._require_verified(checked)
+        self._require_verified(status)
         try:
             lowered = await self._safeguards.limit_return(grant)
         except (AutopilotError, OSError) as error:
             reason = f"cannot limit speed and altitude of the autopilot's return: {error}"
             raise PreconditionFailed("ReturnNotLimited", reason) from error
         if lowered or not self._safeguards.fence.missing:
-            checked = self._update_checked(checked, await self._safeguards.failsafes.learn_return(checked))
-        return checked
+            status = self._update_status(status, await self._safeguards.failsafes.learn_return(status))
+        return status
 
-    def _update_checked(self, before: Checked, after: Checked) -> Checked:
+    def _update_status(self, before: FailsafeStatus, after: FailsafeStatus) -> FailsafeStatus:
         """Store an updated result, unless the failsafes were set again meanwhile."""
-        if self._control.checked is before:
-            self._control.checked = after
+        if self._control.failsafe_status is before:
+            self._control.failsafe_status = after
         return self._require_verified(after)
 
-    def _require_verified(self, chosen: Checked | None = None) -> Checked:
+    def _require_verified(self, chosen: FailsafeStatus | None = None) -> FailsafeStatus:
         """Return the failsafes if they are verified and, if given, are the chosen ones."""
-        checked = self._control.checked
-        if checked is None or checked.problem or (chosen is not None and checked is not chosen):
-            problem = (checked.problem if checked is not None else "") or BEING_SET
+        status = self._control.failsafe_status
+        if status is None or status.problem or (chosen is not None and status is not chosen):
+            problem = (status.problem if status is not None else "") or BEING_SET
             raise PreconditionFailed("FailsafesNotVerified", f"the autopilot's failsafes are not verified: {problem}")
         if self._control.autopilot.link_problem:
             raise PreconditionFailed("LinkTooSlow", self._control.autopilot.link_problem)
         if self._control.audit.failure:
             raise PreconditionFailed("AuditUnavailable", self._control.audit.failure)
-        return checked
+        return status
 
     def _home_of(self, grant: ActiveGrant, mission: Mission) -> tuple[float, float, float]:
         """Return the home of the mission: where it armed for its first takeoff.

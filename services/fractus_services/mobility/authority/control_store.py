@@ -49,7 +49,7 @@ from fractus_services.grant_files import ActiveGrant, GrantFiles
 from fractus_services.mobility.authority.effects import ChangeSignal, EffectRunner, FlightConstraints, Lease, Motion
 from fractus_services.mobility.authority.journal import Journal, record_of
 from fractus_services.mobility.authority.mode_controller import ModeController
-from fractus_services.mobility.autopilot import BEING_SET, Approach, Autopilot, Checked, Permit, always
+from fractus_services.mobility.autopilot import BEING_SET, Approach, Autopilot, FailsafeStatus, Permit, always
 from fractus_services.mobility.settings import SETTINGS
 
 CORRECTION = "Correction"
@@ -73,7 +73,7 @@ class ControlStore:
         changes: Signal of changes that drivers and passengers wait for.
         effects: Execution of the state machine's actions.
         tasks: Background tasks.
-        checked: Result of the last failsafe verification; None if it is outdated.
+        failsafe_status: Result of the last failsafe verification; None if it is outdated.
     """
 
     def __init__(
@@ -107,7 +107,7 @@ class ControlStore:
         )
         self._timer: asyncio.TimerHandle | None = None
         self._closed = False
-        self.checked: Checked | None = None
+        self.failsafe_status: FailsafeStatus | None = None
         self._constraints: FlightConstraints | None = None
         self._removed: ActiveGrant | None = None
         self._transit: tuple[ActiveGrant, CompiledGrant] | None = None
@@ -127,7 +127,7 @@ class ControlStore:
             failsafe=vehicle.failsafe,
             failsafe_text=vehicle.failsafe_text,
             failsafe_text_at=vehicle.failsafe_text_at,
-            silent_s=vehicle.silent_s * self.autopilot.pace,
+            silent_s=vehicle.heartbeat_gap_s * self.autopilot.pace,
         )
         self._state = self._state.observed(facts)
         return self._state
@@ -210,7 +210,7 @@ class ControlStore:
     @property
     def retraces(self) -> bool:
         """True if the autopilot can return on the path it flew (SmartRTL)."""
-        capable = self.checked is not None and self.checked.airframe.retraces
+        capable = self.failsafe_status is not None and self.failsafe_status.airframe.retraces
         return capable and not self.autopilot.vehicle.path_lost
 
     @property
@@ -220,7 +220,7 @@ class ControlStore:
         corrects = state.motion is not None and state.motion.kind == CORRECTION
         if state.speed_mps is not None and state.authority is Authority.DRIVER and not corrects:
             return state.speed_mps
-        return self.checked.speed_mps if self.checked is not None else SETTINGS.default_speed_mps
+        return self.failsafe_status.speed_mps if self.failsafe_status is not None else SETTINGS.default_speed_mps
 
     def mission(self, grant: ActiveGrant) -> Mission:
         """Return the mission of a grant, or a new one if it is unknown."""
@@ -236,10 +236,14 @@ class ControlStore:
         vehicle = self.autopilot.vehicle
         located = vehicle.lat is not None and vehicle.home is not None
         # In flight, the last known result stands in for a verification that is not possible at the moment.
-        problem = "" if self.checked is None or vehicle.armed else self.checked.problem
-        unverified = BEING_SET if self.checked is None else problem
+        problem = "" if self.failsafe_status is None or vehicle.armed else self.failsafe_status.problem
+        unverified = BEING_SET if self.failsafe_status is None else problem
         readiness = Readiness(
-            unverified, vehicle.unready(self.autopilot.now), located, self.autopilot.link_problem, vehicle.unclear
+            unverified,
+            vehicle.arming_refusal(self.autopilot.now),
+            located,
+            self.autopilot.link_problem,
+            vehicle.identity_problem,
         )
         return not_ready_reason(self.state, key, readiness)
 
@@ -248,11 +252,11 @@ class ControlStore:
         """Reason why the motors could not be armed now by any caller; empty if there is none."""
         vehicle = self.autopilot.vehicle
         if not self.autopilot.connected:
-            return vehicle.unclear or NOT_CONNECTED
-        unverified = BEING_SET if self.checked is None else self.checked.problem
+            return vehicle.identity_problem or NOT_CONNECTED
+        unverified = BEING_SET if self.failsafe_status is None else self.failsafe_status.problem
         if unverified:
             return f"the autopilot's failsafes are not verified: {unverified}"
-        return vehicle.unready(self.autopilot.now) or self.autopilot.link_problem
+        return vehicle.arming_refusal(self.autopilot.now) or self.autopilot.link_problem
 
     def note(self, action: str, reason: str, code: str = "") -> None:
         """Record an action of the system in the audit log."""

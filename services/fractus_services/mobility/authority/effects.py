@@ -81,29 +81,29 @@ class FlightConstraints:
 
     grant: ActiveGrant
     compiled: CompiledGrant
-    flight_id: int = field(default_factory=lambda: next(_ids))
+    flight_id: int = field(default_factory=_ids.__next__)
 
 
+@dataclass(eq=False, slots=True)
 class Motion:
     """Motion call in progress, until it completes or is stopped.
 
     Attributes:
-        motion_id: Id in the control state.
         kind: Name of the method.
+        motion_id: Id in the control state.
         braking: True while the drone comes to rest before the motion, so that the monitor does not stop the motion.
         leg: Leg being flown; None if there is none.
         under_way: True if the autopilot acknowledged the leg.
         speed_mps: Speed of the leg.
     """
 
-    def __init__(self, kind: str) -> None:
-        self.motion_id = next(_ids)
-        self.kind = kind
-        self.braking = False
-        self.leg: GotoArgs | None = None
-        self.under_way = False
-        self.speed_mps: float | None = None
-        self._refusal: Refused | None = None
+    kind: str
+    motion_id: int = field(default_factory=_ids.__next__)
+    braking: bool = False
+    leg: GotoArgs | None = None
+    under_way: bool = False
+    speed_mps: float | None = None
+    _refusal: Refused | None = None
 
     def stop(self, refusal: Refused) -> None:
         """End the motion. Its caller receives the first refusal."""

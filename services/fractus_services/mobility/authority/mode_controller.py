@@ -125,7 +125,7 @@ class ModeController:
                 if kind is TaskKind.HOVER:
                     await self._hover()
                     return
-                if (vehicle.standing or not vehicle.in_air) and not refused:
+                if (vehicle.reports_on_ground or not vehicle.in_air) and not refused:
                     refused = not await self.disarm()
                 else:
                     await self._come_down(kind, attempts, wanted, approach)

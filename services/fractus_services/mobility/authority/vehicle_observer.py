@@ -40,9 +40,9 @@ class VehicleObserver:
 
     def found(self) -> None:
         """Handle a link to the autopilot that came up, for the first time or again."""
-        checked = self._control.checked
+        status = self._control.failsafe_status
         flying = self._control.autopilot.vehicle.armed
-        self._control.checked = replace(checked, problem=BEING_SET) if flying and checked is not None else None
+        self._control.failsafe_status = replace(status, problem=BEING_SET) if flying and status is not None else None
         self._control.dispatch(VehicleFound())
         self._control.tasks.drop(self._preparing)
         self._preparing = self._control.tasks.spawn(self._prepare())
@@ -92,12 +92,14 @@ class VehicleObserver:
     def parameter(self, name: str) -> None:
         """Handle a parameter change by another station: update the known values and restore required ones."""
         control = self._control
-        checked = control.checked
-        if checked is None or not self._safeguards.failsafes.concerns(name):
+        status = control.failsafe_status
+        if status is None or not self._safeguards.failsafes.concerns(name):
             return
         log.warning("observer: parameter changed by another station (name=%s)", name)
         flying = control.autopilot.vehicle.armed
-        control.checked = self._safeguards.failsafes.learn(checked) if flying else replace(checked, problem=BEING_SET)
+        control.failsafe_status = (
+            self._safeguards.failsafes.learn(status) if flying else replace(status, problem=BEING_SET)
+        )
         self._changed.set()
 
     async def _prepare(self) -> None:
@@ -134,19 +136,19 @@ class VehicleObserver:
     async def _verify(self) -> None:
         """Set and read back the failsafes, and the fence in flight. A drone that cannot keep them is brought home."""
         control = self._control
-        before = control.checked
+        before = control.failsafe_status
         flying = control.autopilot.vehicle.armed
         self._verified_at = -math.inf
         if flying and self._unverified_since is None:
             self._unverified_since = control.autopilot.now
-        checked = await self._safeguards.failsafes.configure(flying=flying, before=before)
-        if not checked.lost:
+        status = await self._safeguards.failsafes.configure(flying=flying, before=before)
+        if not status.lost:
             self._unverified_since = None
         if not flying:
-            control.checked = checked
+            control.failsafe_status = status
             return
-        problems = ["" if checked.lost else checked.problem]
-        restored = checked.changed
+        problems = ["" if status.lost else status.problem]
+        restored = status.changed
         link_error: AutopilotError | None = None
         for keep in (self._keep_return, self._keep_fence):
             # A failure of one check must not hide the results of the others.
@@ -157,12 +159,12 @@ class VehicleObserver:
                 problems.append("" if error.link else str(error))
             except OSError as error:
                 problems.append(f"cannot store the owner's settings: {error}")
-        checked = self._safeguards.failsafes.learn(checked)
-        control.checked = checked
+        status = self._safeguards.failsafes.learn(status)
+        control.failsafe_status = status
         for setting in restored:
             control.note("restored", f"set back in flight: {setting}", "SettingChanged")
-        if before is not None and before.airframe != checked.airframe:
-            control.note("airframe", f"the vehicle's flight parameters changed: {checked.airframe}", "SettingChanged")
+        if before is not None and before.airframe != status.airframe:
+            control.note("airframe", f"the vehicle's flight parameters changed: {status.airframe}", "SettingChanged")
         if any(problems):
             self._bring_home("; ".join(filter(None, problems)))
         if link_error is not None:
@@ -187,9 +189,9 @@ class VehicleObserver:
 
     def _verification_due(self) -> bool:
         control = self._control
-        checked = control.checked
-        if checked is None or checked.problem == BEING_SET or self._changed.is_set():
+        status = control.failsafe_status
+        if status is None or status.problem == BEING_SET or self._changed.is_set():
             return True
         if control.autopilot.vehicle.armed:
-            return bool(checked.problem) or control.autopilot.now - self._verified_at >= SETTINGS.verify_interval_s
-        return bool(checked.problem) and not control.state.preparing
+            return bool(status.problem) or control.autopilot.now - self._verified_at >= SETTINGS.verify_interval_s
+        return bool(status.problem) and not control.state.preparing

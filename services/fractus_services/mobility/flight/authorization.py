@@ -70,7 +70,7 @@ class PolicyGate:
         autopilot = control.autopilot
         vehicle = autopilot.vehicle
         motion = control.motion
-        airframe = control.checked.airframe if control.checked is not None else Airframe()
+        airframe = control.failsafe_status.airframe if control.failsafe_status is not None else Airframe()
         if airframe.retraces and not control.retraces:
             airframe = replace(airframe, retraces=False)
         unlocated = Situation(

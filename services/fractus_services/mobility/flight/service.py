@@ -154,7 +154,7 @@ class MobilityService:
             vehicle = self._autopilot.vehicle
             await self._control.modes.enter_guided(permit)
             climbs: Callable[[Autopilot, Motion, float, Permit], AsyncGenerator[Step, None]] = climb
-            if vehicle.in_air and not vehicle.standing:
+            if vehicle.in_air and not vehicle.reports_on_ground:
                 await come_to_rest(self._autopilot, motion, permit)
                 final = self.calls.allow_motion(call, self._control.require_control(grant).grant, verdict)
                 climbs = partial(

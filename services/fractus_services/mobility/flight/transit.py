@@ -99,7 +99,7 @@ class TransitFlight:
         try:
             # `standing` is reported by the autopilot, `in_air` is also True if uncertain: for an armed drone on a raised pad
             # both are True.
-            if vehicle.standing or not vehicle.in_air:
+            if vehicle.reports_on_ground or not vehicle.in_air:
                 yield "the system arms the drone"
                 if vehicle.armed:
                     self._allow(Call("Arm"), flight)

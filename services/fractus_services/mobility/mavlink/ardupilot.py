@@ -32,10 +32,10 @@ _COPTERS = frozenset(
 )  # fmt: skip
 _NUMBERS = {mode: number for number, mode in _MODES.items()}
 
-_LISTENS = "listens for the companion's heartbeats, and takes no ground station for it"
+_ACCEPTS_COMPANION = "accepts heartbeats of the companion, and not those of a ground station"
 # Releases with the new name can accept a range of systems as the companion.
-_LISTENS_TO_ONE = Setting(
-    ("MAV_GCS_SYSID_HI",), 0, frozenset(float(n) for n in range(1, SYSTEM_ID + 1)), False, _LISTENS
+_ACCEPTS_ONE_SYSTEM = Setting(
+    ("MAV_GCS_SYSID_HI",), 0, frozenset(float(n) for n in range(1, SYSTEM_ID + 1)), False, _ACCEPTS_COMPANION
 )
 
 _UNSTEERED = 1 << 4 | 1 << 5 | 1 << 6
@@ -51,7 +51,7 @@ _RETURN = 1.0
 _RETRACE = 3.0
 
 _COMES_DOWN = frozenset({1.0, 2.0, 3.0, 5.0})
-"""Values of FENCE_ACTION that bring the drone down. Others only report, or hover until the battery is low."""
+"""Values of FENCE_ACTION that bring the drone down. With other values it only reports, or hovers until the battery is low."""
 
 ENABLE = "FENCE_ENABLE"
 TYPE = "FENCE_TYPE"
@@ -61,7 +61,7 @@ OPTIONS = "FENCE_OPTIONS"
 AUTOENABLE = "FENCE_AUTOENABLE"
 MARGIN = "FENCE_MARGIN"
 _UNION = 2
-"""Bit of FENCE_OPTIONS: being inside of one polygon is sufficient."""
+"""Bit of FENCE_OPTIONS with which the vehicle has to be inside only one of several polygons."""
 _DEFAULT_FENCES = float(mavlink.FENCE_TYPE_ALT_MAX | mavlink.FENCE_TYPE_CIRCLE | mavlink.FENCE_TYPE_POLYGON)
 _DEFAULT_MARGIN_M = 2.0
 
@@ -70,13 +70,13 @@ _GAIN: Names = (("PSC_POSXY_P", 1.0), ("PSC_NE_POS_P", 1.0))
 _CLIMB: Names = (("WPNAV_ACCEL_Z", 0.01), ("WP_ACC_Z", 1.0))
 # 4.7.0 and 4.7.1 use different names.
 _JERK: Names = (("PSC_JERK_XY", 1.0), ("PSC_NE_JERK", 1.0), ("PSC_JERK_NE", 1.0))
-# Maximum lean of the position controller in degrees unless it is 0, and of the vehicle.
+# Maximum lean angle of the position controller in degrees (0 if unset), and of the vehicle.
 _OWN_LEAN: Names = (("PSC_ANGLE_MAX", 1.0),)
 _LEAN: Names = (("ANGLE_MAX", 0.01), ("ATC_ANGLE_MAX", 1.0))
 _MAX_LEAN_DEG = 80.0
 _GRAVITY_MPS2 = 9.81
 _WIND_LEAN_DEG = 4.0
-"""Lean angle that 6 m/s of wind take and that is not available for braking."""
+"""Lean angle that compensates 6 m/s of wind and is not available for braking."""
 _RETURN_ALTITUDE: Names = (("RTL_ALT", 0.01), ("RTL_ALT_M", 1.0))
 _SPEED: Names = (("WPNAV_SPEED", 0.01), ("WP_SPD", 1.0))
 _MOVEMENT = (_ACCEL, _GAIN, _CLIMB, _JERK, _OWN_LEAN, _LEAN, _RETURN_ALTITUDE, _SPEED)
@@ -85,7 +85,7 @@ _RETURN_CLIMB: Names = (("RTL_CLIMB_MIN", 0.01), ("RTL_CLIMB_MIN_M", 1.0))
 _MIN_SPEED_MPS = 0.2
 _MIN_ACCEL_MPS2 = 0.1
 _NO_RALLY_KM = 2.0**-10
-"""Rally points at a greater distance (one metre) are ignored; 0 would allow all of them. Exactly representable as float32."""
+"""Distance of about one metre, beyond which rally points are ignored. 0 would allow all of them. The value is exact in float32."""
 
 
 class ArduCopter:
@@ -96,22 +96,27 @@ class ArduCopter:
     return_straight = _MODES[mavlink.COPTER_MODE_RTL]
     return_retracing = _MODES[mavlink.COPTER_MODE_SMART_RTL]
 
-    witness = "FS_GCS_ENABLE"
+    probe_parameter = "FS_GCS_ENABLE"
     failsafes: tuple[Setting, ...] = (
         Setting(
-            ("SYSID_MYGCS", "MAV_GCS_SYSID"), SYSTEM_ID, frozenset(), True, _LISTENS, {"MAV_GCS_SYSID": _LISTENS_TO_ONE}
+            ("SYSID_MYGCS", "MAV_GCS_SYSID"),
+            SYSTEM_ID,
+            frozenset(),
+            True,
+            _ACCEPTS_COMPANION,
+            {"MAV_GCS_SYSID": _ACCEPTS_ONE_SYSTEM},
         ),
-        Setting(("FS_GCS_TIMEOUT",), 5, frozenset(), False, "after five seconds of silence"),
+        Setting(("FS_GCS_TIMEOUT",), 5, frozenset(), False, "reacts after five seconds without heartbeats"),
         Setting(("BATT_FS_CRT_ACT",), 1, frozenset({1.0}), False, "lands on a critical battery"),
-        Setting(("FS_EKF_ACTION",), 1, frozenset({1.0, 3.0}), False, "lands when it no longer knows where it is"),
+        Setting(("FS_EKF_ACTION",), 1, frozenset({1.0, 3.0}), False, "lands when its position estimate is lost"),
         # 0 disables this failsafe.
         Setting(
-            ("FS_EKF_THRESH",), 0.75, frozenset(), False, "notices that it no longer knows where it is", span=(0.0, 1.0)
+            ("FS_EKF_THRESH",), 0.75, frozenset(), False, "detects that its position estimate is lost", span=(0.0, 1.0)
         ),
     )
-    flown: tuple[Setting, ...] = (
-        Setting(("GUID_TIMEOUT",), 1, frozenset(), False, "gives a velocity up after a second without another"),
-        Setting(("GUID_OPTIONS",), 0, _STEERED, False, "flies as fast as it is told, and stops when it is told to"),
+    mission_settings: tuple[Setting, ...] = (
+        Setting(("GUID_TIMEOUT",), 1, frozenset(), False, "stops one second after the last velocity setpoint"),
+        Setting(("GUID_OPTIONS",), 0, _STEERED, False, "flies at the commanded speed and stops on command"),
         Setting(
             ("RTL_ALT_TYPE",), 0, frozenset(), False, "returns at an altitude above home, not above the ground below"
         ),
@@ -125,17 +130,19 @@ class ArduCopter:
             span=(RTL_CONE_SLOPE, 10.0),
         ),
         Setting(("RTL_ALT_FINAL", "RTL_ALT_FINAL_M"), 0, frozenset(), False, "lands when it has returned"),
-        Setting(("RALLY_LIMIT_KM",), _NO_RALLY_KM, frozenset(), False, "returns to home and to no rally point"),
+        Setting(("RALLY_LIMIT_KM",), _NO_RALLY_KM, frozenset(), False, "returns to home and not to a rally point"),
     )
-    straight: tuple[Setting, ...] = (
-        Setting(("FS_GCS_ENABLE",), _RETURN, frozenset(), True, "returns to launch when the companion falls silent"),
+    straight_return: tuple[Setting, ...] = (
+        Setting(
+            ("FS_GCS_ENABLE",), _RETURN, frozenset(), True, "returns to launch when the companion sends no heartbeats"
+        ),
         Setting(("BATT_FS_LOW_ACT",), 2, frozenset({1.0, 2.0}), False, "returns to launch on a low battery"),
     )
-    retracing: tuple[Setting, ...] = (
+    path_return: tuple[Setting, ...] = (
         Setting(
-            ("FS_GCS_ENABLE",), _RETRACE, frozenset({4.0}), True, "goes back the way it came when the companion falls silent"
+            ("FS_GCS_ENABLE",), _RETRACE, frozenset({4.0}), True, "returns along its path when the companion sends no heartbeats"
         ),
-        Setting(("BATT_FS_LOW_ACT",), 3, frozenset({1.0, 4.0}), False, "goes back the way it came on a low battery"),
+        Setting(("BATT_FS_LOW_ACT",), 3, frozenset({1.0, 4.0}), False, "returns along its path on a low battery"),
     )  # fmt: skip
     path_memory = ("SRTL_POINTS", 100.0)
     movement: tuple[tuple[str, ...], ...] = (
@@ -157,8 +164,8 @@ class ArduCopter:
     # targets. Reports of scripts are not trusted.
     measured_gimbals = frozenset({3.0, 5.0, 6.0, 8.0, 10.0, 11.0, 12.0})
 
-    def foreign(self, vehicle_type: int, autopilot: int) -> str:
-        """Reject other vehicles: modes and parameters of ArduPilot's rovers and planes, and of other firmware, have other meanings."""
+    def unsupported(self, vehicle_type: int, autopilot: int) -> str:
+        """Return why a vehicle is not supported. Modes and parameters of rovers, planes and other firmware have other meanings."""
         if autopilot == mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA and vehicle_type in _COPTERS:
             return ""
         return f"the vehicle is no ArduCopter (MAV_AUTOPILOT {autopilot}, MAV_TYPE {vehicle_type})"
@@ -175,7 +182,7 @@ class ArduCopter:
         """Recognise texts of pre-arm checks, mode changes and takeoffs."""
         return text.startswith(("Arm", "PreArm", "Mode", "Takeoff"))
 
-    def tells_failsafe(self, text: str) -> bool:
+    def reports_failsafe(self, text: str) -> bool:
         """Recognise active failsafes.
 
         Matches `GCS Failsafe`, `Battery 1 is low ... failsafe` and `Fence breached`, but not `Failsafe Cleared`, `Failsafe - Continuing`
@@ -185,7 +192,7 @@ class ArduCopter:
         acts = "failsafe" in lower or ("fence" in lower and "breach" in lower)
         return acts and "cleared" not in lower and "continuing" not in lower
 
-    def tells_path_lost(self, text: str) -> bool:
+    def reports_path_lost(self, text: str) -> bool:
         """Recognise that SmartRTL exceeded its memory or its time limit."""
         return text.startswith("SmartRTL deactivated")
 
@@ -196,16 +203,16 @@ class ArduCopter:
         climb above the altitude for which return flights are judged.
         """
         speed_mps = max(bounds.speed_mps, _MIN_SPEED_MPS)
-        found = {}
-        for names, most in (
+        limited = {}
+        for names, maximum in (
             (_RETURN_ALTITUDE, bounds.height_m), (_RETURN_SPEED, speed_mps), (_SPEED, speed_mps), (_RETURN_CLIMB, 0.0),
         ):  # fmt: skip
             for name, scale in names:
                 if name in owned:
                     # Parameters in centimetres are integers.
-                    limit = most if scale == 1.0 or math.isinf(most) else math.floor(round(most / scale, 3))
-                    found[name] = min(owned[name], float(limit))
-        return found
+                    limit = maximum if scale == 1.0 or math.isinf(maximum) else math.floor(round(maximum / scale, 3))
+                    limited[name] = min(owned[name], float(limit))
+        return limited
 
     def airframe(self, reader: ParameterReader, known: Airframe, speed_mps: float) -> tuple[Airframe, float]:
         """Return accelerations, limited by the maximum lean angle, and gains.
@@ -225,23 +232,23 @@ class ArduCopter:
     def return_altitude_m(self, reader: ParameterReader, known_m: float) -> float:
         """Return RTL_ALT, limited by the fence's ceiling minus its margin."""
 
-        def read(name: str, otherwise: float, *, needed: bool = False) -> float:
-            return reader.read(((name, 1.0),), otherwise, needed=needed)
+        def read(name: str, default: float, *, needed: bool = False) -> float:
+            return reader.read(((name, 1.0),), default, needed=needed)
 
-        wrong = len(reader.problems)
+        problems_before = len(reader.problems)
         height_m = reader.read(_RETURN_ALTITUDE, known_m)
         fenced = read(ENABLE, 0.0) or read(AUTOENABLE, 0.0)
         if fenced and int(read(TYPE, _DEFAULT_FENCES)) & mavlink.FENCE_TYPE_ALT_MAX:
             height_m = min(height_m, read(ALTITUDE, known_m, needed=True) - read(MARGIN, _DEFAULT_MARGIN_M))
-        return known_m if len(reader.problems) > wrong else height_m
+        return known_m if len(reader.problems) > problems_before else height_m
 
     def fence_values(
         self, owned: Mapping[str, float], *, ceiling_m: float | None, polygon: bool, retraces: bool
     ) -> dict[str, float]:
         """Return the parameters of the mission's fence.
 
-        The lower ceiling and both fence types apply. The owner's action stays if it brings the drone down. The drone must be inside of
-        every polygon instead of one of them.
+        The lower of both ceilings and both fence types apply. The owner's action stays if it brings the drone down. The drone must be
+        inside every polygon.
         """
         action = _RETRACE if retraces else _RETURN
         kinds = (mavlink.FENCE_TYPE_ALT_MAX if ceiling_m is not None else 0) | (
@@ -262,7 +269,7 @@ class ArduCopter:
 
 
 def _leant_mps2(reader: ParameterReader) -> float:
-    """Return the horizontal acceleration that the vehicle certainly reaches within its lean angle."""
+    """Return the horizontal acceleration that the vehicle reaches within its lean angle in any permitted wind."""
     lean_deg = reader.read(_OWN_LEAN, 0.0, needed=False)
     if lean_deg <= 0.0:
         lean_deg = reader.read(_LEAN, _MAX_LEAN_DEG, needed=False)

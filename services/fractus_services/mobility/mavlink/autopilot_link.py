@@ -214,7 +214,7 @@ class AutopilotLink:
 
     def _send_first_message(self) -> None:
         """Send a message other than a heartbeat: an autopilot behind UDP sends only to peers that sent something."""
-        self.send(message("PARAM_REQUEST_READ", param_index=-1, param_id=self.stack.witness.encode()))
+        self.send(message("PARAM_REQUEST_READ", param_index=-1, param_id=self.stack.probe_parameter.encode()))
 
     def _lost(self) -> None:
         """Reset everything that was agreed with the vehicle on the broken connection."""
@@ -240,7 +240,7 @@ class AutopilotLink:
                 self.vehicle.take(incoming, self.now)
                 self._on_found()
             if incoming.name == "HEARTBEAT":
-                self.vehicle.unclear = self._selector.problem(incoming, self.now)
+                self.vehicle.identity_problem = self._selector.problem(incoming, self.now)
             if source == self.target:
                 self.take(incoming)
 

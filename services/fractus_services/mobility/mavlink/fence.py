@@ -215,7 +215,7 @@ class MissionFence:
         """
         vehicle = self._autopilot.vehicle
         left_alone = vehicle.armed and not vehicle.mode.commanded
-        if vehicle.fenced is not False or vehicle.checks_at <= self._switched_at or left_alone:
+        if vehicle.fence_enabled is not False or vehicle.checks_at <= self._switched_at or left_alone:
             return ()
         await self._autopilot.command(mavlink.MAV_CMD_DO_FENCE_ENABLE, 1, _SWITCHED)
         self._switched_at = self._autopilot.now

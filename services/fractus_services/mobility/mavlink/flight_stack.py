@@ -23,18 +23,18 @@ class Setting:
         names: Name of the parameter, and its names in older or newer releases.
         value: Value that is set.
         accepted: Values that may stay.
-        span: Values above the first and up to the second may stay, too.
+        span: Values above the first number and up to the second may also stay.
         needed: True if arming is refused when the vehicle does not have the parameter.
-        why: Purpose of the setting, for people.
-        also: Further setting that must hold if the vehicle has the parameter under this name.
+        purpose: What the autopilot does because of the setting: a verb phrase for messages.
+        additional: Further setting, by the name of the parameter: it must hold if the vehicle uses that name.
     """
 
     names: tuple[str, ...]
     value: float
     accepted: frozenset[float]
     needed: bool
-    why: str
-    also: Mapping[str, Setting] = field(default_factory=dict)
+    purpose: str
+    additional: Mapping[str, Setting] = field(default_factory=dict)
     span: tuple[float, float] | None = None
 
     def holds(self, value: float) -> bool:
@@ -56,8 +56,11 @@ class ParameterReader(Protocol):
 
     problems: list[str]
 
-    def read(self, names: Names, otherwise: float, *, needed: bool = True) -> float:
-        """Return a scaled value, or the default if the parameter is missing or invalid; that is a problem if it is needed."""
+    def read(self, names: Names, default: float, *, needed: bool = True) -> float:
+        """Return a scaled value, or the default if the parameter is missing or invalid.
+
+        An invalid parameter is a problem. A missing one is a problem only if it is needed.
+        """
 
 
 class FlightStack(Protocol):
@@ -68,11 +71,11 @@ class FlightStack(Protocol):
         land: Mode that lands at the current position.
         return_straight: Mode that flies home on a straight line.
         return_retracing: Mode that flies home along the path; equal to `return_straight` if the firmware has none.
-        witness: Parameter that every autopilot with this firmware has. If it is not reported, the autopilot does not answer at all.
+        probe_parameter: Parameter that every autopilot with this firmware has, so that a request for it is always answered.
         failsafes: Settings that must hold before arming and afterwards.
-        flown: Settings that must hold during a mission. The owner may have other values.
-        straight: Failsafe settings for a straight return.
-        retracing: Failsafe settings for a return along the path. The first one shows in flight which return was chosen.
+        mission_settings: Settings that must hold during a mission. The owner's values may differ.
+        straight_return: Failsafe settings for a straight return.
+        path_return: Failsafe settings for a return along the path. The first one shows in flight which return was chosen.
         path_memory: Parameter with the capacity of the path memory in points, and the capacity that is sufficient.
         movement: Parameters that determine the dynamics, each with its names.
         leg_speed: Names of the parameter with the speed of legs.
@@ -88,11 +91,11 @@ class FlightStack(Protocol):
     land: FlightMode
     return_straight: FlightMode
     return_retracing: FlightMode
-    witness: str
+    probe_parameter: str
     failsafes: tuple[Setting, ...]
-    flown: tuple[Setting, ...]
-    straight: tuple[Setting, ...]
-    retracing: tuple[Setting, ...]
+    mission_settings: tuple[Setting, ...]
+    straight_return: tuple[Setting, ...]
+    path_return: tuple[Setting, ...]
     path_memory: tuple[str, float]
     movement: tuple[tuple[str, ...], ...]
     leg_speed: tuple[str, ...]
@@ -103,22 +106,22 @@ class FlightStack(Protocol):
     gimbal_type: str
     measured_gimbals: frozenset[float]
 
-    def foreign(self, vehicle_type: int, autopilot: int) -> str:
-        """Return a description of a vehicle with another firmware, by its MAV_TYPE and MAV_AUTOPILOT; empty for this firmware."""
+    def unsupported(self, vehicle_type: int, autopilot: int) -> str:
+        """Return why a vehicle is not supported, from its MAV_TYPE and MAV_AUTOPILOT; empty if it has this firmware."""
 
     def mode(self, custom_mode: int) -> FlightMode:
         """Return the flight mode of a heartbeat's `custom_mode`."""
 
     def mode_parameters(self, mode: FlightMode) -> tuple[float, ...]:
-        """Return the parameters of MAV_CMD_DO_SET_MODE after the first, which requests a custom mode."""
+        """Return the parameters of MAV_CMD_DO_SET_MODE from the second on. The first one requests a custom mode."""
 
     def explains_refusal(self, text: str) -> bool:
         """Return True if a status text states why a command was refused."""
 
-    def tells_failsafe(self, text: str) -> bool:
+    def reports_failsafe(self, text: str) -> bool:
         """Return True if a status text reports an active failsafe."""
 
-    def tells_path_lost(self, text: str) -> bool:
+    def reports_path_lost(self, text: str) -> bool:
         """Return True if a status text reports that the recorded path was discarded."""
 
     def return_values(self, owned: Mapping[str, float], bounds: ReturnBounds) -> dict[str, float]:

@@ -17,7 +17,7 @@ from fractus_runtime.mavlink_codec import Message, Value, enum_name, message
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fractus_services.errors import AutopilotError
-from fractus_services.mobility.autopilot import COURSE_S, LEG_MPS, Permit, VehicleState, always
+from fractus_services.mobility.autopilot import LEG_MPS, VELOCITY_HISTORY_S, Permit, VehicleState, always
 from fractus_services.mobility.mavlink.autopilot_link import AutopilotLink, ignore
 from fractus_services.mobility.mavlink.companion import SYSTEM_ID
 from fractus_services.mobility.mavlink.flight_stack import FlightStack
@@ -32,7 +32,7 @@ log = logging.getLogger(__name__)
 MODE_TIMEOUT_S = 2.0
 REJECTED_RETRY_S = 0.3
 TAKEOFF_TIMEOUT_S = 3.0
-ATTEMPTS = 4
+COMMAND_ATTEMPTS = 4
 
 # In common.xml, but not in the dialect that pymavlink 2.4.50 ships.
 _MAV_RESULT_CANCELLED = 6
@@ -55,10 +55,10 @@ _VELOCITY_ONLY = _VELOCITY_AND_YAW | mavlink.POSITION_TARGET_TYPEMASK_YAW_IGNORE
 ACK_TIMEOUT_S = 0.7
 MAX_ACK_TIMEOUT_S = 3.0
 ACK_SLACK_S = 0.2
-"""An acknowledgement may be slower than the slowest recent answer by this time."""
+"""Time by which an acknowledgement may be slower than the slowest recent answer."""
 
 MAX_UNACKNOWLEDGED = 16
-"""Remembered transmissions of one command, so that a vehicle without acknowledgements cannot fill the memory."""
+"""Maximum number of stored transmissions of a command. It limits the memory if a vehicle sends no acknowledgements."""
 
 Answer = asyncio.Future[int]
 
@@ -66,20 +66,20 @@ Velocity = tuple[float, float, float]
 """North, east and down, m/s."""
 
 MAX_SETPOINTS = 200
-"""More setpoints than can be sent within the longest latency with which the service flies."""
+"""Maximum number of stored setpoints. Fewer can be sent within the longest latency with which the service flies."""
 
 TURNED_MPS = 0.5
-"""A vehicle whose drift across its course is no faster than this has turned onto the course."""
+"""Speed across the course up to which a vehicle has turned onto the course."""
 
 LEVEL_M = 0.3
-"""A leg that ends within this height of the vehicle neither climbs nor sinks."""
+"""Height difference up to which a leg neither climbs nor descends."""
 
 
 class Acknowledgements:
     """Transmissions that are not acknowledged yet, by command.
 
-    A command that was sent twice is acknowledged twice, and the second acknowledgement must not count for the next command with the
-    same id. Links preserve the order, so each acknowledgement is assigned to the oldest transmission that can still be answered
+    COMMAND_ACK contains the command id only. A command that was sent twice is acknowledged twice, and the second acknowledgement
+    must not count for the next command with the same id. Links preserve the order, so each acknowledgement is assigned to the oldest transmission that can still be answered
     according to the measured delay of the link.
 
     Args:
@@ -100,13 +100,13 @@ class Acknowledgements:
         return max(ACK_TIMEOUT_S, min(self._timing.answer_s + ACK_SLACK_S, MAX_ACK_TIMEOUT_S))
 
     def _answerable_s(self, now: float) -> float:
-        """Return for how long a transmission can still be answered.
+        """Return the time for which a transmission can still be answered, in seconds.
 
-        A short time without answers means that the link is becoming slow. After a longer time the link was interrupted, and what was
-        sent is lost.
+        A short time without answers means that the link is becoming slow. A longer time means that the link was interrupted, so
+        that the sent commands are lost.
         """
-        takes_s = max(self._timing.answer_s, min(self._timing.silence_s(now), MAX_ACK_TIMEOUT_S))
-        return max(ACK_TIMEOUT_S, takes_s + ACK_SLACK_S)
+        answer_s = max(self._timing.answer_s, min(self._timing.silence_s(now), MAX_ACK_TIMEOUT_S))
+        return max(ACK_TIMEOUT_S, answer_s + ACK_SLACK_S)
 
     def sent(self, command: int, answer: Answer, now: float) -> None:
         """Record that a command is being sent, for the first time or again.
@@ -120,7 +120,7 @@ class Acknowledgements:
         self._latest[command] = answer
 
     def overtaken(self, command: int, answer: Answer) -> bool:
-        """Return True if another command with the same id was sent after the command of this answer."""
+        """Return True if a later command with the same id was sent."""
         return self._latest.get(command, answer) is not answer
 
     def take(self, acknowledgement: Message, now: float) -> None:
@@ -158,7 +158,7 @@ class Acknowledgements:
 
 
 class RecentSetpoints:
-    """Velocity setpoints, each with the times at which it was first and last sent."""
+    """Recent setpoints, which the vehicle's reported state may not reflect yet. Each has the times of its first and last transmission."""
 
     def __init__(self) -> None:
         self._sent: deque[tuple[float, float, Velocity]] = deque(maxlen=MAX_SETPOINTS)
@@ -179,7 +179,7 @@ class RecentSetpoints:
         self.fly((north * share, east * share, down), now)
 
     def since(self, earliest: float, measured: Velocity) -> tuple[Velocity, ...]:
-        """Return the setpoints that the vehicle may still be reacting to, the latest last; drop older ones.
+        """Return the setpoints that the vehicle may still be reacting to, the latest last. Older ones are dropped.
 
         Setpoints sent after `earliest` always count. The setpoint that was in force at `earliest` counts if the vehicle still
         reacts to it. A vehicle that slows down to a held velocity does not continue to brake. A vehicle that turns onto a leg
@@ -278,15 +278,15 @@ class MavlinkAutopilot(AutopilotLink):
     def pending(self) -> tuple[Velocity, ...]:
         """Velocities of recent setpoints that the vehicle may still be reacting to.
 
-        Velocities from `COURSE_S` earlier count as well, because the vehicle's acceleration is computed from velocities of that period.
+        Setpoints of the `VELOCITY_HISTORY_S` before are included, because the vehicle's acceleration is computed over that period.
         """
         vehicle = self.vehicle
-        earliest = self.now - (self.latency_s + COURSE_S) / self.pace
+        earliest = self.now - (self.latency_s + VELOCITY_HISTORY_S) / self.pace
         return self._setpoints.since(earliest, (vehicle.north_mps, vehicle.east_mps, vehicle.down_mps))
 
     @property
     def at_rest(self) -> bool:
-        """True if the vehicle is certainly stationary and has no pending setpoint."""
+        """True if the vehicle is known to be stationary and no setpoint that moves it is pending."""
         return self.vehicle.at_rest(self.now) and not any(map(moves, self.pending))
 
     def _probe(self, due: float) -> None:
@@ -301,7 +301,7 @@ class MavlinkAutopilot(AutopilotLink):
 
     def _lost(self) -> None:
         self.vehicle.gimbal_measured = self.vehicle.gimbal_limits = None
-        self.vehicle.unclear = ""
+        self.vehicle.identity_problem = ""
         # Accept the first heartbeat of a new connection: the drone may have landed meanwhile.
         self.vehicle.stopping_at = -math.inf
         for part in (self._rates, self._home_monitor, self._acknowledgements, self.vehicle_parameters):
@@ -315,7 +315,7 @@ class MavlinkAutopilot(AutopilotLink):
         elif incoming.name == "COMMAND_ACK":
             self._acknowledgements.take(incoming, self.now)
         elif incoming.name == "GIMBAL_DEVICE_ATTITUDE_STATUS" and self.vehicle.gimbal_measured is None:
-            self.vehicle_parameters.ask(self.stack.gimbal_type)
+            self.vehicle_parameters.request(self.stack.gimbal_type)
         super().take(incoming)
         self._home_monitor.take(incoming.name)
 
@@ -326,7 +326,7 @@ class MavlinkAutopilot(AutopilotLink):
         place: tuple[float, float, float] | None = None,
         frame: int = mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT_INT,
         permit: Permit = always,
-        attempts: int = ATTEMPTS,
+        attempts: int = COMMAND_ATTEMPTS,
     ) -> None:
         """Run a MAVLink command and wait for its acknowledgement.
 
@@ -342,8 +342,8 @@ class MavlinkAutopilot(AutopilotLink):
             AutopilotError: The autopilot refused the command, or did not answer.
         """
         with tracing.child_span(f"autopilot.{enum_name('MAV_CMD', command)}"):
-            # Commands of one kind wait for each other, because a repeated command could undo a later one. Mode changes do not wait
-            # for an unanswered one, because the change may start the return flight.
+            # Commands with the same id wait for each other, because a repeated command could undo a later one. A mode change does
+            # not wait for an unanswered one, because it may start the return flight.
             async with nullcontext() if command in _NOT_SERIALIZED else self._locks.setdefault(command, asyncio.Lock()):
                 answer = Answer()
                 for attempt in range(attempts):
@@ -424,14 +424,14 @@ class MavlinkAutopilot(AutopilotLink):
 
     async def take_off(self, altitude_m: float, permit: Permit = always) -> None:
         """Start to climb to an altitude above home."""
-        for attempt in range(ATTEMPTS):
+        for attempt in range(COMMAND_ATTEMPTS):
             try:
                 await self.command(mavlink.MAV_CMD_NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, altitude_m, permit=permit, attempts=1)
             except AutopilotError as error:
                 # A refusal may mean that only the acknowledgement was lost: a vehicle that is taking off refuses a second takeoff command.
                 if attempt and not error.link and await self._starts_to_fly():
                     return
-                if not error.link or attempt + 1 == ATTEMPTS:
+                if not error.link or attempt + 1 == COMMAND_ATTEMPTS:
                     raise
             else:
                 return
@@ -445,7 +445,7 @@ class MavlinkAutopilot(AutopilotLink):
     async def go_to(
         self, lat: float, lon: float, altitude_m: float, yaw_deg: float | None, permit: Permit = always
     ) -> None:
-        """Start to fly straight to a point; altitude above home.
+        """Start to fly straight to a point. The altitude is above home.
 
         The autopilot uses its default speed if it was not flying to a point before, see `set_speed`.
         """

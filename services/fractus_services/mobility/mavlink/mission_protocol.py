@@ -12,9 +12,9 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from fractus_services.errors import AutopilotError
 from fractus_services.mobility.mavlink.mavlink_autopilot import MavlinkAutopilot
 
-ANSWER_TIMEOUT_S = 1.0
+ITEM_TIMEOUT_S = 1.0
 TEXT_TIMEOUT_S = 0.3
-ATTEMPTS = 4
+ITEM_ATTEMPTS = 4
 
 _REASONS: dict[int, str] = {
     mavlink.MAV_MISSION_ERROR: "error",
@@ -74,20 +74,20 @@ async def upload(
                 autopilot.send(outgoing)
                 last_sent += outgoing.values.get("seq") == len(items) - 1
             answer = await _answer(answers, kind)
-            # The vehicle requested an item twice because the first copy was late. It has it by now and will request the next one.
-            repeated = answer is not None and _is_repeated(answer) and silent + 1 < ATTEMPTS
+            # The vehicle requested an item twice because the first copy was late. It now has the item and will request the next one.
+            repeated = answer is not None and _is_repeated(answer) and silent + 1 < ITEM_ATTEMPTS
             if answer is None or repeated:
                 silent += 1
-                if silent == ATTEMPTS:
+                if silent == ITEM_ATTEMPTS:
                     raise AutopilotError("the autopilot stopped answering while its fence was written", link=True)
             elif answer.name == "MISSION_ACK":
                 if answer.integer("type") == mavlink.MAV_MISSION_ERROR and last_sent > 1:
-                    return  # the answer to the last item was lost; reading back shows if the list is complete
+                    return  # The answer to the last item was lost. Reading the list back shows if it is complete.
                 if answer.integer("type") != mavlink.MAV_MISSION_ACCEPTED:
-                    await asyncio.sleep(TEXT_TIMEOUT_S)  # the texts with the reason may follow the answer
+                    await asyncio.sleep(TEXT_TIMEOUT_S)  # The texts with the reason may follow the answer.
                 _check(answer.integer("type"), [texts.get_nowait().text("text") for _ in range(texts.qsize())])
                 return
-            # The vehicle requests the item that it lacks, again if an item or a request was lost.
+            # The vehicle requests its next item. It repeats the request if the request or the item was lost.
             elif (seq := answer.integer("seq")) < len(items):
                 silent = 0
                 outgoing = _item(autopilot, items[seq], seq, kind)
@@ -119,21 +119,25 @@ async def download(autopilot: MavlinkAutopilot, kind: int = mavlink.MAV_MISSION_
 
 
 async def _request(
-    autopilot: MavlinkAutopilot, request: Message, answers: asyncio.Queue[Message], wanted: str, seq: int | None = None
+    autopilot: MavlinkAutopilot,
+    request: Message,
+    answers: asyncio.Queue[Message],
+    answer_name: str,
+    seq: int | None = None,
 ) -> Message:
-    for _ in range(ATTEMPTS):
+    for _ in range(ITEM_ATTEMPTS):
         autopilot.send(request)
         while (answer := await _answer(answers, request.integer("mission_type"))) is not None:
             if answer.name == "MISSION_ACK":
                 _check(answer.integer("type"))
-            elif answer.name == wanted and seq in {None, answer.values.get("seq")}:
+            elif answer.name == answer_name and seq in {None, answer.values.get("seq")}:
                 return answer
     raise AutopilotError("the autopilot stopped answering while its fence was read", link=True)
 
 
 async def _answer(answers: asyncio.Queue[Message], kind: int) -> Message | None:
     try:
-        async with asyncio.timeout(ANSWER_TIMEOUT_S):
+        async with asyncio.timeout(ITEM_TIMEOUT_S):
             while True:
                 answer = await answers.get()
                 # Mission, fence and rally points share the messages, and another station may be reading another list.

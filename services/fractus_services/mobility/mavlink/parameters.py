@@ -12,8 +12,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fractus_services.errors import AutopilotError
 
-ANSWER_TIMEOUT_S = 0.7
-ATTEMPTS = 8
+PARAMETER_TIMEOUT_S = 0.7
+PARAMETER_ATTEMPTS = 8
 ATTEMPTS_BEFORE_LIST = 4
 """The list has about 1,400 parameters and takes half a minute at 57,600 baud. It is requested only for unanswered names."""
 
@@ -21,7 +21,11 @@ WINDOW = 12
 """Concurrent requests. ArduPilot queues 20 and drops the rest."""
 
 LIST_QUIET_S = 2.0
+"""Time without a further entry after which the autopilot has stopped sending its list."""
+
 LIST_TIMEOUT_S = 180.0
+"""Longest time for the transfer of the list, including repeated requests."""
+
 FEW_MISSING = 0.05
 """If a larger share of the list is missing, the complete list is requested again instead of single entries."""
 
@@ -57,7 +61,7 @@ class Parameters:
         on_change: Callback invoked with the name of a parameter whose value changed, unless this service wrote it.
 
     Attributes:
-        told: Latest reported values by name.
+        values: Latest reported values by name.
         leg_speed: The owner's speed of legs while the return flight is limited; legs are flown with this speed.
     """
 
@@ -72,24 +76,24 @@ class Parameters:
 
     def forget(self) -> None:
         """Reset after the connection broke: the next answers may be from another vehicle or release."""
-        self.told: dict[str, float] = {}
-        self._news = asyncio.Event()
+        self.values: dict[str, float] = {}
+        self._value_received = asyncio.Event()
         self._number = 0
-        self._heard: dict[str, int] = {}
+        self._received: dict[str, int] = {}
         self._list: dict[int, str] = {}
         self._size: int | None = None
         self._absent: set[str] = set()
 
-    def take(self, told: Message) -> None:
+    def take(self, message: Message) -> None:
         """Process a PARAM_VALUE: an answer, or a report that another station changed a parameter."""
-        name = told.text("param_id")
-        value = told.real("param_value")
-        index = told.integer("param_index")
-        size = told.integer("param_count")
+        name = message.text("param_id")
+        value = message.real("param_value")
+        index = message.integer("param_index")
+        size = message.integer("param_count")
         self._number += 1
-        before = self.told.get(name)
-        self.told[name] = value
-        self._heard[name] = self._number
+        before = self.values.get(name)
+        self.values[name] = value
+        self._received[name] = self._number
         self._absent.discard(name)
         # Answers to requests by name have index 65535. Indices of the list count until an enabled feature changes its length.
         if index < size:
@@ -97,46 +101,45 @@ class Parameters:
                 self._size = size
                 self._list = {}
             self._list[index] = name
-        news = self._news
-        self._news = asyncio.Event()
-        news.set()
+        self._value_received.set()
+        self._value_received = asyncio.Event()
         if before is not None and not same(before, value) and not same(self._written.get(name, math.nan), value):
             self._on_change(name)
 
-    def ask(self, name: str) -> None:
-        """Ask for one parameter, and wait for nothing."""
+    def request(self, name: str) -> None:
+        """Request one parameter without waiting for the answer."""
         self._request(name.encode(), -1)
 
-    async def read(self, wanted: Iterable[Spellings]) -> dict[str, float]:
-        """Return the wanted parameters that the vehicle has, each under the name that the vehicle uses.
+    async def read(self, parameters: Iterable[Spellings]) -> dict[str, float]:
+        """Return the parameters that the vehicle has, each under the name that the vehicle uses.
 
         Raises:
             ParameterLost: The value or the existence of a parameter is unknown.
             AutopilotError: The vehicle is not connected.
         """
         begun = self._number
-        asked = tuple(wanted)
-        wanted = [names for names in asked if not self._absent.issuperset(names)]
-        # An absent parameter may exist by now: it is requested, but not waited for.
-        for name in self._absent.intersection(name for names in asked for name in names):
+        requested = tuple(parameters)
+        expected = [names for names in requested if not self._absent.issuperset(names)]
+        # An absent parameter may exist by now. Request it, but do not wait for it.
+        for name in self._absent.intersection(name for names in requested for name in names):
             self._request(name.encode(), -1)
 
         def fresh(names: Spellings) -> bool:
-            return any(self._heard.get(name, 0) > begun for name in names)
+            return any(self._received.get(name, 0) > begun for name in names)
 
-        rest = await self._ask(wanted, fresh, ATTEMPTS_BEFORE_LIST)
-        unknown = [" or ".join(names) for names in rest if not self._known(names)]
+        unanswered = await self._request_by_name(expected, fresh, ATTEMPTS_BEFORE_LIST)
+        unknown = [" or ".join(names) for names in unanswered if not self._known(names)]
         if unknown and not await self._fetch_list():
             raise ParameterLost(
-                f"{', '.join(unknown)} cannot be read: the autopilot answers neither that nor tells its whole list "
-                f"({len(self._list)} of {self._size or '?'} parameters)"
+                f"{', '.join(unknown)} cannot be read: the autopilot neither answers the request nor sends its complete parameter list "
+                f"({len(self._list)} of {self._size or '?'} parameters received)"
             )
-        rest = await self._ask(rest, fresh, ATTEMPTS - ATTEMPTS_BEFORE_LIST)
-        if lost := [self._spelt(names) for names in rest if self._known(names)]:
+        unanswered = await self._request_by_name(unanswered, fresh, PARAMETER_ATTEMPTS - ATTEMPTS_BEFORE_LIST)
+        if lost := [self._spelt(names) for names in unanswered if self._known(names)]:
             raise ParameterLost(f"{', '.join(lost)} cannot be read: the autopilot does not answer")
-        self._absent.update(name for names in rest for name in names)
-        found = (next((name for name in names if self._heard.get(name, 0) > begun), None) for names in wanted)
-        return {name: self.told[name] for name in found if name is not None}
+        self._absent.update(name for names in unanswered for name in names)
+        present = (next((name for name in names if self._received.get(name, 0) > begun), None) for names in expected)
+        return {name: self.values[name] for name in present if name is not None}
 
     async def write(self, name: str, value: float) -> float:
         """Set a parameter that the vehicle has, and return the value that it reports, which differs if the vehicle refuses.
@@ -147,9 +150,9 @@ class Parameters:
         """
         async with self._locks.setdefault(name, asyncio.Lock()):
             self._written[name] = value
-            heard = self._number
-            others = 0
-            for _ in range(ATTEMPTS):
+            last_number = self._number
+            different_values = 0
+            for _ in range(PARAMETER_ATTEMPTS):
                 self._link.send(
                     message(
                         "PARAM_SET",
@@ -159,41 +162,43 @@ class Parameters:
                         **self._link.recipient(),
                     )
                 )
-                while others < 2 and await self._answered(lambda: self._heard.get(name, 0) > heard):  # noqa: B023
-                    if same(self.told[name], value):
+                while different_values < 2 and await self._answered(lambda: self._received.get(name, 0) > last_number):  # noqa: B023
+                    if same(self.values[name], value):
                         return value
-                    # The first differing value may be a late answer to an earlier request.
-                    heard = self._heard[name]
-                    others = others + 1
-                if others > 1:
+                    # The first different value may be a late answer to an earlier request.
+                    last_number = self._received[name]
+                    different_values += 1
+                if different_values > 1:
                     break
             del self._written[name]
-        if not others:
+        if not different_values:
             raise ParameterLost(f"{name} cannot be set to {value:g}: the autopilot does not answer")
-        return self.told[name]
+        return self.values[name]
 
     def _known(self, names: Spellings) -> bool:
         """Return True if the vehicle has reported the parameter."""
-        return any(name in self._heard for name in names)
+        return any(name in self._received for name in names)
 
     def _spelt(self, names: Spellings) -> str:
-        return next((name for name in names if name in self._heard), " or ".join(names))
+        return next((name for name in names if name in self._received), " or ".join(names))
 
-    async def _ask(self, wanted: list[Spellings], fresh: Callable[[Spellings], bool], attempts: int) -> list[Spellings]:
+    async def _request_by_name(
+        self, unanswered: list[Spellings], fresh: Callable[[Spellings], bool], attempts: int
+    ) -> list[Spellings]:
         """Request parameters by name and return those without an answer."""
         for _ in range(attempts):
-            wanted = [names for names in wanted if not fresh(names)]
-            asked = [(names, name) for names in wanted for name in self._to_ask(names)]
-            for begin in range(0, len(asked), WINDOW):
-                window = asked[begin : begin + WINDOW]
+            unanswered = [names for names in unanswered if not fresh(names)]
+            requests = [(names, name) for names in unanswered for name in self._names_to_request(names)]
+            for begin in range(0, len(requests), WINDOW):
+                window = requests[begin : begin + WINDOW]
                 for _, name in window:
                     # An index of -1 requests by name.
                     self._request(name.encode(), -1)
                 await self._answered(lambda: all(fresh(names) for names, _ in window))  # noqa: B023
-        return [names for names in wanted if not fresh(names)]
+        return [names for names in unanswered if not fresh(names)]
 
-    def _to_ask(self, names: Spellings) -> Spellings:
-        known = tuple(name for name in names if name in self._heard)
+    def _names_to_request(self, names: Spellings) -> Spellings:
+        known = tuple(name for name in names if name in self._received)
         return known[:1] or names
 
     def _request(self, name: bytes, index: int) -> None:
@@ -209,7 +214,7 @@ class Parameters:
             silent = 0
             try:
                 async with asyncio.timeout(LIST_TIMEOUT_S):
-                    while silent < ATTEMPTS and not self._complete:
+                    while silent < PARAMETER_ATTEMPTS and not self._complete:
                         before = len(self._list)
                         await self._fetch()
                         silent = 0 if len(self._list) > before else silent + 1
@@ -222,10 +227,10 @@ class Parameters:
         size = self._size or 0
         if size - len(self._list) > FEW_MISSING * size or not size:
             self._link.send(message("PARAM_REQUEST_LIST", **self._link.recipient()))
-            heard = -1
-            while heard != self._number and not self._complete:
-                heard = self._number
-                await self._answered(lambda: self._number > heard, LIST_QUIET_S)  # noqa: B023
+            last_number = -1
+            while last_number != self._number and not self._complete:
+                last_number = self._number
+                await self._answered(lambda: self._number > last_number, LIST_QUIET_S)  # noqa: B023
         else:
             window = [index for index in range(size) if index not in self._list][:WINDOW]
             for index in window:
@@ -237,9 +242,9 @@ class Parameters:
         if done():
             return True
         try:
-            async with asyncio.timeout(ANSWER_TIMEOUT_S if timeout_s is None else timeout_s):
+            async with asyncio.timeout(PARAMETER_TIMEOUT_S if timeout_s is None else timeout_s):
                 while not done():
-                    await self._news.wait()
+                    await self._value_received.wait()
         except TimeoutError:
             return False
         return True

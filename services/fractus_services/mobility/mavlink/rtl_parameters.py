@@ -31,19 +31,19 @@ class RtlParameters:
     def __init__(self, autopilot: MavlinkAutopilot, directory: Path) -> None:
         self._parameters = autopilot.vehicle_parameters
         self._stack = autopilot.stack
-        self._names = (*self._stack.returning, *(setting.names for setting in self._stack.flown))
+        self._names = (*self._stack.returning, *(setting.names for setting in self._stack.mission_settings))
         self._path = directory / "return.json"
         self._lock = asyncio.Lock()
         self._owned = self._load()
-        self._remember()
+        self._update_leg_speed()
 
     @property
     def limited(self) -> bool:
-        """True while the vehicle has values of the service."""
+        """True while the vehicle has values that this service set."""
         return bool(self._owned)
 
     async def limit(self, bounds: ReturnBounds) -> tuple[str, ...]:
-        """Lower what exceeds the bounds, raise what was lowered more than necessary, and return the changes as sentences.
+        """Limit the parameters to the bounds, and undo unnecessary limits. Return the changes as sentences.
 
         Raises:
             AutopilotError: A parameter cannot be set, or the link broke.
@@ -53,17 +53,17 @@ class RtlParameters:
             current = await self._parameters.read(self._names)
             # Ignore stored names that this release of the firmware does not have.
             owned = current | {name: value for name, value in self._owned.items() if name in current}
-            wanted = self._stack.return_values(owned, bounds) | self._flown(owned)
-            changed = {name: value for name, value in wanted.items() if not same(current[name], value)}
+            values = self._stack.return_values(owned, bounds) | self._mission_values(owned)
+            changed = {name: value for name, value in values.items() if not same(current[name], value)}
             if changed:
-                self._owned = {name: owned[name] for name in wanted}
+                self._owned = {name: owned[name] for name in values}
                 await asyncio.to_thread(write_file, self._path, json.dumps(self._owned).encode())
-                self._remember()
+                self._update_leg_speed()
                 await self._set(changed)
             return tuple(f"{name} was {current[name]:g} and is {value:g}" for name, value in changed.items())
 
     async def lift(self, idle: Callable[[], bool]) -> None:
-        """Restore the owner's values if any was changed.
+        """Restore the owner's values.
 
         Args:
             idle: Returns True if no mission needs the limits. Called while no other change is in progress.
@@ -78,14 +78,14 @@ class RtlParameters:
             await self._set({name: value for name, value in self._owned.items() if name in current})
             await asyncio.to_thread(self._path.unlink, True)
             self._owned = {}
-            self._remember()
+            self._update_leg_speed()
             log.info("rtl: owner's parameters restored")
 
-    def _flown(self, owned: dict[str, float]) -> dict[str, float]:
+    def _mission_values(self, owned: dict[str, float]) -> dict[str, float]:
         """Return the values that a mission needs, for the parameters that the vehicle has. Suitable values of the owner stay."""
         return {
             name: owned[name] if setting.holds(owned[name]) else setting.value
-            for setting in self._stack.flown
+            for setting in self._stack.mission_settings
             for name in setting.names
             if name in owned
         }
@@ -97,9 +97,11 @@ class RtlParameters:
                 raise AutopilotError(f"{name} cannot be set to {value:g}; it remains {after:g}")
             log.info("rtl: parameter set (name=%s, value=%g)", name, value)
 
-    def _remember(self) -> None:
-        """Let legs be flown with the owner's speed, within their limits, instead of the lowered speed of the return flight."""
-        self._parameters.leg_speed = {n: v for n, v in self._owned.items() if n in self._stack.leg_speed}
+    def _update_leg_speed(self) -> None:
+        """Make the owner's speed the speed of legs. The vehicle's parameter contains the limited speed of the return flight."""
+        self._parameters.leg_speed = {
+            name: value for name, value in self._owned.items() if name in self._stack.leg_speed
+        }
 
     def _load(self) -> dict[str, float]:
         try:

@@ -9,7 +9,7 @@ from fractus_core.policy.decision_types import Home
 from fractus_runtime.mavlink_codec import Message
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from fractus_services.mobility.autopilot import COURSE_S, DEFAULT_ERROR_M, VehicleState
+from fractus_services.mobility.autopilot import DEFAULT_ERROR_M, VELOCITY_HISTORY_S, VehicleState
 from fractus_services.mobility.mavlink.flight_stack import FlightStack
 from fractus_services.mobility.mavlink.gimbal import attitude_of
 
@@ -30,13 +30,16 @@ The autopilot sends them at least once per second. After a longer silence the es
 """
 
 STOPPED_S = 0.7
-"""Heartbeats, one per second, must report stopped motors in flight for this time before they are accepted."""
+"""Time for which heartbeats (one per second) must report stopped motors in flight before the motors count as stopped."""
 
 STARTED_S = 5.0
-"""A drone whose motors have run for less may be about to take off. After a longer silence it may have landed."""
+"""A drone whose motors have run for a shorter time may be about to take off. After a longer gap between heartbeats it may have landed."""
 
 PATH_KEPT_S = 12.0
-"""ArduCopter discards its path after 15 s without a position and reports that once. This limit is lower, because the text may be lost."""
+"""Time without a position after which the recorded path counts as lost.
+
+ArduCopter discards the path after 15 s and reports that once. The limit is lower, because the report may be lost.
+"""
 
 
 @dataclass(slots=True)
@@ -45,23 +48,23 @@ class Vehicle(VehicleState):
 
     Attributes:
         stack: Firmware of the autopilot.
-        foreign: Description of a vehicle with another firmware; empty for this firmware.
+        unsupported: Reason why the vehicle is not supported; empty if it is.
         gimbal_measured: True if the firmware measures the attitude of its gimbal; None until it reports the gimbal's type.
-        placed_at: Time at which the estimator last had a position.
-        received_at: Time of the last GPS message.
-        fenced: True if the vehicle's fence is enabled, None if it has no fence; reported at `checks_at`.
+        positioned_at: Time at which the estimator last had a position.
+        gps_at: Time of the last GPS message.
+        fence_enabled: True if the vehicle's fence is enabled; None if it has no fence. Reported at `checks_at`.
         started_at: Time of the first heartbeat that reported running motors.
-        stopping_at: Time of the first of the latest heartbeats that reported stopped motors in flight; infinite if the last did not.
+        stopping_at: Time since which all heartbeats have reported stopped motors in flight; infinite if the last one did not.
         gimbal_limits: Smallest and largest pitch and yaw of the gimbal, degrees; None until they are reported.
     """
 
     stack: FlightStack = field(kw_only=True)
-    foreign: str = ""
+    unsupported: str = ""
     gimbal_measured: bool | None = None
     gimbal_limits: tuple[tuple[float, float], ...] | None = None
-    placed_at: float = -math.inf
-    received_at: float = -math.inf
-    fenced: bool | None = None
+    positioned_at: float = -math.inf
+    gps_at: float = -math.inf
+    fence_enabled: bool | None = None
     started_at: float = -math.inf
     stopping_at: float = math.inf
 
@@ -73,14 +76,14 @@ class Vehicle(VehicleState):
 
 
 def _heartbeat(vehicle: Vehicle, message: Message, now: float) -> None:
-    vehicle.silent_s = now - vehicle.heartbeat_at if math.isfinite(vehicle.heartbeat_at) else 0.0
+    vehicle.heartbeat_gap_s = now - vehicle.heartbeat_at if math.isfinite(vehicle.heartbeat_at) else 0.0
     vehicle.heartbeat_at = now
-    vehicle.foreign = vehicle.stack.foreign(message.integer("type"), message.integer("autopilot"))
+    vehicle.unsupported = vehicle.stack.unsupported(message.integer("type"), message.integer("autopilot"))
     armed = bool(message.integer("base_mode") & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
-    # Heartbeats from before the start may arrive late or twice, and they have no time stamp. If they were accepted, the next
-    # heartbeat would seem to report motors that another station started.
+    # Heartbeats from before the start of the motors may arrive late or twice, and they have no time stamp. If such a heartbeat
+    # were accepted, the next one would seem to report motors that another station started.
     flies = vehicle.in_air or now - vehicle.started_at < STARTED_S
-    stops = vehicle.armed and not armed and flies and vehicle.silent_s < STARTED_S
+    stops = vehicle.armed and not armed and flies and vehicle.heartbeat_gap_s < STARTED_S
     vehicle.stopping_at = min(vehicle.stopping_at, now) if stops else math.inf
     if stops and now - vehicle.stopping_at < STOPPED_S:
         return
@@ -95,7 +98,7 @@ def _heartbeat(vehicle: Vehicle, message: Message, now: float) -> None:
 
 
 def _place(lat_e7: int, lon_e7: int) -> tuple[float, float] | None:
-    """Return a place in degrees; None if it is invalid, or zero as ArduPilot sends it before the origin and home are set."""
+    """Return a place in degrees. None if it is invalid, or 0, 0, which ArduPilot sends before its origin and home are set."""
     if (lat_e7 == 0 and lon_e7 == 0) or abs(lat_e7) > 90 * 10**7 or abs(lon_e7) > 180 * 10**7:
         return None
     return lat_e7 / 1e7, lon_e7 / 1e7
@@ -103,9 +106,10 @@ def _place(lat_e7: int, lon_e7: int) -> tuple[float, float] | None:
 
 def _position(vehicle: Vehicle, message: Message, now: float) -> None:
     # Even with a GPS fix the estimator may be using dead reckoning, and its position drifts.
-    told = math.isfinite(vehicle.estimated_at)
-    reckons = told and not (vehicle.estimated and now - vehicle.estimated_at <= STATUS_MAX_AGE_S)
-    if reckons or not vehicle.located or now - vehicle.received_at > STATUS_MAX_AGE_S:
+    reports_estimator = math.isfinite(vehicle.estimated_at)
+    recent_estimate = vehicle.estimated and now - vehicle.estimated_at <= STATUS_MAX_AGE_S
+    dead_reckoning = reports_estimator and not recent_estimate
+    if dead_reckoning or not vehicle.located or now - vehicle.gps_at > STATUS_MAX_AGE_S:
         return
     place = _place(message.integer("lat"), message.integer("lon"))
     if place is None:
@@ -114,11 +118,11 @@ def _position(vehicle: Vehicle, message: Message, now: float) -> None:
     vehicle.altitude_m = message.integer("relative_alt") / 1e3
     vehicle.amsl_m = message.integer("alt") / 1e3
     vehicle.north_mps, vehicle.east_mps, vehicle.down_mps = (message.integer(name) / 100 for name in ("vx", "vy", "vz"))
-    told_s = message.integer("time_boot_ms") / 1e3
-    vehicle.courses.append((told_s, vehicle.north_mps, vehicle.east_mps))
+    boot_s = message.integer("time_boot_ms") / 1e3
+    vehicle.velocity_history.append((boot_s, vehicle.north_mps, vehicle.east_mps))
     # Also drop velocities from before a restart.
-    while not told_s - COURSE_S <= vehicle.courses[0][0] <= told_s:
-        vehicle.courses.popleft()
+    while not boot_s - VELOCITY_HISTORY_S <= vehicle.velocity_history[0][0] <= boot_s:
+        vehicle.velocity_history.popleft()
     heading_cdeg = message.integer("hdg")
     if heading_cdeg != _UNKNOWN_U16:
         vehicle.yaw_deg = heading_cdeg / 100
@@ -136,7 +140,7 @@ def _attitude(vehicle: Vehicle, message: Message, now: float) -> None:
 
 
 def _gimbal(vehicle: Vehicle, message: Message, now: float) -> None:
-    # 0 is of a release that does not number gimbals, 1 is the first one.
+    # Releases that do not number gimbals report 0. The first gimbal is 1.
     if message.integer("gimbal_device_id") > 1 or now < vehicle.gimbal_at:
         return
     vehicle.gimbal = attitude_of(message, vehicle.heading_deg) if vehicle.gimbal_measured else None
@@ -145,11 +149,14 @@ def _gimbal(vehicle: Vehicle, message: Message, now: float) -> None:
 
 def _gimbal_limits(vehicle: Vehicle, message: Message, _now: float) -> None:
     if message.integer("gimbal_device_id") <= 1:
-        least, most = (
-            [math.degrees(message.real(f"{axis}_{end}")) for axis in ("pitch", "yaw")] for end in ("min", "max")
+        # A float32 in radians differs slightly from the degrees that it represents, so the degrees are rounded.
+        limits = tuple(
+            (
+                round(math.degrees(message.real(f"{axis}_min")), 3),
+                round(math.degrees(message.real(f"{axis}_max")), 3),
+            )
+            for axis in ("pitch", "yaw")
         )
-        # A float32 in radians differs slightly from the degrees that it represents.
-        limits = tuple((round(low, 3), round(high, 3)) for low, high in zip(least, most, strict=True))
         vehicle.gimbal_limits = limits if all(low < high for low, high in limits) else None
 
 
@@ -188,24 +195,24 @@ def _status(vehicle: Vehicle, message: Message, now: float) -> None:
     vehicle.ready = bool(healthy) if present else vehicle.fix_type >= mavlink.GPS_FIX_TYPE_3D_FIX
     fence = mavlink.MAV_SYS_STATUS_GEOFENCE
     has_fence = message.integer("onboard_control_sensors_present") & fence
-    vehicle.fenced = bool(message.integer("onboard_control_sensors_enabled") & fence) if has_fence else None
+    vehicle.fence_enabled = bool(message.integer("onboard_control_sensors_enabled") & fence) if has_fence else None
     vehicle.checks_at = now
 
 
 def _estimator(vehicle: Vehicle, message: Message, now: float) -> None:
     # In modes that need no position the checks pass without one. The flags show if GUIDED has what it needs.
     vehicle.estimated = message.integer("flags") & _POSITIONED == _POSITIONED
-    # A service that starts in flight has no earlier position. A vehicle with a position is assumed to have kept its path.
-    begins = vehicle.placed_at == -math.inf and vehicle.estimated
-    lost = vehicle.armed and not begins and now - vehicle.placed_at > PATH_KEPT_S
+    # A service that starts in flight received no earlier positions. It assumes that a vehicle with a position has kept its path.
+    first_estimate = vehicle.positioned_at == -math.inf and vehicle.estimated
+    lost = vehicle.armed and not first_estimate and now - vehicle.positioned_at > PATH_KEPT_S
     vehicle.path_lost = vehicle.path_lost or lost
     if vehicle.estimated:
-        vehicle.placed_at = now
+        vehicle.positioned_at = now
     vehicle.estimated_at = now
 
 
 def _gps(vehicle: Vehicle, message: Message, now: float) -> None:
-    vehicle.received_at = now
+    vehicle.gps_at = now
     vehicle.fix_type = message.integer("fix_type")
     accuracy_mm = message.integer("h_acc")
     satellites = message.integer("satellites_visible")
@@ -220,11 +227,11 @@ def _text(vehicle: Vehicle, message: Message, now: float) -> None:
     text = message.text("text")
     vehicle.texts.append(text)
     del vehicle.texts[:-20]
-    number = vehicle.reports[-1][0] + 1 if vehicle.reports else 1
-    vehicle.reports.append((number, message.integer("severity"), text))
-    if vehicle.stack.tells_path_lost(text):
+    number = vehicle.status_texts[-1][0] + 1 if vehicle.status_texts else 1
+    vehicle.status_texts.append((number, message.integer("severity"), text))
+    if vehicle.stack.reports_path_lost(text):
         vehicle.path_lost = True
-    if vehicle.stack.tells_failsafe(text):
+    if vehicle.stack.reports_failsafe(text):
         vehicle.failsafe_text = text
         vehicle.failsafe_text_at = now
 

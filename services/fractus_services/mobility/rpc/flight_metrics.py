@@ -38,7 +38,7 @@ def flight_metrics(control: ControlStore, supervisor: Supervisor) -> Iterator[Me
     yield gauge(
         "fractus_failsafes_verified",
         "1 while the autopilot's failsafes are verified.",
-        control.checked is not None,
+        control.failsafe_status is not None,
     )
     yield gauge(
         "fractus_battery_ratio",

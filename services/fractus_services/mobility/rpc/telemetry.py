@@ -111,7 +111,7 @@ def telemetry_of(
     if control.autopilot.now - vehicle.wind_at <= WIND_MAX_AGE_S:
         message.wind.from_deg = vehicle.wind_from_deg
         message.wind.speed_mps = vehicle.wind_mps
-    for number, severity, text in vehicle.reports:
+    for number, severity, text in vehicle.status_texts:
         if number > last_text:
             message.texts.add(number=number, severity=severity, text=text)
     if vehicle.home is not None:

@@ -648,6 +648,6 @@ def test_arming_is_not_ready_with_slow_link(tmp_path: Path) -> None:
             world.plane.uplink_s = world.plane.downlink_s = 0.7
             await asyncio.sleep(6)
             grant = world.grants.put(spec())
-            assert "delays by 1.4 s there and back" in str(world.control.not_ready_reason(grant.key))
+            assert "takes 1.4 s" in str(world.control.not_ready_reason(grant.key))
 
     fly(flight)

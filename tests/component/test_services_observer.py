@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +43,7 @@ def test_changed_fence_ends_mission_although_return_limit_check_fails(tmp_path: 
             async def changed() -> tuple[str, ...]:
                 raise AutopilotError("another station changed its fence")
 
-            world.observer._limit_return = fails
+            world.observer._safeguards = replace(world.observer._safeguards, limit_return=fails)
             world.fence.hold = changed  # type: ignore[method-assign]
             await world.until(lambda: world.outcome().startswith("failed:"), 30)
             reason = taken_over(world)[0]["reason"]
@@ -62,7 +63,7 @@ def test_system_returns_drone_if_rtl_limits_cannot_be_applied(tmp_path: Path) ->
             async def fails(_grant: object) -> tuple[str, ...]:
                 raise OSError("no space left on device")
 
-            world.observer._limit_return = fails
+            world.observer._safeguards = replace(world.observer._safeguards, limit_return=fails)
             await world.until(lambda: taken_over(world), 30)
             assert "no space left" in world.outcome()
 

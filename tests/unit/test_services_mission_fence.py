@@ -16,7 +16,7 @@ from fractus_core.geo import LocalFrame
 from fractus_runtime.mavlink_codec import Message
 from fractus_services.errors import AutopilotError
 from fractus_services.mobility.mavlink import fence as module
-from fractus_services.mobility.mavlink.fence import ROOM_M, MissionFence, MissionItem, fence_bounds
+from fractus_services.mobility.mavlink.fence import FENCE_MARGIN_M, MissionFence, MissionItem, fence_bounds
 from fractus_services.mobility.mavlink.mission_protocol import ItemsUnsupported, NoSpace
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
@@ -86,8 +86,8 @@ def test_fence_bounds_enclose_granted_area() -> None:
     assert bounds is not None
     assert bounds.altitude_m == 65.0
     whole = shapely.union(shapely.box(-50, -50, 50, 50), shapely.box(0, -120, 10, 0))
-    assert outline(bounds.items).contains(whole.buffer(ROOM_M - 0.5, join_style="mitre"))
-    assert outline(bounds.items).area < whole.buffer(3 * ROOM_M).area
+    assert outline(bounds.items).contains(whole.buffer(FENCE_MARGIN_M - 0.5, join_style="mitre"))
+    assert outline(bounds.items).area < whole.buffer(3 * FENCE_MARGIN_M).area
     assert {i.param1 for i in bounds.items} == {float(len(bounds.items))}
 
 
@@ -122,7 +122,7 @@ def test_fence_with_fewer_vertices_lies_further_out(circles: list[tuple[float, f
     assert 3 <= len(bounds.items) <= vertices
     whole = shapely.union_all([shapely.Point(x, y).buffer(radius, 64) for x, y, radius in circles])
     assert outline(bounds.items).is_valid
-    assert outline(bounds.items).contains(whole.buffer(ROOM_M - 0.5))
+    assert outline(bounds.items).contains(whole.buffer(FENCE_MARGIN_M - 0.5))
 
 
 async def test_vehicle_with_little_storage_gets_fewer_fence_vertices(
@@ -143,7 +143,7 @@ async def test_vehicle_with_little_storage_gets_fewer_fence_vertices(
     fence = MissionFence(vehicle, tmp_path)
     await fence.raise_around(spec(round_area), retraces=False)
     assert sent[-1] <= room < sent[0]
-    assert outline(vehicle.items).contains(shapely.Point(0, 0).buffer(300 + ROOM_M - 0.5))
+    assert outline(vehicle.items).contains(shapely.Point(0, 0).buffer(300 + FENCE_MARGIN_M - 0.5))
     await fence.lower(lambda: True)
     room = 3
     with pytest.raises(AutopilotError, match="Only 12 items"):

@@ -138,7 +138,7 @@ class Arming:
     async def _prepare_return(self, grant: ActiveGrant, home: tuple[float, float, float]) -> FailsafeStatus:
         """Choose the autopilot's return mode, raise its fence around the mission, and read the altitude of its return.
 
-        A vehicle records its path from where it armed last. If it arms away from home, it must not return on that path.
+        A vehicle records its path from the position where it armed. If that is not home, it must not return on the path.
 
         Returns:
             The verified failsafes. Failsafes that are set later were not chosen for this flight.
@@ -164,13 +164,13 @@ class Arming:
         return status
 
     def _update_status(self, before: FailsafeStatus, after: FailsafeStatus) -> FailsafeStatus:
-        """Store an updated result, unless the failsafes were set again meanwhile."""
+        """Store an updated status, unless the failsafes were verified again meanwhile."""
         if self._control.failsafe_status is before:
             self._control.failsafe_status = after
         return self._require_verified(after)
 
     def _require_verified(self, chosen: FailsafeStatus | None = None) -> FailsafeStatus:
-        """Return the failsafes if they are verified and, if given, are the chosen ones."""
+        """Return the failsafes if they are verified and if they equal `chosen`, which is optional."""
         status = self._control.failsafe_status
         if status is None or status.problem or (chosen is not None and status is not chosen):
             problem = (status.problem if status is not None else "") or BEING_SET
@@ -184,8 +184,8 @@ class Arming:
     def _home_of(self, grant: ActiveGrant, mission: Mission) -> tuple[float, float, float]:
         """Return the home of the mission: where it armed for its first takeoff.
 
-        Landing on the way and arming again does not move home. After an attempt that did not lead to a flight, home is the
-        present position, because the drone may have been moved or its estimate may have settled.
+        If the drone lands on the way and arms again, home does not move. If the previous attempt did not lead to a flight, home is
+        the current position, because the drone may have been carried or its position estimate may have become more accurate.
         """
         vehicle = self._control.autopilot.vehicle
         if vehicle.lat is None or vehicle.lon is None:

@@ -117,7 +117,7 @@ class ControlStore:
 
     @property
     def state(self) -> ControlState:
-        """The control state, with the present state of the vehicle."""
+        """The control state with the current state of the vehicle."""
         vehicle = self.autopilot.vehicle
         facts = VehicleFacts(
             connected=self.autopilot.connected,
@@ -183,14 +183,18 @@ class ControlStore:
         """Current motion."""
         active = self._state.motion
         motion = self.effects.motion
-        return motion if active is not None and motion is not None and motion.motion_id == active.motion_id else None
+        if active is None or motion is None or motion.motion_id != active.motion_id:
+            return None
+        return motion
 
     @property
     def constraints(self) -> FlightConstraints | None:
-        """Constraints of the current system flight; None if there is none."""
+        """Constraints of the current system flight, or None."""
         flight = self._state.flight
         constraints = self._constraints
-        return constraints if constraints and flight and constraints.flight_id == flight.flight_id else None
+        if flight is None or constraints is None or constraints.flight_id != flight.flight_id:
+            return None
+        return constraints
 
     @property
     def mission_grant(self) -> ActiveGrant | None:
@@ -235,7 +239,7 @@ class ControlStore:
         """Return why the drone cannot fly for a mission now, or None if it can."""
         vehicle = self.autopilot.vehicle
         located = vehicle.lat is not None and vehicle.home is not None
-        # In flight, the last known result stands in for a verification that is not possible at the moment.
+        # In flight, a known status is sufficient, even if the failsafes cannot be verified at the moment.
         problem = "" if self.failsafe_status is None or vehicle.armed else self.failsafe_status.problem
         unverified = BEING_SET if self.failsafe_status is None else problem
         readiness = Readiness(
@@ -387,7 +391,7 @@ class ControlStore:
             self.dispatch(WaypointsDone(grant.key, mission.waypoints + near, leg=True))
 
     def count_velocity_flight(self, grant: ActiveGrant) -> None:
-        """Record a velocity setpoint of a driver. It counts as a leg, because velocity flights have no end point."""
+        """Record a velocity setpoint of a driver. It counts as a completed leg, because a velocity flight has no target."""
         mission = self.mission(grant)
         if not mission.leg_flown:
             self.dispatch(WaypointsDone(grant.key, mission.waypoints, leg=True))
@@ -506,7 +510,7 @@ class ControlStore:
         self.dispatch(MotionFailed(motion.motion_id))
 
     def stop_motion(self, verdict: Verdict) -> None:
-        """End the current motion in favour of the next one."""
+        """End the current motion, because another one replaces it."""
         self.dispatch(MotionStopped(verdict.code, verdict.reason, verdict.policies))
 
     # Policies and grants

@@ -185,8 +185,8 @@ class EffectRunner:
     def run_all(self, actions: Sequence[Action]) -> None:
         """Carry out all actions in order.
 
-        The state already reflects all of them. One failure, for example of the audit log, must not prevent the others,
-        least of all a return flight.
+        The state already reflects all of them. A failed action, for example of the audit log, must not prevent the others,
+        above all a return flight.
 
         Raises:
             Exception: The first failure, after all actions were tried.
@@ -251,7 +251,7 @@ class EffectRunner:
         self._control.dispatch(SystemTaskEnded(task.task_id, finished=True))
 
     def _is_current(self, task: SystemTask) -> bool:
-        """Return True if a task may still command. A stopped task must not fly against its successor."""
+        """Return True if a task is current and may send commands."""
         state = self._control.state
         return state.task == task and state.authority is Authority.SYSTEM
 
@@ -263,7 +263,7 @@ class EffectRunner:
         self.tasks.spawn(self._modes.settle())
 
     def require_undisturbed(self) -> None:
-        """Permit for hovering after a driver's motion: no other motion has begun.
+        """Permit to hover after a driver's motion, while no other motion has begun.
 
         Raises:
             AutopilotError: Another motion has begun, or the driver has lost control.

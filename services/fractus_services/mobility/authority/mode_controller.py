@@ -1,6 +1,6 @@
 """Mode changes, braking and descent by the system.
 
-Every mode change is dispatched to the control state, so that it is not attributed to a pilot.
+Every mode change is dispatched to the control state. Otherwise it would be attributed to a pilot.
 """
 
 from __future__ import annotations
@@ -106,18 +106,18 @@ class ModeController:
             return False
         return True
 
-    async def carry_out(self, kind: TaskKind, wanted: Callable[[], bool], approach: Approach) -> None:
-        """Hover, or bring the drone to the ground. Retry as long as the link fails.
+    async def carry_out(self, kind: TaskKind, is_current: Callable[[], bool], approach: Approach) -> None:
+        """Hover, or bring the drone to the ground. Retry if the link fails.
 
         Args:
             kind: Kind of the system task.
-            wanted: Returns True while the task is current.
+            is_current: Returns True while the task is current.
             approach: Return flight up to the final descent.
         """
         vehicle = self._autopilot.vehicle
         attempts = 0
         refused = False
-        while (vehicle.armed or self._control.state.starting_motors) and wanted():
+        while (vehicle.armed or self._control.state.starting_motors) and is_current():
             try:
                 if self._control.state.starting_motors:
                     await self._autopilot.update(SETTINGS.task_retry_s)
@@ -128,32 +128,34 @@ class ModeController:
                 if (vehicle.reports_on_ground or not vehicle.in_air) and not refused:
                     refused = not await self.disarm()
                 else:
-                    await self._come_down(kind, attempts, wanted, approach)
+                    await self._come_down(kind, attempts, is_current, approach)
             except AutopilotError as error:
-                attempts += 0 if error.link else 1
+                attempts += not error.link
                 log.warning("modes: autopilot does not follow, retrying (task=%s error=%s)", kind.value, error)
             await asyncio.sleep(SETTINGS.task_retry_s)
 
-    async def _come_down(self, kind: TaskKind, attempts: int, wanted: Callable[[], bool], approach: Approach) -> None:
+    async def _come_down(
+        self, kind: TaskKind, attempts: int, is_current: Callable[[], bool], approach: Approach
+    ) -> None:
         """Land or return. A descent that the autopilot has already begun is only supervised."""
         vehicle = self._autopilot.vehicle
         expected = self._control.state.expected_mode == vehicle.mode
         if kind is TaskKind.LAND or not vehicle.mode.comes_down or not expected:
-            await self._brake(wanted)
+            await self._brake(is_current)
             mode = self._autopilot.stack.land
             if attempts < SETTINGS.max_return_attempts:
-                mode = await approach(kind, wanted, attempts)
-            await self.change_mode(mode, lambda: _require(wanted))
+                mode = await approach(kind, is_current, attempts)
+            await self.change_mode(mode, lambda: _require(is_current))
         while vehicle.armed and vehicle.mode.comes_down:
             await self._autopilot.update(1.0)
 
-    async def _brake(self, wanted: Callable[[], bool]) -> None:
-        """Brake in GUIDED until the drone is at rest, so that it turns home on the spot and not in a wide arc."""
+    async def _brake(self, is_current: Callable[[], bool]) -> None:
+        """Brake in GUIDED until the drone is at rest, so that it does not fly a wide arc when it turns home."""
         autopilot = self._autopilot
         vehicle = autopilot.vehicle
         deadline = autopilot.now + SETTINGS.brake_timeout_s
         autopilot.stop()
-        while wanted() and vehicle.in_air and vehicle.mode.commanded and autopilot.now < deadline:
+        while is_current() and vehicle.in_air and vehicle.mode.commanded and autopilot.now < deadline:
             if autopilot.at_rest or not vehicle.position_fresh(autopilot.now):
                 return
             autopilot.stop()
@@ -169,6 +171,6 @@ class ModeController:
             await self.settle()
 
 
-def _require(wanted: Callable[[], bool]) -> None:
-    if not wanted():
+def _require(is_current: Callable[[], bool]) -> None:
+    if not is_current():
         raise AutopilotError("the system has lost control of the drone")

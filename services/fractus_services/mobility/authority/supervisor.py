@@ -1,6 +1,6 @@
-"""Supervision of control authority, which the companion heartbeats depend on.
+"""Supervision of the control authority, on which the companion heartbeats depend.
 
-An armed drone without control authority is brought home, and the fence and limits of a mission are removed after it.
+An armed drone without control authority is brought home. The fence and limits of a mission are removed after the mission.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ log = logging.getLogger(__name__)
 
 
 class Supervisor:
-    """Runs in every iteration of the monitor's loop and decides whether heartbeats are sent.
+    """Supervises the control authority in every iteration of the monitor's loop.
 
-    The heartbeats that hold off the autopilot's own failsafe are sent only while `alive` returns True.
+    Heartbeats, which hold off the autopilot's own failsafe, are sent only while `alive` returns True.
     """
 
     def __init__(self, control: ControlStore, fence: Fence, limits: ReturnLimits) -> None:
@@ -34,7 +34,7 @@ class Supervisor:
         self._needed_at = -math.inf
 
     def tick(self) -> None:
-        """Take over a drone without control authority. Remove the fence and limits that no mission needs.
+        """Take over a drone without control authority, and remove a fence and limits that no mission needs.
 
         Raises:
             Exception: The control state failed. No heartbeats are sent until it works again.
@@ -56,7 +56,7 @@ class Supervisor:
                 self._lowering = control.tasks.spawn(self._lower())
 
     def alive(self) -> bool:
-        """Return True if the autopilot may rely on this companion."""
+        """Return True if this companion may hold off the autopilot's failsafe."""
         state = self._control.state
         autopilot = self._control.autopilot
         since = state.unattended_since

@@ -39,7 +39,7 @@ class VehicleObserver:
         self._restoring_home: asyncio.Task[None] | None = None
 
     def found(self) -> None:
-        """Handle a link to the autopilot that came up, for the first time or again."""
+        """Handle the identification of the vehicle on a new connection."""
         status = self._control.failsafe_status
         flying = self._control.autopilot.vehicle.armed
         self._control.failsafe_status = replace(status, problem=BEING_SET) if flying and status is not None else None
@@ -63,11 +63,11 @@ class VehicleObserver:
         """Restore home if another station moved it in flight."""
         control = self._control
         home = control.autopilot.vehicle.home
-        noted = self._home_moved
+        was_moved = self._home_moved
         self._home_moved = control.home_moved
         if not self._home_moved or home is None:
             return
-        if not noted:
+        if not was_moved:
             position = f"{home.lat:.7f}, {home.lon:.7f}, {home.amsl_m:.1f} m above mean sea level"
             log.warning("observer: home moved by another station (home=%s)", position)
             control.note(
@@ -103,7 +103,7 @@ class VehicleObserver:
         self._changed.set()
 
     async def _prepare(self) -> None:
-        """Set and verify the failsafes. Repeat until they are verified, because messages may be lost, and in flight."""
+        """Set and verify the failsafes. Retry after failures, because messages may be lost, and repeat the verification in flight."""
         autopilot = self._control.autopilot
         retry_s = SETTINGS.verify_min_retry_s
         while autopilot.found:
@@ -120,10 +120,10 @@ class VehicleObserver:
                 except Exception:
                     log.exception("observer: preparing the autopilot failed, retrying")
                 else:
-                    retry_s = min(
-                        2 * retry_s,
-                        SETTINGS.verify_interval_s if autopilot.vehicle.armed else SETTINGS.verify_max_retry_s,
-                    )
+                    limit_s = SETTINGS.verify_max_retry_s
+                    if autopilot.vehicle.armed:
+                        limit_s = SETTINGS.verify_interval_s
+                    retry_s = min(2 * retry_s, limit_s)
             else:
                 retry_s = SETTINGS.verify_min_retry_s
                 if autopilot.connected:
@@ -134,7 +134,7 @@ class VehicleObserver:
                     await self._changed.wait()
 
     async def _verify(self) -> None:
-        """Set and read back the failsafes, and the fence in flight. A drone that cannot keep them is brought home."""
+        """Set and read back the failsafes, and in flight also the fence. If they cannot be kept, the drone is brought home."""
         control = self._control
         before = control.failsafe_status
         flying = control.autopilot.vehicle.armed
@@ -172,7 +172,7 @@ class VehicleObserver:
         self._verified_at = control.autopilot.now
 
     def _bring_home(self, problem: str) -> None:
-        """Take over a drone whose autopilot alone would not bring it home, unless the system returns it already."""
+        """Take over a drone whose failsafes may not bring it home, unless the system already returns it."""
         if not self._control.state.returning:
             reason = f"the autopilot's own failsafes no longer protect the drone: {problem}"
             self._control.take_over(Verdict("takeover", None, "FailsafeLost", reason, (), "returnToLaunch"))

@@ -48,7 +48,7 @@ DRIVER_METHODS = frozenset(
 
 
 class PolicyGate:
-    """Judges calls against the present situation.
+    """Judges calls in the current situation.
 
     Args:
         control: Control state.
@@ -62,7 +62,7 @@ class PolicyGate:
         self._audit = audit
 
     def situation(self) -> Situation:
-        """Return the present state of the drone as the policy engine judges it.
+        """Return the current state of the drone for the policy engine.
 
         The position is unknown if it is stale, if the link is too slow, or if home was moved.
         """
@@ -200,7 +200,10 @@ class CallAuthorizer:
             raise Aborted("Replaced", "a later motion call replaced this call")
 
     def cancel_pending(self, grant: ActiveGrant) -> int:
-        """Number a motion call, which cancels waiting ones. Calls of callers without control cancel nothing."""
+        """Cancel waiting motion calls of the driver in control, and return the number of this call.
+
+        Calls of callers without control cancel nothing.
+        """
         self._motion_calls += self._has_control(grant)
         return self._motion_calls
 
@@ -256,9 +259,8 @@ class CallAuthorizer:
         try:
             return self._gate.judge(call, grant, kind=kind, known=known)
         finally:
-            rest_s = (time.perf_counter() - begun) * (
-                SETTINGS.driver_rest_factor if has_control else SETTINGS.others_rest_factor
-            )
+            factor = SETTINGS.driver_rest_factor if has_control else SETTINGS.others_rest_factor
+            rest_s = (time.perf_counter() - begun) * factor
             self._free_at[has_control] = max(self._free_at[has_control], self._control.autopilot.now + rest_s)
 
     def _deny_passenger(self, call: Call, grant: ActiveGrant, *, kind: str = "call") -> Verdict:

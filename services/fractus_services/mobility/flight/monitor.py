@@ -71,11 +71,10 @@ class MotionMonitor:
         """Monitor until cancelled."""
         autopilot = self._control.autopilot
         while True:
-            await autopilot.update(
-                SETTINGS.monitor_interval_s / autopilot.pace
-                if autopilot.vehicle.in_air
-                else SETTINGS.monitor_idle_interval_s
-            )
+            interval_s = SETTINGS.monitor_idle_interval_s
+            if autopilot.vehicle.in_air:
+                interval_s = SETTINGS.monitor_interval_s / autopilot.pace
+            await autopilot.update(interval_s)
             self._reset_return()
             if autopilot.vehicle.in_air:
                 self._control.dispatch(Airborne())
@@ -92,7 +91,7 @@ class MotionMonitor:
                 log.exception("monitor: supervisor failed, the autopilot's failsafe brings the drone home")
 
     def _reset_return(self) -> None:
-        """Forget that no legal return was found, once the drone is on the ground or flies something else."""
+        """Reset the given-up return when the drone has landed or carries out another motion in GUIDED."""
         control = self._control
         vehicle = control.autopilot.vehicle
         returns = control.state.returning or (control.motion is not None and control.motion.kind == "ReturnToLaunch")
@@ -100,7 +99,7 @@ class MotionMonitor:
             self._return_flight.given_up = None
 
     def check(self) -> None:
-        """Judge the present state once."""
+        """Judge the current state once and react to a violation."""
         control = self._control
         mode = control.autopilot.vehicle.mode
         piloted = control.authority is Authority.PILOT
@@ -112,10 +111,10 @@ class MotionMonitor:
             self._alarm = ""
             return
         uncommanded = not mode.commanded or (control.state.returning and control.motion is None)
-        acts = not uncommanded or self._may_take_back(verdict)
-        lasting = control.autopilot.now - self._alarm_at > SETTINGS.correction_timeout_s
-        fresh = verdict.code != self._alarm or (lasting and acts)
-        if fresh:
+        may_act = not uncommanded or self._may_take_back(verdict)
+        timed_out = control.autopilot.now - self._alarm_at > SETTINGS.correction_timeout_s
+        new_alarm = verdict.code != self._alarm or (timed_out and may_act)
+        if new_alarm:
             self._alarm = verdict.code
             self._alarm_at = control.autopilot.now
             policies = ",".join(verdict.policies) or "-"
@@ -124,21 +123,21 @@ class MotionMonitor:
                 verdict.code, mode.name, policies, verdict.reason,
             )  # fmt: skip
         if uncommanded:
-            if fresh:
-                self._note("takeBack" if acts else "alarm", verdict)
-            if fresh and acts:
+            if new_alarm:
+                self._note("takeBack" if may_act else "alarm", verdict)
+            if new_alarm and may_act:
                 self._take_back(verdict)
         elif verdict.code == POSITION_UNKNOWN:
-            self._hover(verdict, fresh)
+            self._hover(verdict, new_alarm)
         elif verdict.action == "takeover" and not by_system:
             control.take_over(verdict)
         elif verdict.action in {"takeover", "deny"}:
-            self._stop(verdict, fresh)
-        elif fresh:
+            self._stop(verdict, new_alarm)
+        elif new_alarm:
             self._correct(verdict, compiled)
 
     def _constraints(self) -> CompiledGrant | None:
-        """Return the constraints of the present flight; None if no grant applies.
+        """Return the constraints of the current flight; None if no Grant applies.
 
         A flight of the system or of the autopilot may be anywhere between home and operation area.
         """
@@ -151,18 +150,18 @@ class MotionMonitor:
         return control.for_transit(control.last_grant) if control.last_grant is not None else None
 
     def _judge(self, compiled: CompiledGrant) -> tuple[Verdict | None, bool]:
-        """Return the violation, if any, and whether the system already flies the drone, so that no takeover is needed."""
+        """Return the violation, if any. The second value is True if the system already flies the drone, so that no takeover is needed."""
         control = self._control
         now = self._gate.situation()
         changed = self._has_changed(compiled.fences_in_force(now.time_s))
         motion = control.motion
-        # The movement of a drone without a motion was never judged: another station commands it, or a motion has just ended.
-        # A drone that keeps its position only moves by gusts, which its margin covers.
+        # A movement without a motion was never judged: another station commands it, or a motion has just ended. If the drone keeps
+        # its position, only gusts move it, and its margin covers them.
         vehicle = control.autopilot.vehicle
         changed = changed or (motion is None and not vehicle.keeps_place(control.autopilot.now))
         current_leg = motion.leg if motion is not None and motion.under_way and not motion.braking else None
         if control.state.returning or not control.autopilot.vehicle.mode.commanded:
-            # The autopilot's own flights were never judged, whatever the grant.
+            # The autopilot's own flights were never judged.
             changed = changed or not control.autopilot.vehicle.mode.commanded
             return monitor(now, compiled, system_flies=True, fences_changed=changed, current_leg=current_leg), True
         verdict = monitor(now, compiled, fences_changed=changed, current_leg=current_leg)
@@ -181,8 +180,8 @@ class MotionMonitor:
     def _may_take_back(self, verdict: Verdict) -> bool:
         """Return True if the system may interrupt a flight of the autopilot.
 
-        It does not interrupt a mode that a pilot chose, or may have chosen before the service started, a landing by the system
-        or a failsafe, or the last resort of a return flight.
+        The system interrupts neither a mode that a pilot chose, or may have chosen before the service started, nor a landing by
+        the system or a failsafe, nor a return flight for which it found no legal route.
         """
         control = self._control
         mode = control.autopilot.vehicle.mode
@@ -196,7 +195,7 @@ class MotionMonitor:
         return returns and control.authority is Authority.SYSTEM
 
     def _take_back(self, verdict: Verdict) -> None:
-        """Stop the drone in GUIDED. The driver receives the reason, and the system searches a legal return."""
+        """Stop the drone in GUIDED. The driver receives the reason, or the system searches a legal return."""
         control = self._control
         state = control.state
         control.stop_motion(verdict)
@@ -209,7 +208,7 @@ class MotionMonitor:
         control.tasks.spawn(control.tasks.attempt(control.modes.hold, permit))
 
     def _has_changed(self, in_force: tuple[bool, ...]) -> bool:
-        """Return True if the present leg may have been judged under other constraints: a different grant or schedule."""
+        """Return True if the current leg may have been judged under other constraints, because a Grant or a schedule changed."""
         control = self._control
         grant = self._flown_grant
         autopilot = control.autopilot
@@ -218,28 +217,32 @@ class MotionMonitor:
             self._grant = grant
             self._in_force = in_force
             self._changed_at = autopilot.now
-        begins = autopilot.now - control.state.motion_began_at < SETTINGS.movement_timeout_s
-        if (motion is None or motion.kind == "Takeoff") and not begins and autopilot.vehicle.keeps_place(autopilot.now):
-            # Any later movement is judged under the present constraints, or later ones.
+        just_began = autopilot.now - control.state.motion_began_at < SETTINGS.movement_timeout_s
+        if (
+            (motion is None or motion.kind == "Takeoff")
+            and not just_began
+            and autopilot.vehicle.keeps_place(autopilot.now)
+        ):
+            # Every later movement is judged under the current constraints or under later ones.
             self._changed_at = -math.inf
         return autopilot.now - self._changed_at < SETTINGS.grant_change_s
 
-    def _stop(self, verdict: Verdict, fresh: bool) -> None:
+    def _stop(self, verdict: Verdict, new_alarm: bool) -> None:
         """End the motion that causes the violation. A system flight then searches a different route.
 
-        A motion that is still braking before its leg already does what is needed.
+        A motion that still brakes before its leg is not ended, because it stops the drone anyway.
         """
         control = self._control
         motion = control.motion
         braking = motion is not None and motion.braking
-        if not braking and (fresh or motion is not None):
+        if not braking and (new_alarm or motion is not None):
             control.brake(verdict)
         else:
             control.autopilot.stop()
 
-    def _hover(self, verdict: Verdict, fresh: bool) -> None:
+    def _hover(self, verdict: Verdict, new_alarm: bool) -> None:
         """Hover while the position is unknown. The driver keeps control for the grace time."""
-        if fresh or self._control.motion is not None:
+        if new_alarm or self._control.motion is not None:
             self._control.dispatch(PositionLost(verdict.reason))
         else:
             self._control.autopilot.stop()
@@ -251,7 +254,7 @@ class MotionMonitor:
 
     def _correct(self, verdict: Verdict, compiled: CompiledGrant) -> None:
         if self._control.constraints is not None and verdict.code in REPLAN_CODES:
-            self._stop(verdict, fresh=True)  # System flights search a different route by themselves.
+            self._stop(verdict, new_alarm=True)  # The system flight then searches a different route.
             return
         self._note(verdict.action, verdict)
         self._control.tasks.spawn(self._carry_out(verdict, self._control.motion, self._permits(), compiled))
@@ -288,14 +291,14 @@ class MotionMonitor:
             log.warning("monitor: correction failed (error=%s)", error)
 
     async def _slow_down(self, speed_mps: float, permit: Permit) -> None:
-        """Reduce the speed of the present leg. The next leg is judged on its own."""
+        """Reduce the speed of the current leg. The next leg is judged separately."""
         motion = self._control.motion
         if motion is not None and motion.speed_mps is not None:
             speed_mps = motion.speed_mps = min(speed_mps, motion.speed_mps)
         await self._control.autopilot.set_speed(speed_mps, permit)
 
     async def _lead_back(self, verdict: Verdict, target: GotoArgs, permits: Permits, compiled: CompiledGrant) -> None:
-        """Fly back into the limits, as a motion that replaces the one that violated them."""
+        """Fly back into the limits. This motion replaces the one that violated them."""
         control = self._control
         control.stop_motion(verdict)
         motion = control.begin_motion(CORRECTION)

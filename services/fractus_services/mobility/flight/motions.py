@@ -1,4 +1,4 @@
-"""Execution of motions: each sends its command, then follows the telemetry until the motion is complete."""
+"""Execution of motions: send the command, then report progress from telemetry until the motion is complete."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ async def climb(autopilot: Autopilot, motion: Motion, altitude_m: float, permit:
     vehicle = autopilot.vehicle
     await autopilot.take_off(altitude_m, permit)
     if vehicle.lat is not None and vehicle.lon is not None:
-        # The monitor permits the climb to this leg's altitude, where the autopilot ends it by itself.
+        # The monitor permits a climb up to the altitude of this leg. The autopilot ends the climb there.
         motion.leg = GotoArgs(vehicle.lat, vehicle.lon, altitude_m)
         motion.under_way = True
     progress_at = autopilot.now
@@ -67,12 +67,12 @@ async def fly_to(
 
     Args:
         autopilot: Autopilot interface.
-        motion: Motion that the leg belongs to.
-        args: Target of the leg; altitude above home. It has a speed, because the autopilot may not keep the previous one.
+        motion: Motion of the leg.
+        args: Target of the leg, with the altitude above home and the speed. Without a speed, the autopilot might use its default.
         reached_m: Distance to the target within which the leg is complete.
         permit: Check before each command.
-        judged: Check before each start of the leg, instead of `permit`. The drone moves on while commands are lost, so a leg
-            that was legal from its previous position may no longer be legal.
+        judged: Check before each transmission of the target, instead of `permit`. It judges the leg from the current position,
+            because the drone moves while commands are lost.
     """
     altitude = args.alt if args.alt is not None else autopilot.vehicle.altitude_m
     motion.leg = args
@@ -83,7 +83,7 @@ async def fly_to(
         await autopilot.go_to(args.lat, args.lon, altitude, args.yaw_deg, judged or permit)
         motion.under_way = True
         if not await _speed_acknowledged(autopilot, motion, permit):
-            # The drone flies at an unknown speed, perhaps its default, which may exceed a limit. Stop and retry once.
+            # The speed of the drone is unknown and may exceed a limit. Stop, and start the leg once more.
             motion.under_way = False
             await come_to_rest(autopilot, motion, permit)
             await autopilot.go_to(args.lat, args.lon, altitude, args.yaw_deg, judged or permit)
@@ -148,13 +148,13 @@ async def come_down(autopilot: Autopilot, motion: Motion) -> AsyncGenerator[Step
 async def rise(
     speed_mps: float, autopilot: Autopilot, motion: Motion, altitude_m: float, permit: Permit, *, judged: Permit
 ) -> AsyncGenerator[Step, None]:
-    """Climb to an altitude above home over the present position at rest, unless the drone is high enough; see `fly_to`."""
+    """Climb vertically to an altitude above home, unless the drone is high enough. The drone is at rest; see `fly_to`."""
     vehicle = autopilot.vehicle
     if vehicle.lat is None or vehicle.lon is None or vehicle.altitude_m > altitude_m - SETTINGS.height_reached_m:
         yield Step(0.0, True)
         return
-    place = GotoArgs(vehicle.lat, vehicle.lon, altitude_m, speed_mps=speed_mps)
-    async with aclosing(fly_to(autopilot, motion, place, SETTINGS.reached_m, permit, judged=judged)) as steps:
+    target = GotoArgs(vehicle.lat, vehicle.lon, altitude_m, speed_mps=speed_mps)
+    async with aclosing(fly_to(autopilot, motion, target, SETTINGS.reached_m, permit, judged=judged)) as steps:
         async for step in steps:
             yield step
 
@@ -217,7 +217,7 @@ class VelocityHold:
         self._watchdog: asyncio.Task[None] | None = None
 
     def start(self, setpoint: VelocityArgs, motion: Motion, permit: Permit) -> None:
-        """Send a setpoint and keep it in force, as a motion of its own.
+        """Send a setpoint and repeat it during its hold time.
 
         Raises:
             Refused: The caller may no longer move the drone.

@@ -48,7 +48,7 @@ class PoiMissions:
         self._connected: set[str] = set()
 
     def passenger_called(self, grant: ActiveGrant) -> None:
-        """Record a call of a component, which means that the passengers of its application have connected."""
+        """Record a call of a passenger. The passengers of its application then count as connected."""
         uid = grant.spec.application.uid
         if uid not in self._connected:
             self._connected.add(uid)
@@ -64,7 +64,7 @@ class PoiMissions:
             await control.changes.wait(SETTINGS.poi_check_interval_s)
 
     def _startable(self) -> ActiveGrant | None:
-        """Return the grant whose mission can start or resume now; None if there is none."""
+        """Return the Grant of a mission that can start or resume now, or None."""
         control = self._control
         grants = [grant for grant in self._grants.active.values() if grant.spec.tour]
         self._granted_at = {grant.key: self._granted_at.get(grant.key, control.autopilot.now) for grant in grants}
@@ -87,7 +87,7 @@ class PoiMissions:
         return connected or mission.flown or control.autopilot.now - self._granted_at[grant.key] >= self._boarding_s
 
     async def _run_mission(self, grant: ActiveGrant) -> None:
-        """Fly a mission as a system task. Its end counts only while the mission still has the drone."""
+        """Fly a mission as a system task. Its end is ignored if the mission no longer has the drone."""
         control = self._control
         control.note("tour", f"{len(grant.spec.tour)} points of interest for {grant.identity}")
         try:
@@ -132,7 +132,7 @@ class PoiMissions:
 
 
 def _is_transient(error: Refused | AutopilotError) -> bool:
-    """Return True if the error may pass, because the autopilot was not connected."""
+    """Return True if the autopilot was not connected, so that a later attempt may succeed."""
     if isinstance(error, AutopilotError):
         return error.link
     return isinstance(error, Unavailable)

@@ -37,7 +37,7 @@ log = logging.getLogger(__name__)
 
 
 class ReturnFlight:
-    """Brings the drone home.
+    """Flies the drone home.
 
     Args:
         control: Control state.
@@ -54,18 +54,20 @@ class ReturnFlight:
         self._routes = routes
         self.given_up: ActiveGrant | None = None
 
-    async def approach(self, kind: TaskKind, wanted: Callable[[], bool], attempts: int) -> FlightMode:
-        """Fly home for the system until only the descent is left. A drone that is to land does so, unless into a zone.
+    async def approach(self, kind: TaskKind, is_current: Callable[[], bool], attempts: int) -> FlightMode:
+        """Fly home for the system until only the descent is left.
+
+        A drone with the task to land lands at its position, unless it would descend into a zone.
 
         Args:
             kind: Task of the system: land or return.
-            wanted: Returns True while the task is current.
+            is_current: Returns True while the task is current.
             attempts: Number of attempts that failed.
 
         Returns:
-            The mode for the rest of the return. If no legal route is known, that is SMART_RTL if the autopilot recorded the
-            path flown, else RTL. A return through a zone is the lesser evil, because a drone that stays in the air comes down
-            anywhere when its battery is empty.
+            The mode for the rest of the return. If no legal route is known, that is SMART_RTL if the autopilot recorded its
+            path, else RTL. The drone then returns even through a zone, because a drone that stays in the air until its battery
+            is empty comes down at an arbitrary place.
 
         Raises:
             AutopilotError: The autopilot refused, or the link broke.
@@ -92,11 +94,12 @@ class ReturnFlight:
         if grant is None or not vehicle.in_air or vehicle.mode.comes_down or self._blind():
             return stack.return_straight
         try:
-            problem = (
-                await self._fly_home(grant, wanted)
-                if attempts < SETTINGS.max_route_attempts
-                else self._give_up(grant, attempts)
-            )
+            if attempts < SETTINGS.max_route_attempts:
+                problem = await self._fly_home(grant, is_current)
+            elif self._straight_return_legal(control.for_transit(grant)):
+                problem = ""
+            else:
+                problem = f"the autopilot refused {attempts} times"
         except AutopilotError:
             raise
         except Exception:
@@ -117,8 +120,8 @@ class ReturnFlight:
         """Restore home if it was moved, because the autopilot's own return leads there.
 
         Raises:
-            AutopilotError: Home was not restored. While the autopilot is connected this counts as an attempt, so that a station
-                that moves home repeatedly does not keep the drone in the air.
+            AutopilotError: Home was not restored. While the autopilot is connected, this counts as a refused attempt, so that
+                a station that moves home repeatedly cannot keep the drone in the air.
         """
         control = self._control
         try:
@@ -127,19 +130,11 @@ class ReturnFlight:
             raise AutopilotError(str(error), link=not control.autopilot.connected) from error
 
     def _path_is_home(self) -> bool:
-        """Return True if home was moved, so that only the path flown leads to where the mission armed."""
+        """Return True if home was moved and the autopilot recorded its path. The path then leads to where the mission armed."""
         return self._control.retraces and self._control.home_moved
 
-    def _give_up(self, grant: ActiveGrant, attempts: int) -> str:
-        """Return why the system no longer flies home; an empty string if the straight return is legal."""
-        return (
-            ""
-            if self._straight_return_legal(self._control.for_transit(grant))
-            else f"the autopilot refused {attempts} times"
-        )
-
-    async def _fly_home(self, grant: ActiveGrant, wanted: Callable[[], bool]) -> str:
-        """Fly home and return why that is impossible, or an empty string.
+    async def _fly_home(self, grant: ActiveGrant, is_current: Callable[[], bool]) -> str:
+        """Fly home. Return the reason if that is impossible, or an empty string.
 
         Raises:
             AutopilotError: The drone did not follow its commands.
@@ -148,7 +143,7 @@ class ReturnFlight:
         constraints = control.begin_system_flight(grant)
 
         def permit() -> None:
-            if not wanted() or control.constraints is not constraints:
+            if not is_current() or control.constraints is not constraints:
                 raise AutopilotError("the system has lost control of the drone")
 
         flight = SystemFlight(constraints, "Homeward", lambda motion: _both(permit, motion))
@@ -189,7 +184,7 @@ class ReturnFlight:
                 raise
 
     def descent(self, grant: ActiveGrant) -> FlightMode:
-        """Return the mode for the rest of the return: land at home, else return on the path flown or straight."""
+        """Return the mode for the rest of the return: landing at home, else a return along the recorded path or straight."""
         autopilot = self._control.autopilot
         stack = autopilot.stack
         if grant is self.given_up:
@@ -198,15 +193,15 @@ class ReturnFlight:
         return stack.land if at_home else stack.return_straight
 
     def _cannot_rest(self, refusal: Refused, flight: SystemFlight) -> bool:
-        """Return True if wind prevents the drone from resting at a place from which the straight return is legal."""
+        """Return True if the drone does not come to rest because of wind, and the straight return is legal from its position."""
         return refusal.verdict.code == "NotStopping" and self._straight_return_legal(flight.constraints.compiled)
 
     def _lands_in_zone(self, grant: ActiveGrant) -> bool:
-        """Return True if the drone would descend into a fence that it is above."""
+        """Return True if the drone is above a zone into which it would descend."""
         return descent_enters_fence(self._gate.situation(), self._control.for_transit(grant))
 
     def _blind(self) -> bool:
-        """Return True if position or home is unknown, so that only the autopilot can navigate."""
+        """Return True if position or home is unknown to the service. Only the autopilot can then navigate."""
         now = self._gate.situation()
         return now.lat is None or now.home is None
 
@@ -224,7 +219,7 @@ class ReturnFlight:
         return vehicle.distance_m(vehicle.home.lat, vehicle.home.lon) if vehicle.home is not None else math.inf
 
     async def _next_leg(self, flight: SystemFlight) -> NextLeg | None:
-        """Return the next leg home; None at home, or if no route can be planned.
+        """Return the next leg home. None at home, or if position or home is unknown.
 
         Raises:
             Refused: There is no legal route.
@@ -237,8 +232,8 @@ class ReturnFlight:
             return None
         for height in return_altitudes_m(now, flight.constraints.compiled, RTL_CONE_SLOPE * distance_m):
             vertical_first = may_change_altitude(now, flight.constraints.compiled, height)
-            # The system flies the whole route, so the autopilot's straight return need not be legal from its waypoints.
-            # `retraces` removes that condition from the search.
+            # The system flies the whole route. `retraces` removes the condition that the autopilot's straight return is legal
+            # from each waypoint.
             planned = replace(
                 now,
                 airframe=replace(now.airframe, retraces=True),

@@ -1,4 +1,4 @@
-"""System flights: the shortest legal route to a target, leg by leg, planned again around zones that appear on it."""
+"""System flights along the shortest legal route. The route is planned again before each leg, and when zones appear on it."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ REPLAN_CODES = frozenset(
         "OperationAreaBorderAhead", "OutsideOperationArea", "AltitudeAboveLimit", "AltitudeBelowLimit",
     }
 )  # fmt: skip
-"""Codes of legs that became illegal, so that a different route may be legal. Other codes end the flight."""
+"""Codes of legs that became illegal. Another route may still be legal. Other codes end the flight."""
 
 
 Search = Callable[[], Awaitable["NextLeg | None"]]
@@ -153,8 +153,7 @@ async def _first_leg(
     for height in heights_m:
         route = await in_slices(route_steps(begin, end, now, grant, height, from_m=now.altitude_m))
         if route is not None:
-            # If the drone is at the first waypoint already, the next leg is legal from here, and this leg would only change
-            # the altitude.
+            # If the drone is already at the first waypoint, skip it: the next leg is legal from the current position.
             reached = (
                 math.dist(begin, route[0]) <= SETTINGS.at_waypoint_m
                 and abs(now.altitude_m - height) <= SETTINGS.height_reached_m
@@ -167,7 +166,7 @@ async def _first_leg(
 def limited_mps(speed_mps: float, leg: GotoArgs, now: Situation, grant: CompiledGrant) -> float:
     """Return the highest speed that the limits along a leg allow, at most the requested one.
 
-    Lower limits are ignored and no limit refuses the leg, because the system returns even where a driver may not fly.
+    Minimum speeds are ignored, and no limit refuses the leg, because the system must return even from where a driver may not fly.
 
     Args:
         speed_mps: Requested speed.
@@ -235,14 +234,14 @@ class RouteFollower:
         autopilot = self._control.autopilot
         permit = flight.permit(motion)
         for _ in range(SETTINGS.max_legs):
-            # A leg is judged from the present position. A moving drone would begin it elsewhere.
+            # A leg is judged from the current position. A moving drone would begin the leg at another position.
             if not autopilot.at_rest:
                 await come_to_rest(autopilot, motion, permit)
             leg = await search()
             if leg is None:
                 return
             distance_m = autopilot.vehicle.distance_m(leg.args.lat, leg.args.lon)
-            # A leg that is shorter than the usual radius, for example out of a zone's margin, is flown nevertheless.
+            # Reduce the acceptance radius of a short leg, for example out of a zone's margin, so that the drone flies it.
             short = SETTINGS.at_waypoint_m < distance_m < 2 * leg.reached_m and not leg.last
             reached_m = min(leg.reached_m, max(distance_m / 3, SETTINGS.at_waypoint_m)) if short else leg.reached_m
             async with aclosing(fly_to(autopilot, motion, leg.args, reached_m, permit)) as steps:
@@ -257,14 +256,15 @@ class RouteFollower:
         grant = flight.constraints.compiled
         if now.lat is None or now.lon is None:
             raise Unavailable("AutopilotUnavailable", "the drone's position is not known")
-        wanted = now.altitude_m if target.alt is None else above_home_m(target.alt, target.reference, now.home, grant)
-        first = await first_leg((target.lat, target.lon), (wanted, now.altitude_m), now, flight)
+        altitude_m = now.altitude_m
+        if target.alt is not None:
+            altitude_m = above_home_m(target.alt, target.reference, now.home, grant)
+        first = await first_leg((target.lat, target.lon), (altitude_m, now.altitude_m), now, flight)
         if first is None:
             raise self._unreachable(flight, target)
         leg, last, height = first
-        # If the only legal route is at the present altitude, its end is an intermediate stop, where the drone climbs or
-        # descends.
-        if last and height != wanted:
+        # If the only legal route is at the current altitude, the drone stops at its end, and the next leg climbs or descends.
+        if last and height != altitude_m:
             if self._arrived(leg):
                 raise self._unreachable(flight, target)
             last = False

@@ -40,7 +40,7 @@ class Progress:
 
 
 class _Outdated(Aborted):
-    """The verdict on a leg changed before its command was acknowledged. Carries the present verdict."""
+    """The verdict on a leg changed before its command was acknowledged. `verdict` is the current one."""
 
     def __init__(self, verdict: Verdict) -> None:
         super().__init__("NotFollowing", "the verdict on the leg changed before the autopilot acknowledged the command")
@@ -105,11 +105,11 @@ class MobilityService:
         return verdict, speed
 
     def _limit_to_leg(self, grant: ActiveGrant, verdict: Verdict, requested_mps: float) -> tuple[Verdict, float]:
-        """Limit a new speed to what the rest of the current leg allows. A leg that is not legal faster keeps its speed."""
+        """Limit a new speed to the speed that is legal on the rest of the current leg. If no higher speed is legal, the leg keeps its speed."""
         motion = self._control.motion
         if motion is None or motion.leg is None or motion.speed_mps is None or requested_mps <= motion.speed_mps:
             return verdict, requested_mps
-        # The leg was judged with its speed. A faster drone needs a wider margin to every border along the rest of it.
+        # The leg was judged at its speed. A faster drone needs a wider margin to every border along the rest of the leg.
         leg = replace(motion.leg, speed_mps=requested_mps)
         speed = motion.speed_mps
         rest = self.calls.check(Call("Goto", leg), grant)
@@ -143,7 +143,7 @@ class MobilityService:
         return verdict
 
     def take_off(self, grant: ActiveGrant, args: TakeoffArgs) -> AsyncGenerator[Progress, None]:
-        """Take off. In the air, climb to the altitude, or do nothing above it, because a takeoff may be sent again."""
+        """Take off. In the air, climb to the altitude unless the drone is high enough, because clients repeat a takeoff."""
         call = Call("Takeoff", args)
         self._require_armed(call, grant)
         verdict = self.calls.allow_motion(call, grant)
@@ -209,7 +209,7 @@ class MobilityService:
         return self._run("Goto", grant, steps)
 
     def _rejudging_permit(self, call: Call, grant: ActiveGrant, verdict: Verdict, permit: Permit) -> Permit:
-        """Return a permit that judges the leg again, from the present position, if its command is sent late."""
+        """Return a permit that judges the leg again from the current position if its command is sent late."""
         judged_at = self._autopilot.now
 
         def check() -> None:
@@ -262,7 +262,7 @@ class MobilityService:
         return final, setpoint
 
     def land(self, grant: ActiveGrant) -> AsyncGenerator[Progress, None]:
-        """Land at the present position."""
+        """Land at the current position."""
         self.calls.cancel_pending(grant)
         verdict = self.calls.allow_motion(Call("Land"), grant)
         _require_in_air(self._autopilot, "Land")
@@ -320,7 +320,7 @@ class MobilityService:
     def _require_armed(self, call: Call, grant: ActiveGrant) -> None:
         """Refuse a takeoff that cannot be carried out, before its expensive judgement.
 
-        A method that is not granted is left to the judgement, which writes the refusal to the audit log.
+        Calls of a method that is not granted are not refused here: the judgement refuses them and writes the audit log.
         """
         if grant.spec.class_ != "driver" or call.method not in grant.compiled.methods:
             return

@@ -43,7 +43,7 @@ def start_of(point: ControlPoint) -> Position:
 
 
 class TransitFlight:
-    """Arms, takes off and flies to the start of a control point, judged by the same policies as a driver."""
+    """Arms, takes off and flies to the start of a control point. The same policies apply as to a driver."""
 
     def __init__(self, control: ControlStore, arming: Arming, gate: PolicyGate, routes: RouteFollower) -> None:
         self._control = control
@@ -97,8 +97,7 @@ class TransitFlight:
         motion = control.begin_motion("Takeoff", flight.permit)
         permit = flight.permit(motion)
         try:
-            # `standing` is reported by the autopilot, `in_air` is also True if uncertain: for an armed drone on a raised pad
-            # both are True.
+            # For an armed drone on a raised pad both properties are True, because `in_air` also considers the altitude.
             if vehicle.reports_on_ground or not vehicle.in_air:
                 yield "the system arms the drone"
                 if vehicle.armed:

@@ -22,9 +22,16 @@ from fractus_services.mobility.mavlink.vehicle_identification import KnownVehicl
 log = logging.getLogger(__name__)
 
 HEARTBEAT_S = 1.0
+"""Interval between heartbeats, in seconds of the vehicle's clock."""
+
 SILENCE_S = 3.0
+"""Time without a heartbeat of the vehicle after which it counts as disconnected."""
+
 RECONNECT_AFTER_S = 6.0
+"""Time without a heartbeat of the vehicle after which the connection is opened again."""
+
 BACKOFF_S = (0.2, 3.0)
+"""First and longest delay between attempts to connect."""
 
 
 def ignore(_data: bytes) -> None:
@@ -35,8 +42,8 @@ class MessageSubscriptions:
     """Message queues of subscribers, filtered by message name.
 
     Args:
-        sysid: System id of the subscribers. Messages for other systems are dropped, because an answer to another station on
-            the same link does not mean that this system's command arrived.
+        sysid: System id of the subscribers. Messages for other systems are dropped, because they may answer another station's
+            command.
     """
 
     def __init__(self, sysid: int) -> None:
@@ -68,11 +75,12 @@ class AutopilotLink:
     Args:
         url: URL of the autopilot, see `open_link`.
         stack: Firmware of the autopilot.
-        alive: Returns True while the companion works. Otherwise no heartbeats are sent, so that the autopilot's own failsafe acts.
+        alive: Returns True while this service controls the drone. Otherwise no heartbeats are sent, and the autopilot's own
+            failsafe acts.
         on_found: Callback invoked when the vehicle is identified, again after each reconnection.
         on_heartbeat: Callback invoked for each heartbeat of the vehicle after the state was updated.
         sysid: System id of this end of the link.
-        known_vehicle: File with the identity of the drone's own vehicle. Without it, the first vehicle is taken.
+        known_vehicle: File with the identity of the drone's own vehicle. Without it, the first vehicle is selected.
         received: Callback that receives a copy of all received bytes. It must neither block nor raise.
         sent: Callback that receives a copy of each sent frame. It must neither block nor raise.
 
@@ -154,7 +162,7 @@ class AutopilotLink:
         while True:
             try:
                 self._broken.clear()
-                # Half a frame of the old connection must not swallow the first frame of the new one.
+                # Discard an incomplete frame of the old connection. It would corrupt the first frame of the new one.
                 self._endpoint = Endpoint(self._sysid, COMPONENT_ID)
                 self._transport = await open_link(self.url, self._received, self._closed)
             except BadUrl:
@@ -205,7 +213,7 @@ class AutopilotLink:
             self.send(message("TIMESYNC", ts1=number))
 
     def send_heartbeat(self) -> None:
-        """Send a heartbeat now if the companion works."""
+        """Send a heartbeat now if this service controls the drone."""
         if not self._alive():
             if not self.found:
                 self._send_first_message()
@@ -213,11 +221,11 @@ class AutopilotLink:
         self.send(heartbeat())
 
     def _send_first_message(self) -> None:
-        """Send a message other than a heartbeat: an autopilot behind UDP sends only to peers that sent something."""
+        """Send a message other than a heartbeat, because an autopilot behind UDP sends only to known peers."""
         self.send(message("PARAM_REQUEST_READ", param_index=-1, param_id=self.stack.probe_parameter.encode()))
 
     def _lost(self) -> None:
-        """Reset everything that was agreed with the vehicle on the broken connection."""
+        """Discard the state that belongs to the broken connection."""
 
     def send(self, outgoing: Message) -> None:
         """Send a message. Without a connection it is dropped."""
@@ -266,7 +274,7 @@ class AutopilotLink:
             self.notify()
 
     def _restarted(self) -> bool:
-        """Return True if the vehicle has restarted; then reconnect, because rates, parameters and other agreements are void."""
+        """Return True if the vehicle has restarted. The link then reconnects, because rates and parameters must be set again."""
         if self.timing.restarted and not self._broken.is_set():
             log.warning("link: autopilot restarted, reconnecting (url=%s)", self.url)
             self._broken.set()
@@ -292,7 +300,7 @@ class AutopilotLink:
         return self._subscriptions.subscribe(*names)
 
     def recipient(self) -> dict[str, int]:
-        """Return the target fields of messages to the vehicle, even if the vehicle is silent.
+        """Return the target fields of messages that are also sent to a vehicle without recent heartbeats.
 
         Raises:
             AutopilotError: The vehicle was not identified since the connection was opened.
@@ -302,7 +310,7 @@ class AutopilotLink:
         return {"target_system": self.target[0], "target_component": self.target[1]}
 
     def address(self) -> dict[str, int]:
-        """Return the target fields of messages to the vehicle.
+        """Return the target fields of messages to a connected vehicle.
 
         Raises:
             AutopilotError: The vehicle is not connected.

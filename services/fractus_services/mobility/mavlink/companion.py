@@ -6,7 +6,7 @@ from fractus_runtime.mavlink_codec import Message, message
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 SYSTEM_ID = 244
-"""The companion is a system of its own. Only its heartbeats hold off the autopilot's failsafe, not those of ground stations (255)."""
+"""System id of the companion. The autopilot's failsafe reacts to missing heartbeats of this id, and ignores ground stations (255)."""
 
 COMPONENT_ID = mavlink.MAV_COMP_ID_ONBOARD_COMPUTER
 

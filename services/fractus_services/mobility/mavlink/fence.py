@@ -25,19 +25,21 @@ log = logging.getLogger(__name__)
 
 _RESTORE_TIMEOUT_S = 5.0
 ITEMS_AGAIN_S = 60.0
-"""Interval of reading the items in flight. No message shows if another station replaced them by as many others."""
+"""Interval at which the items are read in flight. Only this shows if another station replaced them by the same number of items."""
 
 _SWITCHED = mavlink.FENCE_TYPE_ALT_MAX | mavlink.FENCE_TYPE_CIRCLE | mavlink.FENCE_TYPE_POLYGON
-"""All fence types except the minimum altitude, which the autopilot enables by itself."""
+"""All fence types except the minimum altitude, which the autopilot enables automatically."""
 
 _CLOSE_E7 = 2
-"""Autopilots that store floats return positions that differ by a few centimetres."""
+"""Tolerated difference of positions, degrees times 1e7. Autopilots that store floats are off by a few centimetres."""
 
 
-ROOM_M = 10.0
+FENCE_MARGIN_M = 10.0
 """Margin between the granted area and the fence, in metres. The service's own monitor acts long before the fence."""
 
-HEADROOM_M = 5.0
+CEILING_MARGIN_M = 5.0
+"""Margin between the maximum altitude of the grant and the ceiling of the fence, in metres."""
+
 MAX_VERTICES = (60, 30, 15, 8, 4)
 """Numbers of vertices, tried in this order. The capacity depends on the autopilot's board and on the owner's fence."""
 
@@ -67,7 +69,7 @@ def fence_bounds(spec: GrantSpec, vertices: int = MAX_VERTICES[0]) -> FenceBound
         spec: Specification of the Grant.
         vertices: Maximum number of vertices, at least 4. With fewer vertices, the polygon is larger and never smaller.
     """
-    altitude = spec.limits.max_altitude + HEADROOM_M if spec.limits is not None else None
+    altitude = spec.limits.max_altitude + CEILING_MARGIN_M if spec.limits is not None else None
     items: tuple[MissionItem, ...] = ()
     if spec.operation_area:
         frame = LocalFrame.at(area_center(spec.operation_area[0]))
@@ -87,14 +89,16 @@ def _outline(whole: shapely.Geometry, vertices: int) -> shapely.Polygon:
     """Return the smallest of several polygons with a limited number of vertices around a geometry and its margin."""
     outlines: list[shapely.Geometry] = []
     for simpler_m in _SIMPLER_M:
-        # Simplification may shrink the shape by about its tolerance, so the shape is grown by that much before.
-        grown = whole.buffer(ROOM_M + simpler_m, join_style="mitre", mitre_limit=2.0).simplify(simpler_m)
+        # Simplification may shrink the shape by about its tolerance, so it is enlarged by the tolerance first.
+        grown = whole.buffer(FENCE_MARGIN_M + simpler_m, join_style="mitre", mitre_limit=2.0).simplify(simpler_m)
         outlines += [grown, grown.convex_hull]
-    box = whole.buffer(ROOM_M + _SIMPLER_M[0]).minimum_rotated_rectangle
-    rings = [shapely.Polygon(each.exterior) for each in (*outlines, box) if isinstance(each, shapely.Polygon)]
-    # GEOS may also drop a ring's first corner, and shrink the shape by more.
-    roomy = (ring for ring in rings if ring.exterior.distance(whole) >= ROOM_M)
-    return min((ring for ring in roomy if len(ring.exterior.coords) - 1 <= vertices), key=lambda ring: float(ring.area))
+    box = whole.buffer(FENCE_MARGIN_M + _SIMPLER_M[0]).minimum_rotated_rectangle
+    rings = [shapely.Polygon(outline.exterior) for outline in (*outlines, box) if isinstance(outline, shapely.Polygon)]
+    # GEOS may also drop the first corner of a ring. Such a ring may be too small and is rejected here.
+    candidates = (ring for ring in rings if ring.exterior.distance(whole) >= FENCE_MARGIN_M)
+    return min(
+        (ring for ring in candidates if len(ring.exterior.coords) - 1 <= vertices), key=lambda ring: float(ring.area)
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,17 +109,18 @@ class Owned:
         parameters: Fence parameters that the vehicle has.
         items: Polygons and circles.
         raised: Parameters of the mission's fence once it is raised.
-        around: Items of the mission's fence, including active items of the owner; None for a fence that an older release raised.
+        mission_items: Items of the mission's fence, including active items of the owner. None for a fence that an older release
+            raised.
     """
 
     parameters: dict[str, float]
     items: tuple[MissionItem, ...]
     raised: dict[str, float] = field(default_factory=dict)
-    around: tuple[MissionItem, ...] | None = None
+    mission_items: tuple[MissionItem, ...] | None = None
 
 
 class MissionFence:
-    """Raises and lowers the vehicle's fence. The owner's fence is stored on disk before anything is changed.
+    """Raises and lowers the vehicle's fence. The owner's fence is stored on disk before the first change.
 
     An active fence of the owner stays active: the mission's fence is added to it, and the lower ceiling applies.
 
@@ -139,7 +144,7 @@ class MissionFence:
 
     @property
     def raised(self) -> bool:
-        """True while the vehicle has a fence of the service."""
+        """True while the vehicle has a fence that this service set."""
         return self._path.exists()
 
     async def raise_around(self, spec: GrantSpec, *, retraces: bool) -> None:
@@ -167,7 +172,7 @@ class MissionFence:
                 self._set_missing(str(error))
 
     async def lower(self, idle: Callable[[], bool]) -> None:
-        """Restore the owner's fence if it was changed.
+        """Restore the owner's fence.
 
         Args:
             idle: Returns True if no mission needs the fence. Called while no other change is in progress.
@@ -201,17 +206,17 @@ class MissionFence:
             items = (await self._parameters.read([(total,)])).get(total, 0.0)
             if items != raised[total]:
                 raise AutopilotError(f"another station changed its fence from {raised[total]:g} to {items:g} items")
-        if owned.around is not None and self._autopilot.now - self._compared_at >= ITEMS_AGAIN_S:
-            if not _same(await download(self._autopilot), owned.around):
+        if owned.mission_items is not None and self._autopilot.now - self._compared_at >= ITEMS_AGAIN_S:
+            if not _same(await download(self._autopilot), owned.mission_items):
                 raise AutopilotError("another station replaced the items of its fence")
             self._compared_at = self._autopilot.now
         return changed
 
     async def _switch_on(self) -> tuple[str, ...]:
-        """Enable the fence again if it was disabled by another station's command or a switch of the radio. No parameter shows that.
+        """Enable the fence again if a command of another station or a switch of the radio disabled it. No parameter shows this.
 
-        The fence stays disabled while the autopilot lands or returns, because the autopilot may have disabled it, and while a pilot
-        flies.
+        The fence stays disabled while a pilot flies, and while the autopilot lands or returns, because it may have disabled the fence
+        itself.
         """
         vehicle = self._autopilot.vehicle
         left_alone = vehicle.armed and not vehicle.mode.commanded
@@ -245,25 +250,25 @@ class MissionFence:
         if self._standing == (bounds, retraces) and await self._stands(owned):
             return
         self._standing = None
-        # ArduPilot determines the active fence types only when the fence is enabled, so it is disabled first.
+        # ArduPilot reads the fence types only when the fence is enabled, so disable it first.
         try:
             await self._set({switch: 0.0})
-            around = await self._load_around(spec, kept)
+            mission_items = await self._load_around(spec, kept)
             values = self._stack.fence_values(
                 owned.parameters, ceiling_m=bounds.altitude_m, polygon=bool(bounds.items), retraces=retraces
             )
             await self._set(values)
             total = await self._parameters.read([(self._stack.fence_total,)])
-            await asyncio.to_thread(self._store, replace(owned, raised=values | total, around=around))
+            await asyncio.to_thread(self._store, replace(owned, raised=values | total, mission_items=mission_items))
             self._standing = bounds, retraces
             self._compared_at = self._switched_at = self._autopilot.now
         except (AutopilotError, asyncio.CancelledError):
             await self._recover(owned)
             raise
-        log.info("fence: raised (vertices=%d, ceiling_m=%s)", len(around) - len(kept), bounds.altitude_m)
+        log.info("fence: raised (vertices=%d, ceiling_m=%s)", len(mission_items) - len(kept), bounds.altitude_m)
 
     async def _load_around(self, spec: GrantSpec, kept: Sequence[MissionItem]) -> tuple[MissionItem, ...]:
-        """Load the outer bounds in addition to the kept items, with fewer vertices if the capacity is exceeded.
+        """Load the outer bounds in addition to the kept items. Reduce the number of vertices if the capacity is exceeded.
 
         Returns:
             The loaded items.
@@ -287,7 +292,7 @@ class MissionFence:
         raise refused
 
     async def _stands(self, owned: Owned) -> bool:
-        """Return True if the fence is still raised as before, so that a repeated arming need not load it again."""
+        """Return True if the fence is still raised as before. A repeated arming attempt then does not load it again."""
         try:
             self._compared_at = -math.inf
             await self._keep(owned)
@@ -298,7 +303,7 @@ class MissionFence:
         return True
 
     async def _recover(self, owned: Owned) -> None:
-        """Restore the owner's fence after a failure if that is possible at once. Otherwise, `lower` tries again later."""
+        """Try to restore the owner's fence after a failure. If that fails, `lower` tries again later."""
         try:
             async with asyncio.timeout(_RESTORE_TIMEOUT_S):
                 await self._restore(owned)
@@ -348,11 +353,11 @@ class MissionFence:
         remove_temporary(self._path)
         try:
             stored = json.loads(self._path.read_bytes())
-            items, around = (
-                tuple(MissionItem(**item) for item in found) if found is not None else None
-                for found in (stored["items"], stored.get("around"))
-            )
-            return Owned(dict(stored["parameters"]), items or (), stored.get("raised", {}), around)
+            items = tuple(MissionItem(**item) for item in stored["items"])
+            mission_items = None
+            if stored.get("mission_items") is not None:
+                mission_items = tuple(MissionItem(**item) for item in stored["mission_items"])
+            return Owned(dict(stored["parameters"]), items, stored.get("raised", {}), mission_items)
         except FileNotFoundError:
             return None
         except (ValueError, KeyError, TypeError) as error:

@@ -1,8 +1,8 @@
-"""Heartbeats while the service starts, because a start on a small computer takes longer than the failsafe of a flying drone waits.
+"""Heartbeats while the service starts, because a start on a small computer may exceed the heartbeat timeout of a flying drone.
 
-These heartbeats claim that the drone is under control before the service controls it. They are therefore sent only to the drone's
-own vehicle, while it flies and none of its failsafes acts, for a limited time, and only if the previous run of the service
-identified its vehicle. A service that keeps crashing before that point leaves the drone to the autopilot's failsafe.
+These heartbeats hold off the autopilot's failsafe before the service controls the drone. They are therefore sent only to the drone's
+own vehicle, only while it flies and none of its failsafes acts, and only for a limited time. They also require that the previous run
+of the service identified its vehicle. If the service repeatedly crashes before that, the autopilot's failsafe acts.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ async def _send_heartbeats(state: Path, url: str | None) -> None:
 
 
 async def _hold_off_failsafe(url: str, own: Source) -> None:
-    """Answer each heartbeat of the vehicle that needs an answer, until cancelled."""
+    """Reply to heartbeats of the flying vehicle until cancelled."""
     while True:
         responder = _HeartbeatResponder(own)
         with suppress(ConnectionError):
@@ -100,7 +100,7 @@ async def _hold_off_failsafe(url: str, own: Source) -> None:
 
 
 class _HeartbeatResponder:
-    """This end of one connection during the start.
+    """Sends a heartbeat for each heartbeat of the vehicle on one connection.
 
     Args:
         own: System and component id of the drone's own vehicle.
@@ -115,11 +115,11 @@ class _HeartbeatResponder:
         self.broken = asyncio.Event()
 
     def closed(self, _error: Exception | None) -> None:
-        """Note that the connection broke."""
+        """Record that the connection broke."""
         self.broken.set()
 
     def received(self, data: bytes) -> None:
-        """Answer the vehicle's heartbeats, so that the answers follow the vehicle's clock, as its failsafe does."""
+        """Reply to the vehicle's heartbeats. The replies thereby follow the vehicle's clock, like the timeout of its failsafe."""
         for incoming in self._endpoint.decode(data):
             if incoming.name != "HEARTBEAT" or (incoming.sysid, incoming.compid) != self._own:
                 continue
@@ -131,7 +131,7 @@ class _HeartbeatResponder:
                 self._send(heartbeat())
 
     def send_first_message(self) -> None:
-        """Send a message other than a heartbeat: an autopilot behind UDP sends only to peers that sent something."""
+        """Send a message other than a heartbeat, because an autopilot behind UDP sends only to known peers."""
         if not self._received_heartbeat:
             self._send(message("TIMESYNC", ts1=1))
 

@@ -1,4 +1,4 @@
-"""Requests for telemetry: message rates, repeated if messages stay away, and HOME_POSITION if home has moved."""
+"""Requests for telemetry: message rates, requested again if messages are missing, and HOME_POSITION if home has moved."""
 
 from __future__ import annotations
 
@@ -32,16 +32,16 @@ RATES_HZ = {
 """Requested messages with their rates on the ground and in the air."""
 
 CHECK_PERIOD_S = 5.0
-"""Received messages are counted for this time before they are compared with the requested rates."""
+"""Time for which received messages are counted before they are compared with the requested rates."""
 
 MIN_SHARE = 0.25
-"""A smaller share of the requested rate means that the stream was stopped or slowed down. A bad link loses less."""
+"""Share of the requested rate below which the stream was stopped or slowed down. A bad link loses fewer messages."""
 
 _OPTIONAL = frozenset({"WIND", "GIMBAL_DEVICE_ATTITUDE_STATUS"})
 """Messages that an autopilot sends only while it estimates the wind or measures the gimbal's attitude."""
 
 MAX_CHECK_PERIOD_S = 40.0
-"""Each unsuccessful request doubles the check period up to this limit: behind a slow radio, requests do not help."""
+"""Longest check period. Each unsuccessful request doubles the period, because requests do not help behind a slow radio."""
 
 MAX_NEVER_RECEIVED = 5
 """Number of repeated requests because of an accepted message that never arrived.
@@ -51,7 +51,7 @@ cannot send.
 """
 
 HOME_JUMP_M = 1.0
-"""The difference of the altitudes above home and above sea level, of one estimate, changes by more only if home was moved."""
+"""Change of home's altitude above sea level, computed from one position message, above which home was moved."""
 
 HOME_RETRY_S = 0.3
 """Time to wait for a requested HOME_POSITION before it is requested again."""
@@ -95,8 +95,8 @@ class TelemetryRates:
     async def request(self, autopilot: CommandSender, flying: bool) -> None:
         """Request the rates for the ground or the air if they were not requested yet or if messages are missing.
 
-        A message that the autopilot refuses keeps the autopilot's own rate. After a lost acknowledgement, the next call requests
-        the rates again. Call this method about twice a second, or at least as often as failsafes are verified.
+        If the autopilot refuses a rate, the message keeps its default rate. After a lost acknowledgement, the next call requests the
+        rates again. Call this method about twice a second, or at least as often as failsafes are verified.
         """
         if self._flying is flying and not self._messages_missing(flying, autopilot.now):
             return
@@ -162,7 +162,7 @@ class HomeRequester(Protocol):
 class HomePositionMonitor:
     """Detects that home was moved although HOME_POSITION was lost, and requests the message until it arrives.
 
-    Each position shows the altitude of home above sea level. A horizontal move of home is visible in HOME_POSITION only.
+    Each position message contains the altitude of home above sea level. A horizontal move of home is visible in HOME_POSITION only.
     """
 
     def __init__(self, autopilot: HomeRequester) -> None:

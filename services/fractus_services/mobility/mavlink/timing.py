@@ -1,10 +1,10 @@
 """Upper bounds of the delays of vehicle state and commands, in seconds of the vehicle's clock.
 
 The autopilot stamps its positions and the TIMESYNC requests that it receives with one clock. The offset of this clock is unknown.
-Let E be the latest reading of that clock that received positions prove. A request that is sent at E and received at H took at most
-H - E longer than the fastest position: uplink and downlink together. A position stamped S is E - S older than the fastest one would
-be. The sum E - S + max(H - E) bounds the time from a position to the effect of a command that is sent now. The unknown offset
-cancels, whichever direction is slower.
+Let E be the latest reading of that clock that received positions prove: the clock shows at least E now. A request that is sent at E
+and stamped H on reception took at most H - E longer on the uplink than the fastest position took on the downlink. A position stamped S
+is E - S older than the fastest possible one. The sum E - S + max(H - E) therefore bounds the time from a position to the effect of a
+command that is sent now. The unknown offset cancels, whichever direction is slower.
 """
 
 from __future__ import annotations
@@ -17,41 +17,47 @@ from itertools import islice
 from fractus_services.mobility.autopilot import MAX_POSITION_AGE_S
 
 PROBE_S = 0.2
-"""Interval of measurements."""
+"""Interval between measurements."""
 
 WINDOW_S = 10.0
-"""Period of which the longest delay counts."""
+"""Period over which the longest delay is taken."""
 
 ENVELOPE_S = 2.0
 """Period of positions that prove the current reading of the vehicle's clock."""
 
 STALE_S = 3.0
-"""The delay is unknown after this time without an answer, in which 15 answers were due."""
+"""Time without an answer after which the delay is unknown. In this time, 15 answers were due."""
 
 UNANSWERED = 10
-"""After this number of consecutive unanswered requests, acknowledgements of commands measure the link."""
+"""Number of consecutive unanswered requests after which acknowledgements of commands measure the link."""
 
 RATE_S = (1.0, 10.0)
-"""Shortest and longest period over which the vehicle's clock is compared."""
+"""Shortest and longest period over which the vehicle's clock is compared with real time."""
 
 REACTION_S = 0.25
 """Additional delay: the autopilot's loops, the time to tilt, and one lost or overtaken command that is sent again."""
 
 MAX_ARMING_DELAY_S = 1.2
+"""Round-trip delay above which arming is refused."""
+
 MAX_DELAY_S = 1.8
-"""A round-trip delay above the first forbids arming. Above the second, a flying drone hovers."""
+"""Round-trip delay above which a flying drone hovers."""
 
 MAX_PACE = 6.0
 """Fastest simulation that the service can follow, as a multiple of real time."""
 
 OVERTAKEN_S = 5.0
-"""A position that is older than the last one by less than this was overtaken. An older one is either very late, or the vehicle has
-restarted. In the latter case the next position continues from it.
+"""Age difference below which a position that is older than the last one was overtaken by it.
+
+A position that is even older is either very late, or the vehicle has restarted. After a restart, the next position continues from it.
 """
 
 _WRAP_MS = 1 << 32
 _SLACK_S = 0.5
-"""Positions may wait in the autopilot before they are sent. A reply that differs by more is from another clock."""
+"""Tolerance of a measured delay, because positions may wait in the autopilot before they are sent.
+
+A reply outside the tolerance is from another clock.
+"""
 
 
 class Timing:
@@ -71,13 +77,13 @@ class Timing:
         self._sampled = self._arrived_at = self._resumed_at = self._compared_from = -math.inf
         self._samples: deque[tuple[float, float]] = deque()
         self._history: deque[tuple[float, float]] = deque()
-        self._asked: dict[int, tuple[float, float]] = {}
+        self._open_requests: dict[int, tuple[float, float]] = {}
         self._delays: deque[tuple[float, float, float]] = deque()
         self._unanswered = 0
-        self._heard_at = self._read_at_ns = self._answered = -math.inf
+        self._measured_at = self._latest_tc1_ns = self._latest_answered_sent = -math.inf
         self.pace = 1.0
         self.restarted = False
-        self._begun_ms: int | None = None
+        self._restart_boot_ms: int | None = None
 
     def sampled(self, boot_ms: int, now: float) -> float | None:
         """Process the time stamp of a position.
@@ -87,28 +93,29 @@ class Timing:
             now: Time of arrival.
 
         Returns:
-            Delay beyond that of the fastest recent position, in seconds of real time. None for a duplicate or an overtaken position.
+            Time by which the position took longer than the fastest recent one, in seconds of real time. None for a duplicate or an
+            overtaken position.
         """
         if self._samples:
             later_s = self._since(boot_ms)
             if -OVERTAKEN_S < later_s <= 0.0:
                 return None
             if later_s <= 0.0:
-                # A position from long ago may be delivered very late and must be ignored. After a restart of the vehicle, further
-                # positions continue from it.
-                begun_ms = self._begun_ms
-                self._begun_ms = boot_ms
-                if begun_ms is None or not 0 < boot_ms - begun_ms < OVERTAKEN_S * 1e3:
+                # A much older position may have been delivered very late and must be ignored. If the vehicle has restarted, the next
+                # position continues from it.
+                restart_boot_ms = self._restart_boot_ms
+                self._restart_boot_ms = boot_ms
+                if restart_boot_ms is None or not 0 < boot_ms - restart_boot_ms < OVERTAKEN_S * 1e3:
                     return None
                 self.reset()
                 self.restarted = True
             elif self._present(now) + OVERTAKEN_S < self._sampled + later_s:
                 self.reset()
-        self._begun_ms = None
+        self._restart_boot_ms = None
         if now - self._arrived_at > MAX_POSITION_AGE_S:
-            # Requests sent during an interruption measure the interruption, not the link. Messages that a connection kept meanwhile
-            # arrive at once and show nothing about the pace of the clock.
-            self._asked.clear()
+            # Requests that were sent during an interruption measure the interruption, not the link. Messages that were delayed by the
+            # interruption arrive together and do not show the pace of the clock.
+            self._open_requests.clear()
             self._resumed_at = now
             self._history.clear()
             self._compared_from = now + ENVELOPE_S if self._samples else now
@@ -127,7 +134,10 @@ class Timing:
         return (self._present(now) - self._sampled) / self.pace
 
     def age_s(self, boot_ms: int, now: float) -> float:
-        """Return the delay of a time-stamped message beyond that of the fastest recent position, in seconds of real time; 0 without positions."""
+        """Return how much longer a time-stamped message took than the fastest recent position, in seconds of real time.
+
+        The result is 0 without positions.
+        """
         if not self._samples:
             return 0.0
         return max(self._present(now) - self._sampled - self._since(boot_ms), 0.0) / self.pace
@@ -151,7 +161,7 @@ class Timing:
         since_s = now - self._history[0][0]
         if since_s < RATE_S[0]:
             return
-        # A late position makes the clock seem fast while it is the first one in the history. The next one was in time.
+        # If the first position of the history was late, the clock seems fast. The second one was then in time.
         rate = min((self._sampled - first) / (now - begun) for begun, first in islice(self._history, 2))
         error = (max(self.delay_s, 0.0) + 0.1) / since_s
         # The error grows with the measured delay, so an unknown delay does not count.
@@ -160,31 +170,31 @@ class Timing:
     def request(self, due: float) -> int | None:
         """Start a measurement and return the `ts1` of its TIMESYNC, if any.
 
-        A late transmission counts from the time at which it was due. The number is random, because replies to other stations are received,
-        too.
+        The delay of a late transmission is measured from the time at which it was due. The number is random, because replies to other
+        stations are received as well.
         """
         if not self._samples:
             return None
-        for number in [number for number, (sent, _) in self._asked.items() if sent < due - STALE_S]:
-            del self._asked[number]
+        for number in [number for number, (sent, _) in self._open_requests.items() if sent < due - STALE_S]:
+            del self._open_requests[number]
         number = secrets.randbits(62) + 1
-        self._asked[number] = due, self._present(due)
+        self._open_requests[number] = due, self._present(due)
         self._unanswered += 1
         return number
 
     def replied(self, tc1_ns: int, ts1: int, now: float) -> None:
         """Process a TIMESYNC message. Only the first reply to a request of this station counts."""
-        asked = self._asked.pop(ts1, None) if tc1_ns != 0 else None
-        if asked is None or not self._samples:
+        request = self._open_requests.pop(ts1, None) if tc1_ns != 0 else None
+        if request is None or not self._samples:
             return
-        self.restarted = self.restarted or tc1_ns < self._read_at_ns - OVERTAKEN_S * 1e9
-        self._read_at_ns = tc1_ns
-        sent, present = asked
-        heard = self._sampled + self._since(tc1_ns / 1e6)
-        delay_s = heard - present
+        self.restarted = self.restarted or tc1_ns < self._latest_tc1_ns - OVERTAKEN_S * 1e9
+        self._latest_tc1_ns = tc1_ns
+        sent, clock_at_sending = request
+        clock_at_reception = self._sampled + self._since(tc1_ns / 1e6)
+        delay_s = clock_at_reception - clock_at_sending
         if -_SLACK_S <= delay_s <= self.pace * (now - sent) + _SLACK_S:
             self._unanswered = 0
-            self._answered = max(self._answered, sent)
+            self._latest_answered_sent = max(self._latest_answered_sent, sent)
             self._take(max(delay_s, 0.0), sent, now)
 
     def acknowledged(self, sent: float, now: float) -> None:
@@ -203,7 +213,7 @@ class Timing:
         return self._unanswered >= UNANSWERED
 
     def _take(self, delay_s: float, sent: float, now: float) -> None:
-        self._heard_at = now
+        self._measured_at = now
         self._delays.append((now, delay_s, now - sent))
         while self._delays[0][0] < now - WINDOW_S:
             self._delays.popleft()
@@ -214,8 +224,11 @@ class Timing:
         return max((delay_s for _, delay_s, _ in self._delays), default=math.inf)
 
     def downlink_latency_s(self, now: float) -> float:
-        """Return an upper bound of the delay of a message in seconds of real time: the longest recent round trip. Infinite if it is unknown."""
-        return math.inf if now - self._heard_at > STALE_S else self.delay_s / self.pace
+        """Return an upper bound of the delay of a message in seconds of real time: the longest recent round trip.
+
+        It is infinite if the delay is unknown.
+        """
+        return math.inf if now - self._measured_at > STALE_S else self.delay_s / self.pace
 
     @property
     def answer_s(self) -> float:
@@ -223,42 +236,45 @@ class Timing:
         return max((took_s for _, _, took_s in self._delays), default=0.0)
 
     def silence_s(self, now: float) -> float:
-        """Return the seconds since the last answer; infinite without answers. An answer on its way may take that long already."""
-        return now - self._heard_at
+        """Return the seconds since the last answer; infinite without answers."""
+        return now - self._measured_at
 
     def latency_s(self, now: float) -> float:
-        """Return the total latency by the vehicle's clock, in seconds: from its last reported position until a command sent now takes effect. Infinite if unknown."""
-        if now - self._heard_at > STALE_S or self.delay_s > MAX_DELAY_S:
+        """Return the time from the last reported position to the effect of a command that is sent now, in seconds of the vehicle's clock.
+
+        It is infinite if the delay is unknown or too long to fly.
+        """
+        if now - self._measured_at > STALE_S or self.delay_s > MAX_DELAY_S:
             return math.inf
         age_s = self._present(now) - self._sampled
-        # Waiting alone never makes the link too slow to fly: one request may be lost and the next one answered.
+        # An unanswered request alone does not make the link too slow to fly, because it may be lost and the next one answered.
         delay_s = min(self.delay_s + self.pace * self._overdue_s(now), MAX_DELAY_S)
         return age_s + delay_s + REACTION_S if age_s <= MAX_POSITION_AGE_S else math.inf
 
     def _overdue_s(self, now: float) -> float:
-        """Return how much longer the oldest unanswered request has waited than the slowest recent answer took.
+        """Return by how much the oldest unanswered request exceeds the slowest recent answer, in seconds.
 
-        The first slow answer arrives late. Until then the link counts as slower by this time at least.
+        When the link becomes slow, the first slow answer arrives late. Until then, the delay of the link is at least this much longer.
         """
-        if self.unanswering and now - self._answered > STALE_S:
-            return 0.0  # Acknowledgements measure this vehicle. Before that, its answers may only have become slow.
-        waiting = min((sent for sent, _ in self._asked.values() if sent > self._answered), default=now)
+        if self.unanswering and now - self._latest_answered_sent > STALE_S:
+            return 0.0  # The vehicle does not answer TIMESYNC. Acknowledgements measure its link.
+        waiting = min(
+            (sent for sent, _ in self._open_requests.values() if sent > self._latest_answered_sent), default=now
+        )
         return max(now - waiting - self.answer_s, 0.0)
 
     def problem(self, now: float) -> str:
         """Return why this link forbids arming; empty if it does not."""
         if self.pace > MAX_PACE:
             return (
-                f"the autopilot's clock runs {self.pace:.1f} times as fast as real time, and more than {MAX_PACE:g} times"
-                " cannot be followed; run the simulator slower"
+                f"the autopilot's clock runs {self.pace:.1f} times as fast as real time, and the maximum is {MAX_PACE:g} times;"
+                " run the simulator slower"
             )
-        if now - self._heard_at > STALE_S:
-            return (
-                "the delay of the autopilot's link is not known: it answers neither TIMESYNC nor commands at the moment"
-            )
+        if now - self._measured_at > STALE_S:
+            return "the delay of the autopilot's link is unknown, because the autopilot answers neither TIMESYNC nor commands"
         if self.delay_s > MAX_ARMING_DELAY_S:
             return (
-                f"the autopilot's link delays by {self.delay_s:.1f} s there and back, and only up to {MAX_ARMING_DELAY_S} s"
-                " can be flown with; use a faster link"
+                f"the round trip on the autopilot's link takes {self.delay_s:.1f} s, and the maximum for arming is"
+                f" {MAX_ARMING_DELAY_S} s; use a faster link"
             )
         return ""

@@ -24,7 +24,7 @@ log = logging.getLogger(__name__)
 
 CONNECT_TIMEOUT_S = 5.0
 PEER_SILENCE_S = 3.0
-"""An autopilot that is silent for this time may continue from another port."""
+"""Time without datagrams after which the autopilot may continue from another port."""
 
 
 class BadUrl(ValueError):
@@ -163,7 +163,7 @@ class _Serial:
             try:
                 os.write(self._fd, data)
             except BlockingIOError:
-                return  # the line is slower than the messages; the next setpoint replaces this one
+                return  # The line is busy. Drop the message, because the next setpoint replaces it.
             except OSError as error:
                 self._fail(error)
 

@@ -1,6 +1,6 @@
 """Identification of the drone's own autopilot among all senders of heartbeats on a link.
 
-Cameras, gimbals, trackers and other vehicles send heartbeats, too. A radio, a router or the autopilot itself may forward them.
+Cameras, gimbals, trackers and other vehicles also send heartbeats. A radio, a router or the autopilot may forward them.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 log = logging.getLogger(__name__)
 
 FORGET_AFTER_S = 10.0
-"""A vehicle that sent no heartbeat for this time is no longer on the link."""
+"""Time without a heartbeat after which a vehicle is no longer on the link."""
 
 SELECT_AFTER_S = 3.0
-"""An unknown vehicle is selected after it was alone for this time, in which another vehicle would send three heartbeats."""
+"""Time for which an unknown vehicle must be alone before it is selected. Another vehicle would send three heartbeats in this time."""
 
 CONFIRM_AFTER_S = 10.0
-"""A selected vehicle that was alone for this time is confirmed as the drone's own."""
+"""Time for which a selected vehicle must be alone before it is confirmed as the drone's own."""
 
 _NO_VEHICLES = frozenset({mavlink.MAV_TYPE_ANTENNA_TRACKER, mavlink.MAV_TYPE_GCS})
 _VEHICLES = frozenset(
@@ -42,7 +42,7 @@ _VEHICLES = frozenset(
         mavlink.MAV_TYPE_GENERIC_MULTIROTOR,
     }
 )
-"""Types that no camera or gimbal reports."""
+"""MAV_TYPE of vehicles. Cameras and gimbals report none of these types."""
 
 Source = tuple[int, int]
 """System and component id of a sender."""
@@ -77,7 +77,7 @@ def read_known_vehicle(path: Path) -> tuple[str, Source] | None:
 
 
 class KnownVehicleFile:
-    """Identity of the drone's own vehicle on disk, because a restart in flight leaves no time for an identification.
+    """Identity of the drone's own vehicle on disk, because there is no time to identify the vehicle after a restart in flight.
 
     Args:
         path: Path of the file.
@@ -132,7 +132,7 @@ class VehicleSelector:
         Args:
             message: Message of any sender.
             now: Monotonic seconds.
-            flying: True if the motors ran at the last message; then no other vehicle can take its place.
+            flying: True if the motors of the own vehicle ran at its last message. No other vehicle is then selected.
         """
         if not is_vehicle_heartbeat(message):
             self._check_component(message)
@@ -167,8 +167,8 @@ class VehicleSelector:
             return self._waiting_reason
         others = self._other_systems(self._own, now)
         if not others:
-            # A vehicle is the drone's own if it was alone for some time, or if it was armed while it was alone.
-            # While two vehicles are on the link, either may be the one that was selected first.
+            # A vehicle is the drone's own if it was alone for some time, or if it was armed while it was alone. While two vehicles are
+            # on the link, the wrong one may have been selected.
             armed = self._is_own(message) and _armed(message)
             self._confirmed = self._confirmed or now - self._selected_at > CONFIRM_AFTER_S or armed
             if self._confirmed and self._own is not None and self._file is not None:

@@ -60,8 +60,8 @@ class MobilityComponents:
     ) -> None:
         # The control store starts return flights, which need the control store. So this function refers to the return
         # flight, which is created below.
-        async def approach(kind: TaskKind, wanted: Callable[[], bool], attempts: int) -> FlightMode:
-            return await return_flight.approach(kind, wanted, attempts)
+        async def approach(kind: TaskKind, is_current: Callable[[], bool], attempts: int) -> FlightMode:
+            return await return_flight.approach(kind, is_current, attempts)
 
         control = ControlStore(autopilot, journal, grants, audit, approach=approach, grace_s=grace_s, state=state)
         gate = PolicyGate(control, clock, audit)

@@ -54,7 +54,7 @@ async def pass_on(camera: fractus.Camera, checker: fractus.Requester, number: in
     tell("sent", number, bytes=len(picture))
     begun = time.monotonic()
     try:
-        answer = json.loads(await checker.ask("check", picture, request_id=request))
+        answer = json.loads(await checker.request("check", picture, request_id=request))
     except fractus.FractusError as error:
         log.warning("picture %d is lost: %s", number, error)
         return

@@ -26,7 +26,7 @@ async def watch(interval_s: float) -> None:
             number += 1
             try:
                 name, picture = await look(camera, number)
-                found = json.loads(await checker.ask("check", pack(name, os.environ["FRACTUS_INSTANCE"], picture)))
+                found = json.loads(await checker.request("check", pack(name, os.environ["FRACTUS_INSTANCE"], picture)))
                 log.info("sent %s (%d bytes); %s found %s", name, len(picture), found["by"], found["summary"])
             except fractus.PolicyDenied as refusal:
                 if refusal.code != said:

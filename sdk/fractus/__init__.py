@@ -33,10 +33,10 @@ from fractus.errors import NotReady as NotReady
 from fractus.errors import PolicyDenied as PolicyDenied
 from fractus.errors import StateError as StateError
 from fractus.errors import Unavailable as Unavailable
-from fractus.exchange import Answers as Answers
 from fractus.exchange import Request as Request
 from fractus.exchange import Requester as Requester
 from fractus.exchange import Responder as Responder
+from fractus.exchange import StoredResponses as StoredResponses
 from fractus.exchange import requester as requester
 from fractus.mission import Mission as Mission
 from fractus.mission import MissionProgress as MissionProgress

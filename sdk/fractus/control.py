@@ -64,7 +64,7 @@ class Control:
         self.waypoints_reached = 0
         """Number of completed waypoints, including those of earlier runs of this component."""
         self.begun: Sequence[object] | None = None
-        """Waypoints of the mission that was started at this control point, which `waypoints_reached` counts; None if there is none."""
+        """Waypoints of the mission that was started at this control point; None if there is none. `waypoints_reached` counts them."""
         self.mission_complete = False
         """True after control of the last control point was returned."""
 
@@ -101,7 +101,7 @@ class Control:
             FractusError: The reason why control was lost.
         """
         if self._watcher is None:
-            raise ControlLost("control was not taken; use `async with drone.control():`")
+            raise ControlLost("control was not acquired; use `async with drone.control():`")
         granted = asyncio.ensure_future(self._granted.wait())
         try:
             await asyncio.wait([granted, self._watcher], return_when=asyncio.FIRST_COMPLETED)
@@ -141,9 +141,9 @@ class Control:
         Args:
             waypoints: Waypoints, the same in every run of this component; by default the path of the control point.
         """
-        todo = self.task.path if waypoints is None else waypoints
-        for number in range(self.waypoints_reached, len(todo)):
-            yield todo[number]
+        path = self.task.path if waypoints is None else waypoints
+        for number in range(self.waypoints_reached, len(path)):
+            yield path[number]
             await self.report(number + 1)
 
     async def abandon(self) -> None:
@@ -180,7 +180,7 @@ class Control:
         except asyncio.CancelledError:
             if not self._interrupted:
                 raise
-        # As in asyncio.timeout: only a cancellation by this object is converted to an error.
+        # Like asyncio.timeout, convert a cancellation to an error only if this object cancelled the task.
         cancelled_here = self._interrupted and owner is not None and owner.uncancel() <= self._cancellations
         if self._lost is not None and (kind is None or (cancelled_here and kind is asyncio.CancelledError)):
             raise self._lost from error
@@ -204,7 +204,7 @@ class Control:
                 self._granted.clear()
                 retries.reset()
                 _log.warning(
-                    "control: lost the connection to the mobility service; trying again (timeout_s=%g)",
+                    "control: connection to the mobility service lost, reconnecting (timeout_s=%g)",
                     self._channel.reconnect_timeout_s,
                 )
             try:

@@ -33,7 +33,7 @@ class Endpoint:
 
     @classmethod
     def on_node(cls, node: str, address: str, tls_dir: Path) -> Endpoint:
-        """Return the endpoint of a service on a node. Its certificate contains the node's name, whatever the address."""
+        """Return the endpoint of a service on a node. The certificate contains the node's name, not the address."""
         return cls(address, f"{node}.node.fractus.dev", tls_dir)
 
 

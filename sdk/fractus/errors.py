@@ -23,7 +23,7 @@ class FractusError(Exception):
 
 
 class InvalidRequest(FractusError):
-    """An argument is invalid, for example NaN, a latitude of 95, or an unknown picture."""
+    """An argument is invalid, for example NaN, a latitude of 95, or the name of an unknown picture."""
 
     remedy = "correct the argument"
 
@@ -98,7 +98,7 @@ class PolicyDenied(FractusError):
         policies: Names of the policies that decided, most restrictive first.
     """
 
-    remedy = "request something else, or continue without it; `drone.can_i` checks a call in advance"
+    remedy = "change the request, or continue without it; `drone.can_i` checks a call in advance"
 
     def __init__(self, decision: Decision) -> None:
         self.decision = decision
@@ -157,7 +157,7 @@ class MissionComplete(FractusError):
 class Unavailable(FractusError):
     """The service is unreachable or did not respond in time."""
 
-    remedy = "check that the service runs, and start again: the mission continues where it was"
+    remedy = "check that the service runs, and restart the program: the mission continues at its current waypoint"
 
 
 class Busy(FractusError):
@@ -207,35 +207,35 @@ def _detail(error: Any, message: Any) -> bool:
     return any(detail.Is(message.DESCRIPTOR) and detail.Unpack(message) for detail in details)
 
 
-def translate(error: Any, what: str, address: str) -> FractusError:
+def translate(error: Any, method: str, address: str) -> FractusError:
     """Convert a failed gRPC call to an exception of the SDK.
 
     Args:
         error: The `grpc.aio.AioRpcError`.
-        what: Name of the method.
+        method: Name of the method.
         address: Address of the service.
     """
     code = error.code()
     text = error.details() or ""
     decision = decision_of(error)
     if code in {grpc.StatusCode.PERMISSION_DENIED, grpc.StatusCode.FAILED_PRECONDITION}:
-        return _refusal(code, text, what, decision)
+        return _refusal(code, text, method, decision)
     if code is grpc.StatusCode.ABORTED:
-        return Interrupted(f"{what}: {text}", decision)
+        return Interrupted(f"{method}: {text}", decision)
     if code in {grpc.StatusCode.INVALID_ARGUMENT, grpc.StatusCode.NOT_FOUND, grpc.StatusCode.OUT_OF_RANGE}:
-        return InvalidRequest(f"{what}: {text}")
+        return InvalidRequest(f"{method}: {text}")
     if code in {grpc.StatusCode.UNAVAILABLE, grpc.StatusCode.DEADLINE_EXCEEDED}:
-        return Unavailable(f"{what}: no response from {address} ({text or code.name}){_remedy(text)}")
+        return Unavailable(f"{method}: no response from {address} ({text or code.name}){_remedy(text)}")
     if code is grpc.StatusCode.RESOURCE_EXHAUSTED:
-        return Busy(f"{what}: {text or code.name}", _retry_after_s(error))
-    return FractusError(f"{what}: {text or code.name}{_remedy(text)}")
+        return Busy(f"{method}: {text or code.name}", _retry_after_s(error))
+    return FractusError(f"{method}: {text or code.name}{_remedy(text)}")
 
 
 def _remedy(text: str) -> str:
     return next((f"; {remedy}" for sign, remedy in _REMEDIES.items() if sign in text.lower()), "")
 
 
-def _refusal(code: grpc.StatusCode, text: str, what: str, decision: Decision | None) -> FractusError:
+def _refusal(code: grpc.StatusCode, text: str, method: str, decision: Decision | None) -> FractusError:
     if (decision is not None and decision.code == "MissionComplete") or "mission is complete" in text:
         return MissionComplete(text)
     if decision is not None and decision.code == "MissionEnded":
@@ -243,21 +243,21 @@ def _refusal(code: grpc.StatusCode, text: str, what: str, decision: Decision | N
     if decision is not None and decision.code in _CONTROL_CODES:
         return ControlLost(decision.reason or text)
     if code is grpc.StatusCode.PERMISSION_DENIED:
-        return PolicyDenied(decision or Decision(Action.DENY, reason=text or f"{what} is not allowed"))
+        return PolicyDenied(decision or Decision(Action.DENY, reason=text or f"{method} is not allowed"))
     state = decision.code if decision is not None else ""
-    return _STATE_ERRORS.get(state, StateError)(state, f"{what}: {text}")
+    return _STATE_ERRORS.get(state, StateError)(state, f"{method}: {text}")
 
 
 _FOREIGN = "another authority signed its certificate: correct FRACTUS_TLS_DIR, or the address"
 _REMEDIES = {
-    "hostname verification": "the certificate is that of another node: correct FRACTUS_NODE or the address",
-    "not in peer certificate": "the certificate is that of another node: correct FRACTUS_NODE or the address",
+    "hostname verification": "the certificate belongs to another node: correct FRACTUS_NODE or the address",
+    "not in peer certificate": "the certificate belongs to another node: correct FRACTUS_NODE or the address",
     "certificate_verify_failed": _FOREIGN,
     "certificate signature failure": _FOREIGN,
     "create security handshaker": "tls.crt and tls.key do not match: correct FRACTUS_TLS_DIR",
     "socket closed": "the service may not trust the authority of this component's certificate: see its log, and correct FRACTUS_TLS_DIR",
     "wrong_version_number": "the server does not use TLS: correct the address",
-    "method not found": "another service or another version listens there: correct the address",
+    "method not found": "another service or another version listens at this address: correct the address",
 }
 """Remedies for failed connections, by a part of gRPC's error text."""
 

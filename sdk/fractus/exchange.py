@@ -1,9 +1,10 @@
-"""Requests between components of an application that are retried until a response arrives and are processed once.
+"""Requests between components of an application. They are repeated until a response arrives, and processed once.
 
 When traffic moves to another network path, connections break: a request may arrive twice, or its response may be lost.
-Each request therefore has an id that stays the same when it is repeated. The responder stores its responses for some
-time and returns a stored response instead of repeating the work. A repetition may reach another instance than the first
-attempt, so a component that collects results must drop those whose `Request.id` it already received (`Answers` does).
+Each request therefore has an id, and its repetitions have the same id. The responder stores its responses for some time.
+If a request is repeated, it returns the stored response instead of calling the handler again. A repetition may reach
+another instance than the first attempt. A component that collects results must therefore drop requests whose `Request.id`
+it already received (`StoredResponses` does).
 
 The connections are not encrypted.
 """
@@ -38,8 +39,8 @@ ATTEMPT_TIMEOUT_S = 5.0
 MAX_DELAY_S = 0.5
 CONNECTION_AGE_S = 30.0
 CONNECTION_GRACE_S = 10.0
-KEPT_ANSWERS = 4096
-KEPT_BYTES = 16 * 2**20
+MAX_STORED_RESPONSES = 4096
+MAX_STORED_BYTES = 16 * 2**20
 _MAX_ID_LENGTH = 200
 _MAX_ATTEMPT_LENGTH = 9
 
@@ -87,12 +88,12 @@ class Request:
 Handler = Callable[[Request], Awaitable[bytes]]
 
 
-class _Kept(NamedTuple):
+class _StoredResponse(NamedTuple):
     digest: bytes
-    answer: asyncio.Task[bytes]
+    task: asyncio.Task[bytes]
 
 
-class Answers:
+class StoredResponses:
     """Stored responses by method and request id, so that no request is processed twice. The oldest are removed first.
 
     Args:
@@ -100,14 +101,14 @@ class Answers:
         size: Maximum size of all stored responses, in bytes.
     """
 
-    def __init__(self, count: int = KEPT_ANSWERS, size: int = KEPT_BYTES) -> None:
+    def __init__(self, count: int = MAX_STORED_RESPONSES, size: int = MAX_STORED_BYTES) -> None:
         self._count = count
-        self._left = size
-        self._kept: OrderedDict[tuple[str, str], _Kept] = OrderedDict()
+        self._free_bytes = size
+        self._stored: OrderedDict[tuple[str, str], _StoredResponse] = OrderedDict()
         self.repeated = 0
 
     async def once(self, request: Request, handler: Handler) -> bytes:
-        """Return the response of `handler`, which is called only for the first request with this method and id.
+        """Return the response of `handler`. It is called only for the first request with this method and id.
 
         If the handler raises, the request counts as not processed, and a repetition calls the handler again. A running
         handler continues when the connection breaks.
@@ -117,26 +118,26 @@ class Answers:
         """
         key = (request.method, request.id)
         digest = hashlib.sha256(request.body).digest()
-        kept = self._kept.get(key)
-        if kept is None:
-            kept = self._kept[key] = _Kept(digest, asyncio.ensure_future(_run(handler, request)))
-            kept.answer.add_done_callback(lambda done: self._ended(key, done))
-        elif kept.digest != digest:
+        stored = self._stored.get(key)
+        if stored is None:
+            stored = self._stored[key] = _StoredResponse(digest, asyncio.ensure_future(_run(handler, request)))
+            stored.task.add_done_callback(lambda done: self._ended(key, done))
+        elif stored.digest != digest:
             raise ValueError(f"request {request.id} had another body before; use a new id for each request")
         else:
             self.repeated += 1
-        return await asyncio.shield(kept.answer)
+        return await asyncio.shield(stored.task)
 
     def _ended(self, key: tuple[str, str], task: asyncio.Task[bytes]) -> None:
         if task.cancelled() or task.exception() is not None:
-            self._kept.pop(key, None)
+            self._stored.pop(key, None)
             return
-        self._left -= len(task.result())
-        for oldest in list(self._kept):
-            if self._left >= 0 and len(self._kept) <= self._count:
+        self._free_bytes -= len(task.result())
+        for oldest in list(self._stored):
+            if self._free_bytes >= 0 and len(self._stored) <= self._count:
                 return
-            if self._kept[oldest].answer.done():
-                self._left += len(self._kept.pop(oldest).answer.result())
+            if self._stored[oldest].task.done():
+                self._free_bytes += len(self._stored.pop(oldest).task.result())
 
 
 async def _run(handler: Handler, request: Request) -> bytes:
@@ -162,7 +163,7 @@ class Requester:
         self._channel: Any = None
         self._connecting: asyncio.Task[None] | None = None
 
-    async def ask(
+    async def request(
         self, method: str, body: bytes = b"", *, timeout_s: float = TIMEOUT_S, request_id: str | None = None
     ) -> bytes:
         """Send a request, repeat it with the same id until a response arrives, and return the response.
@@ -196,14 +197,14 @@ class Requester:
             await asyncio.sleep(delay)
         raise AssertionError("the back-off is infinite")
 
-    async def _attempt(self, method: str, body: bytes, request_id: str, attempt: int, left_s: float) -> bytes:
+    async def _attempt(self, method: str, body: bytes, request_id: str, attempt: int, remaining_s: float) -> bytes:
         if self._channel is None:
             self._channel = grpc.aio.insecure_channel(self.address, options=_CLIENT)
             self._connecting = asyncio.create_task(_keep_connected(self._channel))
         call = self._channel.unary_unary(f"/{SERVICE}/{method}")
         metadata = ((ID_HEADER, request_id), (ATTEMPT_HEADER, str(attempt)))
-        answer: bytes = await call(body, timeout=min(left_s, self._attempt_timeout_s), metadata=metadata)
-        return answer
+        response: bytes = await call(body, timeout=min(remaining_s, self._attempt_timeout_s), metadata=metadata)
+        return response
 
     async def __aenter__(self) -> Self:
         return self
@@ -252,7 +253,7 @@ class Responder:
         self, handlers: Mapping[str, Handler], port: int, *, connection_age_s: float = CONNECTION_AGE_S
     ) -> None:
         self.port = port
-        self.answers = Answers()
+        self.responses = StoredResponses()
         self._handlers = dict(handlers)
         self._connection_age_s = connection_age_s
         self._server: Any = None
@@ -301,7 +302,7 @@ class Responder:
     def _method(self, name: str, handler: Handler) -> Any:
         """Return the gRPC method handler for a handler function."""
 
-        async def answer(body: bytes, context: Any) -> bytes:
+        async def handle(body: bytes, context: Any) -> bytes:
             metadata = dict(context.invocation_metadata())
             request_id = str(metadata.get(ID_HEADER, ""))
             attempt = str(metadata.get(ATTEMPT_HEADER, ""))
@@ -310,7 +311,7 @@ class Responder:
             valid_attempt = attempt.isdecimal() and len(attempt) <= _MAX_ATTEMPT_LENGTH
             request = Request(request_id, name, body, int(attempt) if valid_attempt else 1)
             try:
-                return await self.answers.once(request, handler)
+                return await self.responses.once(request, handler)
             except ValueError as error:
                 await context.abort(grpc.StatusCode.INVALID_ARGUMENT, str(error))
             except (OSError, Unavailable) as error:
@@ -320,4 +321,4 @@ class Responder:
                 await context.abort(grpc.StatusCode.UNKNOWN, f"{name}: {type(error).__name__}")
             raise AssertionError("abort does not return")
 
-        return grpc.unary_unary_rpc_method_handler(answer)
+        return grpc.unary_unary_rpc_method_handler(handle)

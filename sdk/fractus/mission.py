@@ -93,8 +93,8 @@ class Mission:
         *,
         skip_refused: bool = False,
     ) -> None:
-        given = control.task.path if waypoints is None else waypoints
-        self.waypoints = tuple(Waypoint(item) if isinstance(item, Position) else item for item in given)
+        path = control.task.path if waypoints is None else waypoints
+        self.waypoints = tuple(Waypoint(item) if isinstance(item, Position) else item for item in path)
         self.refused: dict[int, PolicyDenied] = {}
         """Skipped legs by the number of their waypoint, from 1."""
         self._fly = fly
@@ -155,7 +155,7 @@ class Mission:
         if begun is not None and begun is not self.waypoints and (complete or begun != self.waypoints):
             raise InvalidRequest(
                 "a control point has one mission, and another one has started: fly all waypoints in one mission, "
-                "`drone.mission([*survey, *orbit])`, or use `drone.goto` for waypoints that need not be remembered"
+                "`drone.mission([*survey, *orbit])`, or use `drone.goto` for waypoints whose progress need not be stored"
             )
         self._control.begun = self.waypoints
 
@@ -166,13 +166,13 @@ class Mission:
             if progress is not None:
                 progress(MissionProgress(number, len(self.waypoints), step))
 
-        async def flown() -> None:
+        async def fly_leg() -> None:
             await self._fly(self.waypoints[number - 1], report)
             await asyncio.sleep(self.waypoints[number - 1].stay_s)
 
         while True:
             await self._resumed.wait()
-            leg = asyncio.ensure_future(flown())
+            leg = asyncio.ensure_future(fly_leg())
             pause = asyncio.ensure_future(self._paused.wait())
             try:
                 await asyncio.wait([leg, pause], return_when=asyncio.FIRST_COMPLETED)

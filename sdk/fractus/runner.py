@@ -1,4 +1,4 @@
-"""Runner for driver programs that may be killed at any time and continue where they were."""
+"""Runner for driver programs, which continue at their current waypoint after a restart at any time."""
 
 from __future__ import annotations
 

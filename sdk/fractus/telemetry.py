@@ -1,4 +1,4 @@
-"""The drone's state: complete samples, or changes of one part of it."""
+"""Telemetry of the drone: complete samples, or the changes of one part of the state."""
 
 from __future__ import annotations
 

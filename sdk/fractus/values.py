@@ -130,12 +130,15 @@ class Progress(Result):
 
         Only the first message contains decision and target. They apply to all messages.
         """
-        present = {field.name for field, _ in message.ListFields()}
+        decision = Decision.from_proto(message.decision)
+        target = Position.from_proto(message.target)
+        if first is not None and not message.HasField("decision"):
+            decision = first.decision
+        if first is not None and not message.HasField("target"):
+            target = first.target
         return cls(
-            decision=Decision.from_proto(message.decision)
-            if first is None or "decision" in present
-            else first.decision,
-            target=Position.from_proto(message.target) if first is None or "target" in present else first.target,
+            decision=decision,
+            target=target,
             position=Position.from_proto(message.position),
             distance_m=message.distance_m,
             complete=message.complete,

@@ -157,7 +157,9 @@ def _service_options(service: str, port: int, kinds: str, state: str, recorded: 
             help="HOST:PORT that serves /metrics for Prometheus (docs/metrics.md). Without it there are no metrics.",
         ),
         click.option(
-            "--node", envvar="FRACTUS_NODE", help="Name of this node; by default the description's, else the host's."
+            "--node",
+            envvar="FRACTUS_NODE",
+            help="Name of this node; by default the name in the description, or the host name.",
         ),
     )
 
@@ -179,7 +181,7 @@ def mobility() -> None:
 @click.option(
     "--autopilot",
     help="Link to the autopilot: tcp:HOST:PORT, udpin:HOST:PORT, udpout:HOST:PORT or serial:DEVICE:BAUD; by default the"
-    " description's, else tcp:127.0.0.1:5760.",
+    " link in the description, or tcp:127.0.0.1:5760.",
 )
 @_option("--driver-grace", 15.0, "Seconds in which a lost driver may reconnect.", _SECONDS)
 @_option(
@@ -194,7 +196,7 @@ def mobility() -> None:
     help="Assume that the ground is level with home everywhere; otherwise limits above terrain deny calls.",
 )
 @click.option("--verbose", "-v", is_flag=True, help="Log more.")
-def serve_mobility(verbose: bool, **given: Any) -> None:
+def serve_mobility(verbose: bool, **options: Any) -> None:
     """Serve until stopped. Waits for certificates and for the autopilot."""
     from fractus_services.mobility.mavlink.startup_heartbeat import with_heartbeats  # noqa: PLC0415 - keeps the command line fast
 
@@ -203,7 +205,7 @@ def serve_mobility(verbose: bool, **given: Any) -> None:
         serve = await with_heartbeats(asyncio.to_thread(_mobility_server), options.state, options.autopilot)
         await serve(options, stop)
 
-    until_signalled("mobility", run, MobilityOptions(**given), verbose)
+    until_signalled("mobility", run, MobilityOptions(**options), verbose)
 
 
 def _mobility_server() -> Callable[[MobilityOptions, asyncio.Event], Coroutine[Any, Any, None]]:
@@ -231,7 +233,7 @@ def camera() -> None:
 @click.option(
     "--camera",
     help="Camera: http://HOST/snapshot.jpg, v4l2:/dev/video0, picamera2:0, directory:/PATH or test:;"
-    " by default the description's.",
+    " by default the connection in the description.",
 )
 @click.option("--face-model", type=FILE, help="Face detector (YuNet, ONNX) to use instead of OpenCV's cascades.")
 @_option(
@@ -246,8 +248,8 @@ def camera() -> None:
     "Maximum depth of the surrounding ground below home in metres, for the area that an image may show.",
     click.FloatRange(min=0, max=5000),
 )
-def serve_camera(**given: Any) -> None:
+def serve_camera(**options: Any) -> None:
     """Serve until stopped. Waits for certificates."""
     from fractus_services.camera.server import run  # noqa: PLC0415 - needs libraries that the CLI does without
 
-    until_signalled("camera", run, CameraSettings(**given))
+    until_signalled("camera", run, CameraSettings(**options))

@@ -33,7 +33,7 @@ from fractus_services.options import CannotServe
 log = logging.getLogger(__name__)
 
 CALLS_PER_S = 50.0
-BURST = 100.0
+CALL_BURST = 100.0
 """Rate and burst of calls of one identity. A driver that streams setpoints stays far below it."""
 
 URGENT_PER_S = 20.0
@@ -55,7 +55,7 @@ _MAX_COUNTED = 1_000
 class RateLimiter:
     """A token bucket for each caller, so that a flood affects its sender only."""
 
-    def __init__(self, rate: float = CALLS_PER_S, burst: float = BURST) -> None:
+    def __init__(self, rate: float = CALLS_PER_S, burst: float = CALL_BURST) -> None:
         self._rate = rate
         self._burst = burst
         self._buckets: dict[str, tuple[float, float]] = {}

@@ -26,7 +26,7 @@ DEFAULT_LOCK_TIMEOUT_S = 60.0
 CHECK_INTERVAL_S = 0.2
 """Interval at which the holder checks that its lock file still exists under its path."""
 
-SETTLE_S = 1.0
+NEW_FILE_WAIT_S = 1.0
 """Time for which the first holder of a new lock file waits, so that the holder of a replaced file has ended."""
 
 POLL_INTERVAL_S = 0.1
@@ -76,7 +76,7 @@ class ServiceLock:
             if path == self._path:
                 self._held = _identity(os.fstat(handle))
                 if _read_holder(handle).get("file") != list(self._held):
-                    await _pause(stop, SETTLE_S)
+                    await _pause(stop, NEW_FILE_WAIT_S)
             self._sign(handle)
         return not stop.is_set()
 

@@ -9,7 +9,7 @@ from contextlib import asynccontextmanager, suppress
 import grpc
 import pytest
 from fractus.errors import InvalidRequest, Unavailable
-from fractus.exchange import ATTEMPT_HEADER, ID_HEADER, SERVICE, Answers, Request, Requester, Responder
+from fractus.exchange import ATTEMPT_HEADER, ID_HEADER, SERVICE, Request, Requester, Responder, StoredResponses
 
 
 class Worker:
@@ -47,8 +47,8 @@ async def until(condition: Callable[[], int]) -> None:
 async def test_request_returns_response() -> None:
     worker = Worker()
     async with worker.serving() as responder, Requester(f"127.0.0.1:{responder.port}") as asking:
-        assert await asking.ask("work", b"this") == b"did this"
-        assert await asking.ask("work", b"that") == b"did that"
+        assert await asking.request("work", b"this") == b"did this"
+        assert await asking.request("work", b"that") == b"did that"
     assert len(set(worker.done)) == 2
     assert asking.repeated == 0
 
@@ -74,27 +74,27 @@ async def test_requester_reconnects_before_the_next_request() -> None:
         path = await asyncio.start_server(pass_on, "127.0.0.1", 0)
         port = path.sockets[0].getsockname()[1]
         async with path, Requester(f"127.0.0.1:{port}") as asking:
-            await asking.ask("work", b"this")
+            await asking.request("work", b"this")
             for number in (1, 2):
                 opened[-1].transport.abort()
                 await until(lambda wanted=number + 1: len(opened) == wanted)  # type: ignore[misc]
-            assert await asking.ask("work", b"that") == b"did that"
+            assert await asking.request("work", b"that") == b"did that"
             assert len(opened) == 3
 
 
 async def test_repeated_request_returns_first_response() -> None:
     worker = Worker()
     async with worker.serving() as responder, Requester(f"127.0.0.1:{responder.port}") as asking:
-        assert await asking.ask("work", b"this", request_id="r1") == b"did this"
-        assert await asking.ask("work", b"this", request_id="r1") == b"did this"
-        assert responder.answers.repeated == 1
+        assert await asking.request("work", b"this", request_id="r1") == b"did this"
+        assert await asking.request("work", b"this", request_id="r1") == b"did this"
+        assert responder.responses.repeated == 1
         with pytest.raises(InvalidRequest, match="r1 had another body before"):
-            await asking.ask("work", b"other", request_id="r1")
+            await asking.request("work", b"other", request_id="r1")
     assert worker.done == ["r1"]
 
 
 async def test_request_id_is_scoped_to_its_method() -> None:
-    answers = Answers()
+    answers = StoredResponses()
     worker = Worker()
     for method in ("work", "play"):
         await answers.once(Request("r1", method, b"this"), worker.work)
@@ -105,8 +105,8 @@ async def test_repeated_request_waits_for_running_handler() -> None:
     worker = Worker()
     worker.slow.clear()
     async with worker.serving() as responder, Requester(f"127.0.0.1:{responder.port}", attempt_timeout_s=0.3) as asking:
-        answer = asyncio.ensure_future(asking.ask("work", b"slow"))
-        await until(lambda: responder.answers.repeated)
+        answer = asyncio.ensure_future(asking.request("work", b"slow"))
+        await until(lambda: responder.responses.repeated)
         worker.slow.set()
         assert await answer == b"did slow"
     assert len(worker.done) == 1
@@ -118,7 +118,7 @@ async def test_temporary_handler_error_is_retried(failure: Exception) -> None:
     worker = Worker()
     worker.failures = [failure, failure]
     async with worker.serving() as responder, Requester(f"127.0.0.1:{responder.port}") as asking:
-        assert await asking.ask("work", b"x") == b"did x"
+        assert await asking.request("work", b"x") == b"did x"
     assert asking.repeated == 2
 
 
@@ -127,11 +127,11 @@ async def test_refused_request_is_not_retried() -> None:
     worker.failures = [ValueError("this is no picture")]
     async with worker.serving() as responder, Requester(f"127.0.0.1:{responder.port}") as asking:
         with pytest.raises(InvalidRequest, match="this is no picture"):
-            await asking.ask("work", b"x")
+            await asking.request("work", b"x")
         with pytest.raises(InvalidRequest):
-            await asking.ask("play", b"x")
+            await asking.request("play", b"x")
         with pytest.raises(InvalidRequest, match="exceeds 16 MiB"):
-            await asking.ask("work", b"x" * (16 * 2**20 + 1))
+            await asking.request("work", b"x" * (16 * 2**20 + 1))
     assert asking.repeated == 0
 
 
@@ -140,7 +140,7 @@ async def test_requester_finds_restarted_server() -> None:
     async with worker.serving() as responder:
         port = responder.port
     async with Requester(f"127.0.0.1:{port}") as asking:
-        answer = asyncio.ensure_future(asking.ask("work", b"x"))
+        answer = asyncio.ensure_future(asking.request("work", b"x"))
         await until(lambda: asking.repeated)
         again = Responder({"work": worker.work}, port)
         await again.start()
@@ -154,7 +154,7 @@ async def test_request_without_response_fails_at_its_timeout() -> None:
         port = responder.port
     async with Requester(f"127.0.0.1:{port}") as asking:
         with pytest.raises(Unavailable, match="attempts"):
-            await asking.ask("work", b"x", timeout_s=0.5)
+            await asking.request("work", b"x", timeout_s=0.5)
 
 
 async def test_request_without_id_is_refused() -> None:
@@ -173,7 +173,7 @@ async def test_oldest_stored_responses_are_removed_first() -> None:
         return request.body
 
     calls: list[str] = []
-    for answers, size in ((Answers(2, 1000), 1), (Answers(1000, 20), 10)):
+    for answers, size in ((StoredResponses(2, 1000), 1), (StoredResponses(1000, 20), 10)):
         calls.clear()
         for name in ("a", "b", "b", "c", "c", "a"):
             assert await answers.once(Request(name, "echo", b"x" * size), echo) == b"x" * size

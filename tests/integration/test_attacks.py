@@ -22,7 +22,7 @@ from fractus_core.api.names import OPERATOR_IDENTITY, component_identity, node_i
 from fractus_proto.v1 import camera_pb2, camera_pb2_grpc, mobility_pb2_grpc, types_pb2
 from fractus_proto.v1 import mobility_pb2 as pb
 from fractus_runtime.audit_chain import verify
-from fractus_services.grpc_server import BURST, CALLS_PER_S, MAX_OPEN_CALLS
+from fractus_services.grpc_server import CALL_BURST, CALLS_PER_S, MAX_OPEN_CALLS
 from google.rpc import error_details_pb2
 from grpc_status import rpc_status
 from mobility_rig import (
@@ -172,7 +172,7 @@ async def test_attack_with_malformed_calls_is_limited_and_fills_no_disk(rig: Rig
         for _ in range(300):
             call: Any = kind(f"/fractus.v1.MobilityService/{method}")(b"\xff" * 8, timeout=5)
             codes[await call.code()] += 1
-    assert codes[Status.INVALID_ARGUMENT] <= BURST + CALLS_PER_S * 10
+    assert codes[Status.INVALID_ARGUMENT] <= CALL_BURST + CALLS_PER_S * 10
     assert codes.keys() == {Status.INVALID_ARGUMENT, Status.RESOURCE_EXHAUSTED}
     host, port = rig.address.split(":")
     stranger = ssl.create_default_context()
@@ -363,7 +363,7 @@ async def test_attack_with_flood_of_calls_does_not_affect_others(rig: Rig) -> No
     ended = result["ended"]
     assert set(ended) <= {"OK", "RESOURCE_EXHAUSTED", "SHED"}
     assert sum(ended.values()) == result["sent"]
-    assert 0 < ended["OK"] <= BURST + CALLS_PER_S * result["seconds"] + 1, "at most the limit of each caller"
+    assert 0 < ended["OK"] <= CALL_BURST + CALLS_PER_S * result["seconds"] + 1, "at most the limit of each caller"
     assert result["hints"] == ended["RESOURCE_EXHAUSTED"] > 0, "each refusal contains a retry delay"
     assert len(answers) > 10
 

@@ -36,13 +36,13 @@ CLIENT = """
 import asyncio, json, sys
 import fractus
 address, count, pause_s, size = sys.argv[1], int(sys.argv[2]), float(sys.argv[3]), int(sys.argv[4])
-async def ask():
+async def request():
     loop = asyncio.get_running_loop()
     async with fractus.Requester(address, attempt_timeout_s=2.0) as checker:
         print("ready", flush=True)
         for number in range(count):
             begun = loop.time()
-            who = await checker.ask("check", bytes(size), request_id=str(number))
+            who = await checker.request("check", bytes(size), request_id=str(number))
             print(json.dumps({"number": number, "who": who.decode(), "at": loop.time()}), flush=True)
             await asyncio.sleep(max(pause_s - (loop.time() - begun), 0))
 asyncio.run(ask())

@@ -15,7 +15,7 @@ from fractus_proto.v1 import types_pb2
 from fractus_services import grpc_server
 from fractus_services.auth import Caller
 from fractus_services.errors import PolicyDenied
-from fractus_services.grpc_server import BURST, MAX_OPEN_CALLS, URGENT_BURST, CallAdmission
+from fractus_services.grpc_server import CALL_BURST, MAX_OPEN_CALLS, URGENT_BURST, CallAdmission
 from google.protobuf import any_pb2
 from google.rpc import error_details_pb2, status_pb2
 
@@ -67,7 +67,7 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> CallAdmission:
 
 
 async def test_urgent_calls_have_separate_rate_limit(calls: CallAdmission) -> None:
-    for _ in range(int(BURST)):
+    for _ in range(int(CALL_BURST)):
         async with calls.call(Context()):
             pass
     with pytest.raises(Aborted, match="RESOURCE_EXHAUSTED: more than 50 calls per second") as refusal:

@@ -46,7 +46,7 @@ async def test_repeated_picture_counts_once_across_instances(programs: dict[str,
         responder = Responder({"check": check}, 0)
         await responder.start()
         async with Requester(f"127.0.0.1:{responder.port}") as asking:
-            answer = json.loads(await asking.ask("check", body, request_id="r1"))
+            answer = json.loads(await asking.request("check", body, request_id="r1"))
         await responder.stop(0.0)
         assert (answer["picture"], answer["source"], answer["kind"]) == ("picture-1", "viewer-1", "PNG")
     (kept,) = programs["data_store"].results(b"", Message())

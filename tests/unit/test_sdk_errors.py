@@ -71,7 +71,7 @@ async def test_policy_denied_contains_decision() -> None:
         (
             "UNIMPLEMENTED",
             "Method not found!",
-            "another service or another version listens there: correct the address",
+            "another service or another version listens at this address: correct the address",
         ),
     ],
 )

@@ -1,7 +1,8 @@
 """Settings of the mobility process: intervals, timeouts, tolerances and limits of attempts.
 
-Times are seconds of the service's clock unless a field says otherwise. Bounds and defaults of the public API, and physical
-and protocol constants, stay beside their use.
+Times are in seconds of the service's clock unless a field states another unit. Bounds and defaults of the public API, and
+physical and protocol constants, are beside their use. The settings are one instance for the process and not constructor
+arguments, because many functions without an object use them, such as the motions.
 """
 
 from __future__ import annotations

@@ -262,12 +262,9 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
         """See mobility.proto."""
         async with self.admission.call(context, lasting=True) as caller:
             is_node = caller.identity == self._node
-            wanted = request.interval_s
-            interval = (
-                max(wanted, SETTINGS.telemetry_min_interval_s)
-                if math.isfinite(wanted) and wanted > 0
-                else SETTINGS.telemetry_default_interval_s
-            )
+            interval_s = SETTINGS.telemetry_default_interval_s
+            if math.isfinite(request.interval_s) and request.interval_s > 0:
+                interval_s = max(request.interval_s, SETTINGS.telemetry_min_interval_s)
             loop = asyncio.get_running_loop()
             judged_at = -math.inf
             due = -math.inf
@@ -279,7 +276,7 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
                     if not is_node:
                         self._service.calls.allow(Call("GetPosition"), self.admission.grant_of(caller))
                 if loop.time() >= due:
-                    due = loop.time() + interval
+                    due = loop.time() + interval_s
                     sample = self._sample(missions=is_node, last_text=last_text)
                     last_text = sample.texts[-1].number if sample.texts else last_text
                     await context.write(sample)

@@ -55,13 +55,15 @@ def _fixed_camera(description: NodeDescription) -> bool:
     return camera is not None and camera.mount is not None and not camera.mount.gimbal
 
 
-async def _watch_description(description: NodeDescription, url: str, found: asyncio.Event, *, fixed_link: bool) -> None:
+async def _watch_description(
+    description: NodeDescription, url: str, identified: asyncio.Event, *, fixed_link: bool
+) -> None:
     """Reload the node description when it changes.
 
     Args:
         description: The node description.
         url: Autopilot link in use.
-        found: Set once the autopilot was found on this link.
+        identified: Set once the vehicle was identified on this link.
         fixed_link: True if the command line specifies the link.
 
     Raises:
@@ -71,7 +73,7 @@ async def _watch_description(description: NodeDescription, url: str, found: asyn
         await description.changed()
         if fixed_link or _link(description) == url:
             continue
-        if not found.is_set():
+        if not identified.is_set():
             raise CannotServe(
                 f"the node description now names a different autopilot link ({_link(description)}); restarting"
             )
@@ -84,17 +86,17 @@ async def _watch_description(description: NodeDescription, url: str, found: asyn
 def _connect(
     options: MobilityOptions,
     url: str,
-    found: asyncio.Event,
+    identified: asyncio.Event,
     *,
     recorder: Recorder,
     grants: GrantFiles,
     audit: AuditLog,
     clock: Clock,
 ) -> tuple[MavlinkAutopilot, MobilityComponents]:
-    """Create the autopilot and the components that command it. `found` is set once the autopilot is on the link."""
+    """Create the autopilot and the components that command it. `identified` is set once the vehicle is identified."""
 
     def on_found() -> None:
-        found.set()
+        identified.set()
         components.observer.found()
         components.control.tasks.spawn(mark_served(options.state))
 
@@ -146,8 +148,10 @@ async def run(options: MobilityOptions, stop: asyncio.Event) -> None:
     )
     verifier = GrantVerifier(options.tls, options.grant_memory)
     grants = GrantFiles(options.grants, node, verifier, options.flat_terrain, audit.refused_grant)
-    found = asyncio.Event()
-    autopilot, components = _connect(options, url, found, recorder=recorder, grants=grants, audit=audit, clock=clock)
+    identified = asyncio.Event()
+    autopilot, components = _connect(
+        options, url, identified, recorder=recorder, grants=grants, audit=audit, clock=clock
+    )
     control = components.control
     monitor = components.monitor
     poi_missions = components.poi_missions
@@ -170,7 +174,7 @@ async def run(options: MobilityOptions, stop: asyncio.Event) -> None:
     register = partial(mobility_pb2_grpc.add_MobilityServiceServicer_to_server, handlers)
     calls = serve_grpc("mobility", options.listen, tls, register, handlers.admission, node=node)
     running = [autopilot.run(), grants.run(), monitor.run(), monitor.record(), poi_missions.run(), calls]
-    running.append(_watch_description(description, url, found, fixed_link=bool(options.autopilot)))
+    running.append(_watch_description(description, url, identified, fixed_link=bool(options.autopilot)))
     metrics.add_callback(
         partial(common_metrics, BackgroundReader(tls.expires_s), grants, audit, lambda: recorder.problem)
     )

@@ -55,7 +55,7 @@ def _outcome_message(outcome: Outcome) -> mobility_pb2.MissionOutcome:
 def telemetry_of(
     control: ControlStore, time_s: float, *, missions: bool, not_ready_reason: str, last_text: int
 ) -> mobility_pb2.Telemetry:
-    """Return the present telemetry.
+    """Return the current telemetry.
 
     Args:
         control: Control state.
@@ -65,6 +65,9 @@ def telemetry_of(
         last_text: Number of the last status text that the subscriber received.
     """
     vehicle = control.autopilot.vehicle
+    outcomes: dict[str, mobility_pb2.MissionOutcome] = {}
+    if missions:
+        outcomes = {key: _outcome_message(outcome) for key, outcome in control.state.outcomes.items()}
     message = mobility_pb2.Telemetry(
         altitude_amsl_m=vehicle.amsl_m,
         yaw_deg=vehicle.yaw_deg,
@@ -80,12 +83,10 @@ def telemetry_of(
         controller=control.state.controller,
         controller_reason=control.effects.takeover_reason if missions else "",
         autopilot_connected=control.autopilot.connected,
-        missions={key: _outcome_message(outcome) for key, outcome in control.state.outcomes.items()}
-        if missions
-        else {},
+        missions=outcomes,
     )
     message.time.FromNanoseconds(int(time_s * 1e9))
-    # Ages are measured from the arrival of the fastest messages, whose own latency is at most this.
+    # Ages are measured from the arrival of the fastest messages. Their latency is at most `downlink_latency_s`.
     downlink_latency_s = control.autopilot.downlink_latency_s
     if located(control):
         message.position.CopyFrom(position_of(vehicle))

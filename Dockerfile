@@ -1,10 +1,10 @@
 # Images of Fractus: docker build --target operator --tag localhost/fractus/operator:dev .
-# Each is Debian with a virtual environment in /opt/fractus and the code as the last layer. A release passes BASE with a digest.
+# Each image is Debian with a virtual environment in /opt/fractus. The code is the last layer. A release specifies BASE with a digest.
 ARG BASE=debian:trixie-slim
 FROM ${BASE} AS base
 ARG BASE
 LABEL org.opencontainers.image.base.name=${BASE}
-# Builds reset the time stamps of files, so bytecode must not be checked against them.
+# Reproducible builds reset the time stamps of files, so bytecode must be valid independently of time stamps.
 RUN apt-get update -q && DEBIAN_FRONTEND=noninteractive apt-get install -qy --no-install-recommends python3 iproute2 nftables procps >/dev/null \
  && rm -rf /var/lib/apt/lists/* /var/cache/* /var/log/* \
  && python3 -m compileall -qf --invalidation-mode unchecked-hash /usr/lib/python3.13 \
@@ -13,7 +13,7 @@ ENV PATH=/opt/fractus/bin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin LANG=C.UT
 
 # ---- environments: the locked dependencies of each image, without the code
 FROM base AS build
-# The CA bundle of a proxy in front of the package index, mounted for the build only.
+# CA bundle, for a proxy in front of the package index. It is mounted only during the build.
 ARG SSL_CERT_FILE=/etc/ssl/certs/ca-certificates.crt
 ENV SSL_CERT_FILE=${SSL_CERT_FILE} PIP_CERT=${SSL_CERT_FILE} UV_PYTHON=/usr/bin/python3 UV_PYTHON_DOWNLOADS=never \
     UV_LINK_MODE=copy UV_PROJECT_ENVIRONMENT=/opt/fractus UV_COMPILE_BYTECODE=1 PYC_INVALIDATION_MODE=UNCHECKED_HASH \

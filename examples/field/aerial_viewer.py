@@ -1,4 +1,4 @@
-"""AerialViewer: takes and fetches a picture every PERIOD_S seconds; where that is not allowed, it waits for the next."""
+"""AerialViewer: takes and fetches a picture every PERIOD_S seconds. If policies refuse a picture, it waits for the next one."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ async def watch(period_s: float) -> None:
                 picture = await camera.take()
                 log.info("%s: %d bytes", picture.info.name, len(picture.data))
             except fractus.PolicyDenied as refusal:
-                log.info("no picture here: %s", refusal)
+                log.info("picture refused: %s", refusal)
             except fractus.FractusError as error:
-                log.warning("no picture: %s", error)
+                log.warning("picture failed: %s", error)
             due_s += period_s
             try:
                 await asyncio.wait_for(stop.wait(), max(due_s - loop.time(), 0.0))

@@ -22,18 +22,18 @@ async def fly(drone: fractus.Mobility, control: fractus.Control) -> None:
         number = first + control.waypoints_reached
         await go(drone, f"WP{number}", replace(waypoint, alt=altitudes.get(number, waypoint.alt)))
         if number in detours:
-            place, stay_s = detours[number]
-            await go(drone, f"a detour after WP{number}", place, stay_s)
+            target, stay_s = detours[number]
+            await go(drone, f"a detour after WP{number}", target, stay_s)
 
 
-async def go(drone: fractus.Mobility, what: str, to: fractus.Position, stay_s: float = 0.0) -> None:
+async def go(drone: fractus.Mobility, name: str, target: fractus.Position, stay_s: float = 0.0) -> None:
     """Fly to a position and hover there. Positions that policies forbid are skipped."""
     try:
-        done = await drone.goto(to.lat, to.lon, to.alt)
+        result = await drone.goto(target.lat, target.lon, target.alt)
     except fractus.PolicyDenied as refusal:
-        log.info("%s refused, going on: %s", what, refusal)
+        log.info("%s refused, continuing: %s", name, refusal)
     else:
-        log.info("%s reached%s", what, f", corrected: {done.decision.reason}" if done.corrected else "")
+        log.info("%s reached%s", name, f", corrected: {result.decision.reason}" if result.corrected else "")
         await asyncio.sleep(stay_s)
 
 
@@ -47,20 +47,22 @@ def _positions(text: str) -> tuple[fractus.Position, ...]:
 
 
 def _altitudes() -> dict[int, float]:
-    """Parse ALTITUDES, for example `1:20,6:4`: other altitudes for some waypoints."""
+    """Parse ALTITUDES, which replaces the altitudes of waypoints by number, for example `1:20,6:4`."""
     pairs = (part.split(":") for part in os.environ.get("ALTITUDES", "").split(",") if part)
     return {int(number): float(altitude) for number, altitude in pairs}
 
 
 def _detours() -> dict[int, tuple[fractus.Position, float]]:
-    """Parse DETOURS, for example `2:39.3711,22.9307,10; 6:39.3704,22.9318,10,20`: positions after waypoints, with seconds to stay."""
-    found = {}
-    for pair in filter(str.strip, os.environ.get("DETOURS", "").split(";")):
-        number, place = pair.split(":")
-        where = place.split(",")[:3]
-        stay = place.split(",")[3:]
-        found[int(number)] = _position(",".join(where)), float(stay[0]) if stay else 0.0
-    return found
+    """Parse DETOURS, for example `2:39.3711,22.9307,10; 6:39.3704,22.9318,10,20`.
+
+    Each entry is a position that is visited after a waypoint, optionally with the seconds to hover there.
+    """
+    detours = {}
+    for entry in filter(str.strip, os.environ.get("DETOURS", "").split(";")):
+        number, values = entry.split(":")
+        lat, lon, alt, *stay = values.split(",")
+        detours[int(number)] = _position(f"{lat},{lon},{alt}"), float(stay[0]) if stay else 0.0
+    return detours
 
 
 if __name__ == "__main__":

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from fractus_core.linking import PathMetrics
 
-NEEDED_MBPS = 6.0
-"""Bandwidth of the pictures. More bandwidth does not improve a path."""
+REQUIRED_MBPS = 6.0
+"""Bandwidth that the pictures need. More bandwidth does not improve a path."""
 
 MOBILE_COST_MBPS = 2.0
-"""Bandwidth that is worth giving up to avoid the cost of the mobile network."""
+"""Cost of the mobile network, expressed as bandwidth: a direct link is preferred if it is slower by less than this."""
 
 
 def least_cost(path: PathMetrics) -> float:
     """Return the score of a path. Higher is better.
 
-    Scores add up over time: a score of 2 for ten seconds is as good as a score of 4 for five seconds.
+    The agent compares sums of scores over time: a score of 2 for ten seconds is as good as a score of 4 for five seconds.
     """
-    useful = min(path.ingress_mbps, NEEDED_MBPS)
+    useful = min(path.ingress_mbps, REQUIRED_MBPS)
     return useful if path.direct else useful - MOBILE_COST_MBPS

@@ -11,7 +11,7 @@ MOBILE = PathMetrics(ingress_mbps=8.0, egress_mbps=8.0, ingress_latency_ms=60.0,
 WIFI = PathMetrics(ingress_mbps=12.0, egress_mbps=12.0, ingress_latency_ms=3.0, egress_latency_ms=3.0, direct=True)
 
 
-def test_bandwidth_above_the_need_does_not_raise_the_score() -> None:
+def test_bandwidth_above_requirement_does_not_raise_the_score() -> None:
     assert least_cost(WIFI) == least_cost(replace(WIFI, ingress_mbps=100.0))
 
 

@@ -1,6 +1,6 @@
-"""ImageChecker, in the cloud and at the edge: receives pictures and does nothing with them (thesis 8.9.3).
+"""ImageChecker, in the cloud and at the edge: receives pictures and discards them (thesis 8.9.3).
 
-It logs a line of JSON for each picture.
+It logs a JSON line for each picture.
 """
 
 from __future__ import annotations

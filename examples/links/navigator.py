@@ -1,4 +1,4 @@
-"""Navigator: takes off at the first waypoint, flies the others slowly, and lands at the last."""
+"""Navigator: takes off at the first waypoint and flies slowly to the other waypoints. The system flies the drone home."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""AerialViewer, a passenger of the drone: a picture from above every 2 s."""
+"""AerialViewer, a passenger of the drone: takes a picture every 2 s."""
 
 import pictures
 

@@ -12,47 +12,48 @@ from typing import Any
 from web import serve
 
 PORT = 8080
-RESULTS = Path("/tmp/results.jsonl")  # nosec B108  # an emptyDir: survives a restart of the container
+RESULTS = Path("/tmp/results.jsonl")  # nosec B108  # an emptyDir: it survives a restart of the container
 MAX_BYTES = 32 * 2**20
 log = logging.getLogger("data-store")
-writing = threading.Lock()
-kept: set[str | None] = set()
+lock = threading.Lock()
+stored: set[str | None] = set()
+"""Ids of the requests whose results are stored."""
 
 
-def keep(body: bytes, headers: Message) -> dict[str, Any]:
-    """Store a result once. Two ImageCheckers may check the same picture when the path changes.
+def store(body: bytes, headers: Message) -> dict[str, Any]:
+    """Store a result once. Two ImageCheckers may check the same picture if the path of the traffic changes.
 
     Raises:
-        ValueError: it is not a JSON object.
-        OSError: the store is full.
+        ValueError: The body is not a JSON object.
+        OSError: The store is full.
     """
     result = json.loads(body)
     if not isinstance(result, dict):
-        raise ValueError("a result is a JSON object")  # noqa: TRY004 (error of the sender)
+        raise ValueError("a result must be a JSON object")  # noqa: TRY004 (the sender receives status 400)
     line = json.dumps(result, separators=(",", ":")) + "\n"
     request = result.get("request")
-    with writing:
-        if request is not None and request in kept:
-            return {"kept": False}
-    with writing, RESULTS.open("a") as file:
+    with lock:
+        if request is not None and request in stored:
+            return {"stored": False}
+    with lock, RESULTS.open("a") as file:
         if file.tell() + len(line) > MAX_BYTES:
             raise OSError(f"the store is full at {MAX_BYTES} bytes")
         file.write(line)
-        kept.add(request)
-    log.info("kept %s of %s", result.get("picture"), result.get("source"))
-    return {"kept": True}
+        stored.add(request)
+    log.info("stored %s of %s", result.get("picture"), result.get("source"))
+    return {"stored": True}
 
 
 def results(body: bytes, headers: Message) -> list[Any]:
     """Return all stored results, oldest first."""
-    with writing:
+    with lock:
         lines = RESULTS.read_text().splitlines() if RESULTS.exists() else []
     return [json.loads(line) for line in lines]
 
 
 if __name__ == "__main__":
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S")
-    before = results(b"", Message())
-    kept.update(result.get("request") for result in before)
-    log.info("listening on port %d, %d results kept before", PORT, len(before))
-    serve(PORT, get={"/results": results}, post={"/results": keep})
+    earlier = results(b"", Message())
+    stored.update(result.get("request") for result in earlier)
+    log.info("listening on port %d (stored results: %d)", PORT, len(earlier))
+    serve(PORT, get={"/results": results}, post={"/results": store})

@@ -1,4 +1,4 @@
-"""GroundViewer, at the roadside: a picture every 5 s."""
+"""GroundViewer, at the roadside: takes a picture every 5 s."""
 
 import pictures
 

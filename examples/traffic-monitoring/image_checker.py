@@ -17,26 +17,26 @@ log = logging.getLogger("image-checker")
 
 
 async def check(request: fractus.Request) -> bytes:
-    """Return the properties of the picture, and send them to the DataStore with the request id that identifies repetitions.
+    """Return the properties of a picture, and send them to the DataStore. The request id identifies repeated requests.
 
     Raises:
-        ValueError: it is no picture.
-        OSError: the DataStore is away; the sender repeats its request.
+        ValueError: The request contains no picture.
+        OSError: The DataStore is unreachable. The sender repeats its request.
     """
-    line, _, picture = request.body.partition(b"\n")
-    told = json.loads(line)
+    first_line, _, picture = request.body.partition(b"\n")
+    header = json.loads(first_line)
     kind, width, height = measure(picture)
     result = {
         "request": request.id,
-        "picture": str(told.get("picture", "")),
-        "source": str(told.get("source", "")),
+        "picture": str(header.get("picture", "")),
+        "source": str(header.get("source", "")),
         "by": os.environ.get("FRACTUS_INSTANCE", "") + "@" + os.environ.get("FRACTUS_NODE", ""),
         "kind": kind,
         "width": width,
         "height": height,
         "bytes": len(picture),
         "sha256": hashlib.sha256(picture).hexdigest(),
-        "summary": f"{kind} {width}x{height}, {8 * len(picture) / (width * height):.2f} bits a pixel",
+        "summary": f"{kind} {width}x{height}, {8 * len(picture) / (width * height):.2f} bits per pixel",
     }
     headers = {"Content-Type": "application/json"}
     await asyncio.to_thread(post, fractus.egress("DataStore"), "/results", json.dumps(result).encode(), headers)
@@ -48,20 +48,20 @@ def measure(picture: bytes) -> tuple[str, int, int]:
     """Return type, width and height of a PNG or JPEG from its header.
 
     Raises:
-        ValueError: it is neither, or its headers are broken.
+        ValueError: The picture has another type, or its header is damaged.
     """
     if picture.startswith(b"\x89PNG\r\n\x1a\n") and len(picture) > 24:
         width, height = struct.unpack_from(">II", picture, 16)
         return "PNG", max(width, 1), max(height, 1)
-    at = 2 if picture.startswith(b"\xff\xd8") else len(picture)
-    while at + 9 < len(picture) and picture[at] == 0xFF:
-        marker = picture[at + 1]
-        length = struct.unpack_from(">H", picture, at + 2)[0]
-        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):  # a start-of-frame segment
-            height, width = struct.unpack_from(">HH", picture, at + 5)
+    offset = 2 if picture.startswith(b"\xff\xd8") else len(picture)
+    while offset + 9 < len(picture) and picture[offset] == 0xFF:
+        marker = picture[offset + 1]
+        length = struct.unpack_from(">H", picture, offset + 2)[0]
+        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):  # start-of-frame segment
+            height, width = struct.unpack_from(">HH", picture, offset + 5)
             return "JPEG", max(width, 1), max(height, 1)
-        at += 2 + length
-    raise ValueError("this is neither a PNG nor a JPEG")
+        offset += 2 + length
+    raise ValueError("the picture is neither a PNG nor a JPEG")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Viewer: takes pictures at intervals and sends them to the ImageChecker."""
+"""Common part of the viewers: takes pictures at intervals and sends them to the ImageChecker."""
 
 from __future__ import annotations
 
@@ -16,33 +16,33 @@ log = logging.getLogger("viewer")
 
 
 async def watch(interval_s: float) -> None:
-    """Take, retrieve and send pictures until SIGTERM. A failure is logged, and the next picture is taken."""
+    """Take, retrieve and send pictures until SIGTERM. Failures are logged."""
     stop = asyncio.Event()
     asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, stop.set)
     number = 0
-    said = ""
+    logged_code = ""
     async with fractus.camera(reconnect_timeout_s=1.0) as camera, fractus.requester("ImageChecker") as checker:
         while not stop.is_set():
             number += 1
             try:
-                name, picture = await look(camera, number)
-                found = json.loads(await checker.request("check", pack(name, os.environ["FRACTUS_INSTANCE"], picture)))
-                log.info("sent %s (%d bytes); %s found %s", name, len(picture), found["by"], found["summary"])
+                name, picture = await take_picture(camera, number)
+                result = json.loads(await checker.request("check", pack(name, os.environ["FRACTUS_INSTANCE"], picture)))
+                log.info("sent %s (%d bytes), result of %s: %s", name, len(picture), result["by"], result["summary"])
             except fractus.PolicyDenied as refusal:
-                if refusal.code != said:
-                    log.info("no picture here: %s", refusal)
-                said = refusal.code
+                if refusal.code != logged_code:
+                    log.info("pictures refused: %s", refusal)
+                logged_code = refusal.code
             except fractus.FractusError as error:
                 log.warning("picture %d: %s", number, error)
             else:
-                said = ""
+                logged_code = ""
             try:
                 await asyncio.wait_for(stop.wait(), interval_s)
             except TimeoutError:
                 continue
 
 
-async def look(camera: fractus.Camera, number: int) -> tuple[str, bytes]:
+async def take_picture(camera: fractus.Camera, number: int) -> tuple[str, bytes]:
     """Return a picture of the node's camera, or a test picture if the node has no camera service."""
     try:
         picture = await camera.take()
@@ -63,8 +63,8 @@ def render(width: int, height: int, number: int) -> bytes:
         road = height // 3 < y < 2 * height // 3
         row = bytearray([90 if road else 150]) * width
         if road and abs(y - height // 2) < height // 12:
-            at = number * 7 % (width - 16)
-            row[at : at + 16] = bytes([230]) * 16
+            left = number * 7 % (width - 16)
+            row[left : left + 16] = bytes([230]) * 16
         rows.append(b"\0" + bytes(row))
     header = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
     parts = ((b"IHDR", header), (b"IDAT", zlib.compress(b"".join(rows))), (b"IEND", b""))

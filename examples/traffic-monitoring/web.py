@@ -22,19 +22,19 @@ def serve(port: int, get: Mapping[str, Handler], post: Mapping[str, Handler]) ->
     class Requests(BaseHTTPRequestHandler):
         timeout = 10
 
-        def answer(self) -> None:
+        def respond(self) -> None:
             handler = routes[self.command].get(self.path)
             length = int(self.headers.get("Content-Length") or 0)
             if handler is None or not 0 <= length <= MAX_BODY_BYTES:
-                return self.reply(404 if handler is None else 413, {"error": "no such path, or too much"})
+                return self.reply(404 if handler is None else 413, {"error": "unknown path, or body too large"})
             try:
                 return self.reply(200, handler(self.rfile.read(length), self.headers))
             except ValueError as error:
                 return self.reply(400, {"error": str(error)})
-            except OSError as error:  # a dependency of this component is unreachable
+            except OSError as error:  # A dependency of this component is unreachable.
                 return self.reply(503, {"error": str(error)})
 
-        do_GET = do_POST = answer  # noqa: N815
+        do_GET = do_POST = respond  # noqa: N815
 
         def reply(self, status: int, value: Any) -> None:
             body = json.dumps(value).encode()
@@ -57,8 +57,8 @@ def post(address: str, path: str, body: bytes, headers: Mapping[str, str], timeo
     """Send a body to another component and return its JSON response.
 
     Raises:
-        OSError: it cannot be reached, or refuses.
+        OSError: The component is unreachable, or returned an error.
     """
     request = urllib.request.Request(f"http://{address}{path}", data=body, headers=dict(headers), method="POST")
-    with urllib.request.urlopen(request, timeout=timeout_s) as reply:  # nosec B310  # plain HTTP, see the module docstring
-        return json.load(reply)
+    with urllib.request.urlopen(request, timeout=timeout_s) as response:  # nosec B310  # plain HTTP within the cluster
+        return json.load(response)

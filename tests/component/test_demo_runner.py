@@ -103,7 +103,7 @@ def test_mission_fails_after_the_timeout(tmp_path: Path) -> None:
 def test_driver_log_lines_are_reported_complete_and_once(tmp_path: Path) -> None:
     log = tmp_path / "log"
     lines = list[str]()
-    log.write_bytes(b"[pod/x-navigator-1/navigator] 08:00 armed\n[pod/y/data-store] 08:00 kept 1\n[pod/x-navi")
+    log.write_bytes(b"[pod/x-navigator-1/navigator] 08:00 armed\n[pod/y/data-store] 08:00 stored 1\n[pod/x-navi")
     at = report_driver_lines(log, 0, lines.append)
     log.write_bytes(log.read_bytes() + b"gator-1/navigator] 08:01 waypoint 1/5\n")
     report_driver_lines(log, at, lines.append)

@@ -119,7 +119,8 @@ def test_dist_refuses_a_tag_of_another_version() -> None:
     )
     assert done.returncode == 2
     assert (
-        f"the tag v9.9.9 is not that of version {VERSION} in pyproject.toml: make release VERSION=9.9.9" in done.stderr
+        f"the tag v9.9.9 does not match version {VERSION} in pyproject.toml; run make release VERSION=9.9.9"
+        in done.stderr
     )
 
 
@@ -129,7 +130,7 @@ def test_audit_fails_if_advisories_are_unreachable() -> None:
         ["make", "--silent", "audit"], cwd=ROOT, env={**os.environ, **nowhere}, capture_output=True, text=True, timeout=120, check=False
     )  # fmt: skip
     assert done.returncode == 2
-    assert done.stderr.startswith("nothing was audited: cannot reach PyPI's advisories (https://pypi.org/")
+    assert done.stderr.startswith("audit not possible: cannot reach the advisories of PyPI (https://pypi.org/")
 
 
 @pytest.mark.root

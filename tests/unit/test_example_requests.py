@@ -33,7 +33,7 @@ def programs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> dict[str, Any]:
     monkeypatch.setattr(found["data_store"], "RESULTS", tmp_path / "results.jsonl")
     monkeypatch.setenv("FRACTUS_SERVICE_DATA_STORE", "data-store:8080")
     monkeypatch.setattr(
-        found["image_checker"], "post", lambda _to, _path, body, _headers: found["data_store"].keep(body, Message())
+        found["image_checker"], "post", lambda _to, _path, body, _headers: found["data_store"].store(body, Message())
     )
     return found
 
@@ -88,7 +88,7 @@ async def test_traffic_example_leaves_no_pictures_on_the_node(programs: dict[str
     camera = FullCamera()
     for number in range(4):
         try:
-            assert (await programs["pictures"].look(camera, number))[1] == f"picture-{camera.taken}".encode()
+            assert (await programs["pictures"].take_picture(camera, number))[1] == f"picture-{camera.taken}".encode()
         except fractus.PolicyDenied:
             assert camera.taken % 2
     assert (camera.kept, camera.taken) == ([], 4)
@@ -98,7 +98,7 @@ async def test_links_example_leaves_no_pictures_on_the_node(monkeypatch: pytest.
     monkeypatch.setattr(sys, "path", [str(EXAMPLES / "links"), *sys.path])
     monkeypatch.delitem(sys.modules, "aerial_viewer", raising=False)
     monkeypatch.delitem(os.environ, "PICTURE_BYTES", raising=False)
-    look = importlib.import_module("aerial_viewer").look
+    look = importlib.import_module("aerial_viewer").take_picture
     camera = FullCamera()
     with pytest.raises(fractus.PolicyDenied):
         await look(camera)

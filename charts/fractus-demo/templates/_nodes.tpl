@@ -14,8 +14,8 @@
 {{- with .root }}{{ .Values.image.registry }}/{{ $.part }}:{{ .Values.image.tag | default .Chart.AppVersion }}{{ end }}
 {{- end }}
 
-{{/* Name of the node that this release chose as the drone. The choice persists when other nodes come and go. */}}
-{{- define "fractus-demo.earlier" -}}
+{{/* Name of the node that this release chose as the drone. The choice stays if nodes are added or removed. */}}
+{{- define "fractus-demo.previous" -}}
 {{- if .Release.IsUpgrade }}
 {{- dig "metadata" "annotations" "fractus.dev/node" "" (lookup "apps/v1" "DaemonSet" .Release.Namespace (printf "%s-vehicle" .Release.Name)) }}
 {{- end }}
@@ -23,15 +23,15 @@
 
 {{/* Name of the drone node. */}}
 {{- define "fractus-demo.drone" -}}
-{{- $earlier := include "fractus-demo.earlier" . }}
-{{- if and $earlier .Values.drone (ne $earlier .Values.drone) }}
-{{- fail (printf "drone: %s is the drone of this release; to make %s the drone, uninstall it and install it again" $earlier .Values.drone) }}
-{{- else if or .Values.drone $earlier }}
-{{- .Values.drone | default $earlier }}
+{{- $previous := include "fractus-demo.previous" . }}
+{{- if and $previous .Values.drone (ne $previous .Values.drone) }}
+{{- fail (printf "drone: %s is the drone of this release; to use %s instead, uninstall the release and install it again" $previous .Values.drone) }}
+{{- else if or .Values.drone $previous }}
+{{- .Values.drone | default $previous }}
 {{- else }}
 {{- $found := include "fractus-demo.nodes" "drone" | fromJsonArray }}
 {{- if not $found }}
-{{- fail "no node has the label fractus.dev/class=drone; label one (kubectl label node NODE fractus.dev/class=drone) or name it: --set drone=NODE" }}
+{{- fail "no node has the label fractus.dev/class=drone; label a node (kubectl label node NODE fractus.dev/class=drone), or specify its name: --set drone=NODE" }}
 {{- end }}
 {{- first $found }}
 {{- end }}

@@ -41,7 +41,9 @@ class CallerAddress(OpenModel):
 
     instance: str = Field(description="Name of the calling instance.")
     address: str | None = Field(
-        default=None, max_length=45, description="IP address of its pod; unset while it has none."
+        default=None,
+        max_length=45,
+        description="IP address of the pod of the instance; unset if the pod has no address yet.",
     )
 
 

@@ -72,7 +72,7 @@ Ring = Annotated[tuple[Point, ...], Field(min_length=3, max_length=MAX_RING_POIN
 class Polygon(Model):
     """A polygon with holes. Rings are closed implicitly and must not cross themselves.
 
-    A ring follows the shorter way between neighbours, so it may cross the antimeridian.
+    The edge between two corners is the shorter connection, so a ring may cross the antimeridian.
     """
 
     exterior: Ring = Field(description="Outer ring: at least three points in order; the first one is not repeated.")

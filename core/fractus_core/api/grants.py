@@ -89,7 +89,7 @@ class GrantSpec(Model):
     tour: tuple[Position, ...] = Field(
         default=(),
         description="Positions that the system visits in this order before it returns home: the mission of an application"
-        " without a driver. Empty: a driver flies, or the application shares the flight of another one.",
+        " without a driver. Empty: a driver flies, or the application shares the flight of another application.",
     )
     services: tuple[ServiceRequest, ...] = Field(
         default=(), description="System services that the instance may call, with the methods."

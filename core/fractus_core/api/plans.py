@@ -63,7 +63,7 @@ class DroneChoice(Model):
         description="namespace/name of the application that flies the drone, if this application shares its flight.",
     )
     mission: Mission | None = Field(
-        default=None, description="Estimated flight; unset if the application shares the flight of another one."
+        default=None, description="Estimated flight; unset if the application shares the flight of another application."
     )
     transit: tuple[TransitLeg, ...] = Field(default=(), description="Legs that the system flies, in order.")
     legality: tuple[LegLegality, ...] = Field(
@@ -72,7 +72,7 @@ class DroneChoice(Model):
         " empty: all legs are allowed as requested.",
     )
     legality_omitted: int | None = Field(
-        default=None, ge=1, description="Number of such legs omitted from `legality` because of its size limit."
+        default=None, ge=1, description="Number of legs omitted from `legality` because of its size limit."
     )
     policy_conflict: str | None = Field(
         default=None, description="Reason why policies do not allow the mission as planned; unset: they allow it."
@@ -85,8 +85,8 @@ class DroneChoice(Model):
 class Serves(Model):
     """The instance near which a hybrid instance is placed."""
 
-    component: str = Field(description="Component of that instance.")
-    node: str = Field(description="Node of that instance.")
+    component: str = Field(description="Component of the served instance.")
+    node: str = Field(description="Node of the served instance.")
 
 
 class PlannedInstance(Model):

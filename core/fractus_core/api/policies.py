@@ -113,7 +113,7 @@ class ApplicationSelector(Model):
 
 
 class PolicySelector(Model):
-    """Selects the places, nodes and applications that a policy applies to. All given parts must match."""
+    """Selects the places, nodes and applications that a policy applies to. All specified fields must match."""
 
     zones: tuple[Name, ...] = Field(default=(), max_length=1000, description="Names of Zones; empty: everywhere.")
     nodes: tuple[NodeExpression, ...] = Field(

@@ -133,7 +133,7 @@ class MobilityServiceServicer(object):
         raise NotImplementedError('Method not implemented!')
 
     def ReturnControl(self, request, context):
-        """Returns control at the end of the task of a control point. After the last control point the system flies the drone home.
+        """Returns control at the end of a control point. After the last control point, the system flies the drone home.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')

@@ -27,7 +27,7 @@ _NODE_AUDIT_FOLDER = "/var/lib/fractus/audit"
 _NODE_RECORDINGS_FOLDER = "/var/lib/fractus/recordings"
 _LIST_RECORDINGS = "import sys, pathlib as p; r = p.Path(sys.argv[1]); [print(f.stat().st_mtime, f.relative_to(r)) for f in r.glob('*/*.mcap')]"
 _AUDIT_FILE = re.compile(r"(mobility|camera|links)(\.\d{12})?\.jsonl")
-_STORED_PICTURE = re.compile(rb"\[pod/[^/]+/data-store\] .* kept ")
+_STORED_PICTURE = re.compile(rb"\[pod/[^/]+/data-store\] .* stored ")
 _KINDS = "applications,deploymentplans,depots,drones,edgenodes,policies,zones"
 _FETCH_ATTEMPTS = 5
 _PICTURE_SHARES = (0.25, 0.5, 0.75)

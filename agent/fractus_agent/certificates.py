@@ -68,8 +68,8 @@ def inspect_certificate(directory: Path, node: str) -> ValidityPeriod:
     """Validate tls.crt, tls.key and ca.crt of a directory as a client of the node's services would.
 
     Raises:
-        InvalidCertificate: A file is missing or malformed, the files do not belong together, or the names are another
-            node's.
+        InvalidCertificate: A file is missing or malformed, the files do not belong together, or the certificate names another
+            node.
     """
     try:
         server = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)

@@ -229,7 +229,7 @@ class GrantSynchronizer:
             self._work.set()
 
     def on_authority_changed(self) -> None:
-        """Verify the Grants again whose authority was unknown."""
+        """Verify again the Grants whose authority was unknown."""
         for body, _ in tuple(self._unverified.values()):
             self._put(body)
         self._work.set()
@@ -242,7 +242,7 @@ class GrantSynchronizer:
             del grant_list  # frees the unpacked Grants, because the next event may be hours away
 
     def apply(self, grant_list: GrantList) -> None:
-        """Update the files to a list of Grants."""
+        """Update the files so that they match a list of Grants."""
         self._generation = grant_list.generation
         self._reported_generation = grant_list.reported_generation
         self._reported = grant_list.reported

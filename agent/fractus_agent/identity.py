@@ -178,7 +178,7 @@ class NodeIdentity:
         return validity is None or self._clock() >= validity.not_after
 
     def _validity(self) -> ValidityPeriod | None:
-        """Return the validity of the files, None if they are invalid. They are inspected only after a change."""
+        """Return the validity of the files, None if they are invalid. The files are inspected only after a change."""
         try:
             stamp: object = tuple(
                 (s.st_ino, s.st_mtime_ns) for s in ((self._directory / name).stat() for name in CERTIFICATE_FILES)

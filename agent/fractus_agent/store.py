@@ -149,7 +149,7 @@ async def connect(service_account: Path = SERVICE_ACCOUNT) -> Client:
     The token of the service account is read again when the API server refuses it.
 
     Raises:
-        Unconfigured: There is neither.
+        Unconfigured: There is neither KUBECONFIG nor a service account.
     """
     path = os.environ.get("KUBECONFIG")
     access = await kubeconfig(path) if path else await in_cluster(service_account)
@@ -315,8 +315,8 @@ class Store:
     async def _follow(self, target: _WatchTarget) -> AsyncGenerator[WatchEvent, None]:
         """Yield a complete list, then changes, and another list after each interruption, indefinitely.
 
-        An interruption never yields an empty list. After it the objects are listed again instead of resuming the watch:
-        the list is short, and an API server restored from a backup may have lower resource versions.
+        An interruption never yields an empty list. After an interruption the objects are listed again, and the watch is not
+        resumed, because an API server restored from a backup may have lower resource versions. The list is short.
         """
         backoff = Backoff(self._times.first_retry_s, self._times.longest_retry_s)
         kind = target.kind

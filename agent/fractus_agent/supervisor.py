@@ -20,7 +20,7 @@ WATCHDOG_TIMEOUT_S = 60.0
 
 
 class Supervisor:
-    """Runs the loops of the agent. If one fails, all end, and kubelet restarts the agent."""
+    """Runs the loops of the agent. If a loop fails, all loops end, and kubelet restarts the agent."""
 
     def __init__(self) -> None:
         self._loops: dict[str, Callable[[], Coroutine[Any, Any, None]]] = {}

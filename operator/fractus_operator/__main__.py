@@ -133,7 +133,7 @@ async def _await(future: asyncio.Future[None]) -> None:
 def work_queues(
     store: Store, cache: ClusterCache, csr: CsrController, conditions: NodeConditionWriter
 ) -> list[WorkQueue]:
-    """Return the queues of all controllers except that of Applications, connected to the informers of their inputs."""
+    """Return the queues of all controllers that kopf does not run, connected to the informers of their inputs."""
     policies = PolicyController(store, cache, _now)
     missions = MissionConditionController(store, cache, conditions, _now)
     events = DroneEventRecorder(store, cache, missions.granted_applications, _now)

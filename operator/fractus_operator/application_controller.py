@@ -50,7 +50,7 @@ _FIRST_RETRY_S = 1.0
 _MAX_RETRY_S = 30.0
 _MAX_PAUSE_S = 1.0
 _PAUSE_FACTOR = 2.0
-"""Duration of the pause after a reconciliation, relative to its own duration. Under load, each one then runs less often."""
+"""Pause after a reconciliation as a multiple of its duration. Under load, each Application is then reconciled less often."""
 
 EXCLUSION = timedelta(minutes=5)
 """Duration for which plans of an Application avoid a node on which the scheduler placed no pod."""
@@ -72,7 +72,7 @@ class BeingDeleted(Exception):
 
 @dataclass
 class _ApplicationState:
-    """State of one Application between reconciliations. Losing it, as in a restart, is harmless.
+    """State of one Application between reconciliations. It may be lost, for example in a restart.
 
     Attributes:
         excluded: Nodes that plans avoid, with the end of the exclusion and the reason.

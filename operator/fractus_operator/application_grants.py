@@ -66,7 +66,7 @@ class ApplicationGrants:
         results = await asyncio.gather(*writes, return_exceptions=True)
         failure = next((result for result in results if result is not None), None)
         if failure is not None:
-            # Either the watch reports a newer Grant, or the next reconciliation fails in the same way.
+            # A logged error is sufficient. Either the watch will report a newer Grant, or the next attempt will fail again.
             log.warning("application grants: Grants not updated (application=%s/%s error=%s)", *observed.key, failure)
             refused = isinstance(failure, KubeError) and failure.status in REFUSALS
             if not refused and not isinstance(failure, Conflict | NotFound):

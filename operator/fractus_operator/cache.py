@@ -36,7 +36,7 @@ from fractus_operator.store import Informer, Store
 from fractus_operator.work_queue import Subscriptions
 
 _WITHOUT_STATUS = frozenset({kinds.DEPLOYMENT, kinds.DIRECT_LINK})
-"""Kinds of child objects whose status changes often and is not an input."""
+"""Kinds of child objects whose status changes often and is used by no decision."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -30,10 +30,10 @@ from fractus_operator.store import ContentType, NotFound, Store
 log = logging.getLogger(__name__)
 
 ORPHANED_PODS_PERIOD_S = 30.0
-"""Period of the search for orphaned pods, and the minimum time that the garbage collector has for them."""
+"""Period of the search for orphaned pods, in seconds. The garbage collector has at least this time to delete them."""
 _DEFAULT_TTL_S: int = ApplicationSpec.model_fields["ttl_after_finished"].default
 _MAX_CLOCK_DIFFERENCE = timedelta(minutes=2)
-"""Maximum time by which the clock of an earlier operator may have been ahead."""
+"""Maximum time by which the clock of an earlier operator may have been ahead of this one."""
 
 
 class FinishedPods:
@@ -50,7 +50,7 @@ class FinishedPods:
         self._clock = clock
 
     async def stop(self, submitted: Submitted) -> bool:
-        """Stop the pods of an Application for good. Return True if there was anything to do.
+        """Stop the pods of an Application permanently. Return True if anything was changed.
 
         Raises:
             KubeError: The API server refused a change, or could not be reached.
@@ -93,7 +93,7 @@ class FinishedPods:
         return next_s
 
     async def remove(self, key: Key) -> bool:
-        """Delete all pods of an Application without Deployments, including kept ones. Return True if there were any.
+        """Delete all pods of an Application that has no Deployments, including kept pods. Return True if there were any.
 
         Raises:
             KubeError: The API server refused a deletion, or could not be reached.
@@ -131,7 +131,7 @@ class FinishedPods:
             else:
                 await self._store.delete(kinds.REPLICA_SET, key_of(body), body["metadata"]["uid"])
         for body in await list_objects(self._store, kinds.POD, key):
-            # Kept pods, too. The Application owns them, but the garbage collector deletes them late or not at all.
+            # Kept pods are deleted here as well. Their owner is the Application, but the garbage collector may miss them.
             if _managed_pods([parse_pod(body)]) and not owned_by(collected, body):
                 await self._store.delete(kinds.POD, key_of(body), body["metadata"]["uid"])
 

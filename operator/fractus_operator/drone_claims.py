@@ -275,7 +275,7 @@ def shared_flight_outcome(
 ) -> Outcome | None:
     """Return the mission outcome of an Application that shares a flight, or None while the mission continues.
 
-    The mission is complete when that of its host is.
+    The mission is complete when the mission of its host is complete.
 
     Args:
         plan: Plan of the Application.

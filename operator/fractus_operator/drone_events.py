@@ -25,7 +25,7 @@ EVENT_PERIOD_S = 60.0
 MAX_LATE = timedelta(seconds=60)
 """Maximum age difference between two reports of which the older one arrived late. Beyond it, the drone's clock was set back."""
 _PAUSE = timedelta(seconds=2 * DRONE_REPORT_S)
-"""Time between two reports from which the time of a change between them is unknown."""
+"""Pause between two reports from which an Event states the times of both, because the change happened between them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,7 +131,7 @@ class DroneEventRecorder:
         clock: Returns the current time.
 
     Attributes:
-        work_queue: Queue of drones with pending Events. Run it.
+        work_queue: Queue of drones with pending Events. The caller runs it.
     """
 
     def __init__(
@@ -149,7 +149,7 @@ class DroneEventRecorder:
         self._current: dict[str, FlightReport] = {}
         self._posted: dict[str, FlightReport] = {}
         self._budgets: dict[str, tuple[float, float]] = {}
-        """By drone: the number of allowed Events, and the time of this number in seconds."""
+        """By drone, the number of allowed Events, and the time at which it was computed, in seconds."""
 
     def changed(self, key: Key) -> None:
         """Handle a report of a drone."""

@@ -54,7 +54,7 @@ def _register(registry: kopf.OperatorRegistry, applications: Controller, oldest_
 
     @kopf.on.login(registry=registry, retries=3)
     def login(**kwargs: Any) -> kopf.ConnectionInfo | None:
-        """Return the credentials that the store uses. kopf calls it again when they expire."""
+        """Return the credentials that the store uses. kopf calls this function again when they expire."""
         info = _with_address(kopf.login_with_service_account(**kwargs)) or kopf.login_with_kubeconfig(**kwargs)
         return KopfConnection(**{f.name: getattr(info, f.name) for f in dataclasses.fields(info)}) if info else None
 

@@ -28,7 +28,7 @@ DIGEST_ANNOTATION = f"{GROUP}/applied"
 """Annotation with the digest of the object as last applied, so that an unchanged object is not written again."""
 
 CAUSE_ANNOTATION = f"{GROUP}/cause"
-"""Annotation of Deployments: DIGEST@NODE. The digest is that of the component in the manifest."""
+"""Annotation of Deployments: DIGEST@NODE, with the digest of the component in the manifest."""
 
 CERTIFICATE_ANNOTATION = f"{GROUP}/certificate"
 """Annotation of Deployments: the public part of the Secret of the instance.

@@ -79,8 +79,8 @@ class LinkEventRecorder:
     """Creates the Events. The state at the start of the operator has no Event, because the previous operator posted it.
 
     Attributes:
-        informer: Informer of DirectLinks. Run it.
-        work_queue: Queue of links with pending Events. Run it.
+        informer: Informer of DirectLinks. The caller runs it.
+        work_queue: Queue of links with pending Events. The caller runs it.
     """
 
     def __init__(self, store: Store, clock: Callable[[], datetime]) -> None:

@@ -22,7 +22,7 @@ from fractus_operator.store import Store
 log = logging.getLogger(__name__)
 
 _REPORTS = 2
-"""Number of different reports after the deletion of the last Grant that show the state of the drone."""
+"""Number of different reports after the deletion of the last Grant from which the state of the drone is known."""
 
 
 class MissionConditionController:

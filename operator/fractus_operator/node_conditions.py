@@ -68,15 +68,15 @@ class NodeConditionWriter:
         """Write a condition that only the operator writes. Return the transitions."""
         before = [known] if known is not None else []
         conditions, transitions = merge_conditions(before, [update], node.metadata.generation, now)
-        # With the uid, so that a later object of this name is not written. Each type has its own field manager, because an
-        # apply removes the conditions of its manager that it does not contain.
+        # The uid prevents a write to a later object of this name. Each type has its own field manager, because an apply removes
+        # the conditions of its manager that it does not contain.
         body = kind.header(node.name, uid=node.metadata.uid)
         body["status"] = {"conditions": [condition.to_dict() for condition in conditions]}
         manager = f"{self._store.field_manager}-{update.type.lower()}"
         try:
             self._record(kind, await self._store.apply(kind, body, subresource="status", field_manager=manager))
         except KubeError as error:
-            # After a rollback of the release, the ClusterRole allows only updates.
+            # The ClusterRole of an earlier release, to which the chart was rolled back, allows only updates.
             if error.status != HTTPStatus.FORBIDDEN:
                 raise
             if not self._warned:

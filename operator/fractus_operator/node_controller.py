@@ -60,7 +60,7 @@ def geohash(lat: float, lon: float, length: int = GEOHASH_LENGTH) -> str:
 
 
 def location_labels(node: Drone | EdgeNode, home: Point | None = None) -> dict[str, str]:
-    """Return the labels of the Node of a drone or edge node. The cell of a drone is that of its last report.
+    """Return the labels of the Node of a drone or edge node. A drone has the geohash of its last reported position.
 
     Args:
         node: The drone or edge node.

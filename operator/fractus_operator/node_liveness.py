@@ -27,7 +27,7 @@ _MISSED_REPORTS = 3
 _RECONNECT_S = 15.0
 """Longest pause of an agent before it reconnects after an outage of the API server."""
 _MAX_STEP_S = 3 * LIVENESS_PERIOD_S
-"""Longest step that counts as observation time. A longer one was delayed, and so were the informers."""
+"""Longest step that counts as observation time, in seconds. A longer step means that this process and its informers were delayed."""
 
 
 class ObservationClock:

@@ -65,7 +65,7 @@ def choose_plan(
         InvalidObject: The Application contradicts itself.
     """
     if in_flight is not None:
-        # Calls of an Application in flight are checked one by one. No plan takes its drone away.
+        # The services check every call of an Application in flight. A policy conflict must not take its drone away.
         settings = replace(settings, policy_conflicts="warn")
     reason = replan_reason(application, previous, inventory, stuck, in_flight)
     if reason is None and settings.policy_conflicts == "forbid" and _conflict(previous) is not None:
@@ -154,7 +154,7 @@ def replan_reason(
 ) -> str | None:
     """Return why a new plan is needed, as a CamelCase reason, or None.
 
-    An unreachable node is no reason, because its pods continue to run and it returns. A cordoned node is a reason.
+    An unreachable node is no reason, because its pods continue to run until it is reachable again. A cordoned node is a reason.
 
     Args:
         application: The Application.
@@ -187,7 +187,7 @@ def stuck_nodes(
     """Return the planned nodes on which the scheduler cannot place a pod.
 
     Returns:
-        The message of the scheduler by node. Seconds until the next check, if another pod may become stuck.
+        Messages of the scheduler by node, and the seconds until the next check, or None if no other pod may become stuck.
     """
     nodes = {placed.instance: placed.node for placed in plan.placements} if plan is not None else {}
     stuck: dict[str, str] = {}
@@ -198,7 +198,7 @@ def stuck_nodes(
         node = nodes.get(pod.instance or "")
         if pod.unschedulable_since is None or node is None or pod.terminating:
             continue
-        # Users of the namespace may create pods with these labels.
+        # A pod of another Deployment copies the labels. A user of the namespace created it.
         if pod.deployment != pod.instance:
             continue
         remaining_s = (pod.unschedulable_since + UNSCHEDULABLE_GRACE - now).total_seconds()

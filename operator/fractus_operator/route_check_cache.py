@@ -36,7 +36,7 @@ class _Check(NamedTuple):
 
 
 class RouteCheckCache:
-    """The latest check of each Application's plan. Losing it, as in a restart, is harmless.
+    """The latest check of each Application's plan. It may be lost, for example in a restart.
 
     One check runs at a time, and each Application has at most one waiting, so no tenant blocks the event loop.
 

@@ -22,7 +22,7 @@ log = logging.getLogger(__name__)
 SERVICES_CURRENT = "ServicesCurrent"
 ROLLOUT_PERIOD_S = 2.0
 _SHARE = 20
-"""The services of one node in this many are replaced at the same time."""
+"""The services of at most one in this number of nodes are replaced at the same time, but always of one node."""
 STUCK_S = 600.0
 """Maximum time until services are ready, in seconds, including image pulls over slow links.
 
@@ -107,7 +107,7 @@ def _condition_without_outdated(node: ServicesOfNode, skipped: bool) -> Conditio
 
 
 class ServiceRollout:
-    """Executes the steps, and reports them in the condition ServicesCurrent of drones and edge nodes."""
+    """Executes the steps of the rollout, and reports them in the condition ServicesCurrent of drones and edge nodes."""
 
     def __init__(
         self, store: Store, cache: ClusterCache, conditions: NodeConditionWriter, monotonic: Callable[[], float]
@@ -121,7 +121,7 @@ class ServiceRollout:
         self._awaited: dict[str, set[str]] = {}
         """By node, the DaemonSets whose deleted pods have no ready successor yet."""
         self._starting: dict[str, tuple[Mapping[str, str], float]] = {}
-        """By node, the starting pods, and since when in seconds."""
+        """By node, the starting pods, and the time since which they have been starting, in seconds."""
 
     async def step(self) -> None:
         """Replace the services that may be replaced now.

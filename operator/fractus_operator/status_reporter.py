@@ -23,9 +23,9 @@ log = logging.getLogger(__name__)
 _BUSY_ROLLOUTS = 5
 """Number of concurrent rollouts from which a further one takes seconds, so that its Application is reported as queued."""
 _MIN_FAILURES = 3
-"""Number of successive failed reconciliations that are reported in the status.
+"""Number of successive failed reconciliations after which the status reports the failure.
 
-A busy API server then gets no additional request after a single failure, but a webhook that does not respond is reported.
+A single failure causes no additional request to a busy API server. A webhook that does not respond is reported.
 """
 _WITHOUT_EVENT = frozenset({"MissionWaiting", "PodsNotReady", "OperatorBusy"})
 """Reasons without an Event, because they are only reported as progress in the status."""
@@ -108,7 +108,7 @@ class StatusReporter:
         if status == before:
             return
         namespace, name = submitted.key
-        # With the uid, so that a later Application of this name is not written.
+        # The uid prevents a write to a later Application of this name.
         body = {**kinds.APPLICATION.header(name, namespace, uid=submitted.uid), "status": status}
         try:
             applied = await self._store.apply(kinds.APPLICATION, body, subresource="status")

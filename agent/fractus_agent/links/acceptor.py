@@ -135,7 +135,7 @@ class Acceptor:
                 self._sessions[session.peer] = _this_task()
             await session.send({"accepted": not reason, "reason": reason})
         except (LinkLost, PairingFailed, OSError, TimeoutError) as error:
-            # Every radio in range can cause this line.
+            # Every radio in range can cause this line, so its rate is limited.
             log.warning("links: pairing failed (error=%s)", error, extra={"limit_by": "pairing"})
             reason = str(error) or "timeout"
         except BaseException:

@@ -99,7 +99,7 @@ class CloudPath:
 
 
 def declared_metrics(node: Node | None, latency_ms: float | None = None) -> PathMetrics:
-    """Return the performance of the cloud path, from the fastest interface that is not the direct one.
+    """Return the performance of the cloud path, from the fastest interface other than the direct interface.
 
     Args:
         node: Node with its interfaces, None if unknown.

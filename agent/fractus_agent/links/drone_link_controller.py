@@ -205,7 +205,7 @@ class DroneLinkController:
         return _parse_routes(message, link_address(peer), [link for link in self._links if link.spec.node == peer])
 
     def _track_and_peers(self) -> tuple[Track | None, dict[str, Peer]]:
-        """Return the track of the drone and its peers in one frame. The path is that of the first application by name."""
+        """Return the track of the drone and its peers in one frame. The track follows the path of the first application by name."""
         sample = self._telemetry()
         if sample is None or not self._links:
             return None, {}
@@ -234,7 +234,7 @@ class DroneLinkController:
         return traffic
 
     def _heuristic(self, application: str, link: DirectLink) -> PathHeuristic | None:
-        """Return the heuristic of an application, None if it is unknown: then its traffic takes the cloud path."""
+        """Return the heuristic of an application, or None if it is unknown. Its traffic then takes the cloud path."""
         selected = link.spec.heuristic
         try:
             return self._heuristics.find(selected.kind, selected.metric)

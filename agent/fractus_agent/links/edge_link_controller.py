@@ -50,7 +50,7 @@ class EdgeLinkController:
         self._record = record
         self._links: tuple[DirectLink, ...] = ()
         self._next_plan = asyncio.Event()
-        """Set by the next change of the DirectLinks, which then creates a new event."""
+        """Event that the next change of the DirectLinks sets, and then replaces by a new event."""
         self._routes: dict[str, dict[Endpoint, Endpoint]] = {}
         self._ports: dict[Endpoint, int] = {}
         self._acceptor = Acceptor(tls, self._refusal, self._serve, max_peers=MAX_DRONES)

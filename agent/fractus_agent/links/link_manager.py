@@ -194,7 +194,7 @@ class LinkManager:
         def make_table(callers: Callers) -> None:
             ruleset.create(device, ports, clients=is_drone, callers=callers)
 
-        # The new table replaces that of an earlier agent, and contains its guards from the beginning.
+        # The new table replaces the table of an earlier agent, and contains the guards from the beginning.
         guarded_endpoints = allowed_callers if is_drone else isolated_pods
         guards = guarded_endpoints(self._direct_links.links)
         make_table(guards)
@@ -217,7 +217,7 @@ class LinkManager:
                     maps.recreate_table()
             await self._keep_up(controller)
 
-        # Not part of the group, because redirects must stay alive while the controller moves traffic back.
+        # This task is not part of the group, because redirects must stay alive while the controller moves traffic back.
         refreshing = asyncio.create_task(redirector.run())
         try:
             async with asyncio.TaskGroup() as tasks:
@@ -239,7 +239,7 @@ class LinkManager:
                 with suppress(RedirectFailed):
                     ruleset.remove()
             finally:
-                # After the table, which would mark new connections.
+                # The entries are deleted after the table, because the table would mark new connections.
                 with suppress(NetlinkError):
                     conntrack.delete_all()
                 netlink.close()

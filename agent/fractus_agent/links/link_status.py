@@ -23,7 +23,7 @@ from fractus_agent.supervisor import repeat
 
 URGENT_INTERVAL_S = 1.0
 VALUES_INTERVAL_S = 15.0
-"""Seconds between writes of one status: after a decision, and if only measured values have changed."""
+"""Minimum seconds between writes of one status: after a decision (URGENT), or if only measured values have changed (VALUES)."""
 
 _PHASES = {LinkPhase.NONE: "Idle", LinkPhase.CONNECTING: "Connecting", LinkPhase.UP: "Up"}
 

@@ -1,8 +1,8 @@
 """Pairing session of a direct link: mutual authentication by node certificates, heartbeats and bandwidth probes.
 
 The session is a sequence of JSON objects, one per line, over TLS 1.3. The drone requests pairing. The edge node accepts,
-or refuses with a reason. After that the session carries heartbeats in both directions, by which each end detects the
-loss of the link, short bandwidth probes, and messages about the traffic.
+or refuses with a reason. After that the session carries heartbeats in both directions, short bandwidth probes, and messages
+about the traffic. Each end detects the loss of the link by missing heartbeats.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ def authenticated_node(writer: asyncio.StreamWriter) -> str:
     """Return the node name in the certificate of the other end.
 
     Raises:
-        PairingFailed: The certificate is not a node's. Components and operators have certificates of the same authority.
+        PairingFailed: The certificate does not belong to a node. Components have certificates of the same authority.
     """
     certificate: Mapping[str, Any] = writer.get_extra_info("peercert") or {}
     prefix = node_identity("")

@@ -1,8 +1,8 @@
 """Established connections: TCP sockets of pods (socket diagnosis) and connection tracking entries (conntrack).
 
 The TCP socket of a client in its pod still has the virtual address as its peer, because the address translation happens
-outside of the pod. Established connections keep the translation of their first packet, whatever the nftables map
-contains later. So after a switch the old sockets are closed, and the old conntrack entries are deleted.
+outside of the pod. Established connections keep the translation of their first packet, even if the nftables map
+changes later. So after a switch the old sockets are closed, and the old conntrack entries are deleted.
 """
 
 from __future__ import annotations
@@ -200,7 +200,7 @@ def _decode(response: bytes) -> TcpConnection | None:
 
 
 class PodNamespaces:
-    """TCP sockets of all pods on this node, by the network namespaces of the container runtime.
+    """TCP sockets of all pods on this node, one `TcpSockets` for each network namespace of the container runtime.
 
     Args:
         directory: Directory of the namespaces, /run/netns. None if this node has no clients.
@@ -231,7 +231,7 @@ class PodNamespaces:
         return self._open.values()
 
     def list_connections(self, services: Collection[Endpoint]) -> Iterator[tuple[TcpSockets, TcpConnection]]:
-        """Yield the connections to some services. Namespaces that cannot be read are skipped, such as of ending pods."""
+        """Yield the connections to some services. Unreadable namespaces are skipped, such as those of ending pods."""
         for sockets in self.refresh():
             try:
                 connections = sockets.list_connections(services)
@@ -242,7 +242,7 @@ class PodNamespaces:
                 yield sockets, connection
 
     def cut(self, services: Collection[Endpoint], identities: Collection[bytes]) -> int:
-        """Close connections to some services, whatever they are doing.
+        """Close connections to some services, even in the middle of a call.
 
         Args:
             services: Endpoints that the connections go to.
@@ -271,7 +271,11 @@ class PodNamespaces:
 
 
 def destroy_connection(sockets: TcpSockets, connection: TcpConnection) -> bool:
-    """Close a connection. Return False if the kernel cannot: it then ends when its conntrack entry is deleted."""
+    """Close a connection.
+
+    Returns:
+        False if the kernel cannot close sockets. The connection then ends when its conntrack entry is deleted.
+    """
     try:
         sockets.destroy(connection)
     except DestroyUnsupported as error:

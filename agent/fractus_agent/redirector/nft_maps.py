@@ -38,7 +38,7 @@ CALLERS = "callers"
 
 MARK_MASK = 0xFFF00000
 MARK_BASE = 0xF6A00000
-"""Connection mark of redirected connections. The lower bits number the period of a service on one path."""
+"""Connection mark of redirected connections. The lower bits contain the service number, which changes with each switch."""
 
 MAX_NUMBER = 0xFFFFF
 

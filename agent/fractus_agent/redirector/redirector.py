@@ -130,8 +130,8 @@ class Redirector:
 
         Args:
             services: Endpoints that clients connect to.
-            callers: Allowed clients by guarded endpoint: of services on a node with clients, and of pods that accept
-                only traffic of a direct link on other nodes.
+            callers: Allowed clients by guarded endpoint. On a node with clients, the guarded endpoints are services. On other
+                nodes they are pods that accept only traffic of a direct link.
 
         Raises:
             NetlinkError: The kernel refused the transaction. Nothing has changed.

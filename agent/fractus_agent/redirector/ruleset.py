@@ -87,7 +87,7 @@ def ruleset_text(devices: str, ports: Ports, *, clients: bool, callers: Callers 
         ports: Ports of the node itself that are open on direct interfaces.
         clients: True to redirect clients on this node. False to redirect only traffic of paired nodes that arrives over
             direct interfaces. Guarded pods of this node then accept nothing else.
-        callers: Allowed clients by guarded endpoint. They are part of the text, so that the table never exists without.
+        callers: Allowed clients by guarded endpoint. They are part of the text, so that the table never exists without them.
     """
     chains = (
         _redirect_chains(devices, clients=clients),

@@ -85,7 +85,7 @@ class NodeObservation:
 
 
 def ready_condition(observed: NodeObservation) -> ConditionUpdate:
-    """Return the condition Ready: true if components can work on the node, otherwise with the first problem."""
+    """Return the condition Ready. It is True if components can work on the node, otherwise it contains the first problem."""
 
     def unready(reason: str, message: str) -> ConditionUpdate:
         return ConditionUpdate("Ready", "False", reason, message)

@@ -1,4 +1,4 @@
-"""Builders of Grants, and of the status that reports of a node's agent give them."""
+"""Builders of Grants, and of their status from the reports of a node's agent."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def grant(application: Application, spec: GrantSpec) -> Body:
 
 
 def regranted(observed: Body, spec: GrantSpec) -> Body:
-    """Return an existing Grant with another spec, as `grant` builds it. The Application is not needed."""
+    """Return an existing Grant with another spec, in the form that `grant` builds from an Application."""
     body = kinds.GRANT.header(observed["metadata"]["name"])
     present = observed["metadata"].get("labels") or {}
     body["metadata"]["labels"] = {label: present[label] for label in _LABELS if label in present}

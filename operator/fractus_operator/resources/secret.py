@@ -1,7 +1,7 @@
 """Client certificates of instances, in Secrets that the operator may write and delete but not read.
 
 The public part of a certificate is an annotation of the Deployment of its instance. So the operator's token gives access to
-no Secret except that of the certificate authority.
+no Secret except the Secret of the certificate authority.
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ class Certificates:
         self._authority = authority
         self._clock = clock
         self._states: dict[Key, dict[str, SecretState]] = {}
-        """By Application and instance. Losing it, as in a restart, is harmless."""
+        """By Application and instance. The states may be lost, for example in a restart."""
 
     def of(
         self, application: Application, placed: PlannedInstance, deployment: Body | None, pods: Iterable[PodView]

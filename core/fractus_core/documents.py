@@ -1,8 +1,8 @@
 """YAML and JSON parsing as in the API server, with resource limits and the line of each value.
 
-Files must mean the same to Fractus as to other programs. So plain scalars have the types that kubectl gives them (a
-timestamp is a string, `on` is true, 1e3 is a number), duplicate keys are errors, and an alias counts as the values that
-it repeats. Values are built from parser events, so the limits apply before memory is spent (docs/decisions/0019-yaml-from-parser-events.md).
+Fractus reads a file like kubectl does. So plain scalars have the types that kubectl gives them: a timestamp is a string,
+`on` is true, and 1e3 is a number. Duplicate keys are errors, and an alias counts as the values that it repeats. Values are
+built from parser events, so the limits apply before memory is spent (docs/decisions/0019-yaml-from-parser-events.md).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ MAX_BYTES = 64 * 2**20
 MAX_NODES = 5_000_000
 """Maximum number of scalars, lists and objects of a file, enough for 100,000 nodes with their interfaces."""
 MAX_ALIASED = 100_000
-"""Maximum number of values that aliases repeat. Manifests repeat an image or a path; alias bombs repeat each other."""
+"""Maximum number of values that aliases repeat. In an alias bomb, aliases repeat other aliases."""
 MAX_DEPTH = 100
 _MAX_DIGITS = 300
 
@@ -72,10 +72,10 @@ class BadDocument(ValueError):
     def __init__(self, name: str, line: int, problem: str) -> None:
         self.line = line
         self.problem = problem
-        super().__init__(f"{_place(name, line)}: {problem}")
+        super().__init__(f"{_file_line(name, line)}: {problem}")
 
 
-def _place(name: str, line: int) -> str:
+def _file_line(name: str, line: int) -> str:
     return f"{name}:{line}" if line else name
 
 
@@ -89,12 +89,12 @@ class Documents:
 
     def where(self, value: object, path: str = "") -> str:
         """Return FILE:LINE of a list or object of these documents, or of the field at `path` below it."""
-        return _place(self.name, self.line(value, path))
+        return _file_line(self.name, self.line(value, path))
 
     def line(self, value: object, path: str = "") -> int:
         """Return the line of a list or object of these documents, or of the field at `path` below it.
 
-        If the path does not exist completely, the line of its last existing part is returned, or 0 if no part is known.
+        If only the first parts of the path exist, return the line of the last existing part, or 0 if no part exists.
         """
         line, fields = self._lines.get(id(value), (0, {}))
         for part in _PART.finditer(path):
@@ -238,7 +238,7 @@ class _Reader:
         for other in done.merged:
             for key, value in other.items():
                 if key in done.value:
-                    raise self._bad(done.line, f"{key} is defined here and by <<; remove one of them")
+                    raise self._bad(done.line, f"{key} is defined in this object and by <<; remove one of them")
                 done.value[key] = value
                 done.lines[key] = done.line
         self.lines[id(done.value)] = done.line, done.lines

@@ -7,7 +7,7 @@ from datetime import datetime
 
 from fractus_core.api import Condition, InvalidObject, Policy, Zone
 from fractus_core.api.conditions import ConditionUpdate, merge_conditions
-from fractus_core.planning.grant_compiler import check_united, sound
+from fractus_core.planning.grant_compiler import check_united, validated
 from fractus_core.validation import check_policy, check_zone
 
 from fractus_operator.cache import ClusterCache
@@ -70,7 +70,7 @@ class PolicyController:
                 return ConditionUpdate("Ready", "False", "ZoneInvalid", message)
         selected = [zones[name] for name in dict.fromkeys(policy.spec.selector.zones)]
         try:
-            check_united(policy, [sound(zone) for zone in selected if isinstance(zone, Zone)])
+            check_united(policy, [validated(zone) for zone in selected if isinstance(zone, Zone)])
         except InvalidObject as error:
             return ConditionUpdate("Ready", "False", "ZoneInvalid", str(error))
         return ConditionUpdate("Ready", "True", "Valid", "the policy can be enforced")

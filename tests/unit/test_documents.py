@@ -57,7 +57,7 @@ def test_json_accepts_characters_that_yaml_forbids(number):
     [
         ("a: 1\nb: 2\na: 3", "f.yaml:3: a is also defined on line 1; remove one of them"),
         ("a:\n  b: {c: 1, d: 2, c: 1}", "f.yaml:2: c is also defined on line 2"),
-        ("a: &a {p: 1}\nb: {<<: *a, p: 2}", "f.yaml:2: p is defined here and by <<; remove one of them"),
+        ("a: &a {p: 1}\nb: {<<: *a, p: 2}", "f.yaml:2: p is defined in this object and by <<; remove one of them"),
         ("a: &a [1, *a]", "f.yaml:1: *a refers to a value that contains it"),
         ("a: *b", "f.yaml:1: the anchor &b is not defined above"),
         ("a: &x 1\n---\nb: *x", "f.yaml:3: the anchor &x is not defined above"),

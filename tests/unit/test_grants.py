@@ -9,7 +9,14 @@ from fractus_core.api import InvalidObject, Policy, Zone
 from fractus_core.api.policies import NodeExpression
 from fractus_core.geo import area_polygon
 from fractus_core.planning import flight_of, grant_compiler, plan
-from fractus_core.planning.grant_compiler import _SOUND, MAX_ROUNDING_M, compile_grants, refresh, sound, zone_crossings
+from fractus_core.planning.grant_compiler import (
+    _VALIDATED,
+    MAX_ROUNDING_M,
+    compile_grants,
+    refresh,
+    validated,
+    zone_crossings,
+)
 from fractus_core.planning.operation_area import operation_area
 from fractus_core.policy.compiled_grant import compile_grant
 from fractus_core.policy.decision_types import Call, CaptureArgs, GotoArgs, Home, Situation
@@ -68,20 +75,20 @@ def test_grant_refuses_zones_with_too_many_crossings():
 def test_zone_validity_cache_is_cleared_with_the_zone():
     """Each change of a zone, even of its status, creates another object."""
     gc.collect()
-    before = len(_SOUND)
+    before = len(_VALIDATED)
     near = zone("near", (50, 0))
     compiled(policy("out", ("near",), **FENCE), zones=[near])
     compiled(policy("out", ("near",), **FENCE), zones=[near])
-    assert len(_SOUND) == before + 1
-    assert sound(near) is sound(near)
+    assert len(_VALIDATED) == before + 1
+    assert validated(near) is validated(near)
     del near
     gc.collect()
-    assert len(_SOUND) == before
+    assert len(_VALIDATED) == before
 
 
 def test_zone_crossings_are_equal_across_the_antimeridian():
     zones = [
-        tuple(sound(z) for z in (comb("north", 20, lon=lon), comb("east", 20, across=True, lon=lon)))
+        tuple(validated(z) for z in (comb("north", 20, lon=lon), comb("east", 20, across=True, lon=lon)))
         for lon in (20.0, 179.9999, -180.0)
     ]
     first, *others = (zone_crossings(each, 10**6) for each in zones)

@@ -10,7 +10,7 @@ from fractus_core.api import Zone
 from fractus_core.api.geometry import Point
 from fractus_core.api.plans import DroneChoice
 from fractus_core.planning import Infeasible, Settings, operation_area, plan
-from fractus_core.planning.grant_compiler import AROUND_WAY_M, compile_grants, flight_grant, sound
+from fractus_core.planning.grant_compiler import AROUND_CORRIDOR_M, compile_grants, flight_grant, validated
 from fractus_core.planning.legality import MAX_LISTED, MAX_SEARCHES, with_legality
 from fractus_core.policy.compiled_grant import compile_grant
 from fractus_core.policy.decision_types import Airframe, Call, GotoArgs, Home, Situation
@@ -220,9 +220,9 @@ def test_legality_uses_every_zone_near_path():
     area_ = operation_area(APP.spec, inventory_.depots, 7.0)
     grant = flight_grant(APP, inventory_.drones["d"], inventory_, area_)
     corners = [area_.frame.xy(p.lat, p.lon) for p in grant.corridor[0].polygon.exterior]
-    reach_m = max(math.hypot(x, y) for x, y in corners) + AROUND_WAY_M
+    reach_m = max(math.hypot(x, y) for x, y in corners) + AROUND_CORRIDOR_M
     middle = Point(lat=area_.frame.lat, lon=area_.frame.lon)
-    near = {z.name for z in zones if sound(z).distance_m(middle) <= reach_m}
+    near = {z.name for z in zones if validated(z).distance_m(middle) <= reach_m}
     assert {z.name for z in grant.policies[0].zones} == near
     assert 50 < len(near) < 300
 

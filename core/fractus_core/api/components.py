@@ -21,7 +21,7 @@ _EXTENDED = (
 _NAME_LENGTH = 317
 TLS_DIR = "/var/run/fractus/tls"
 """Directory with the certificate of a component."""
-TMP_DIR = "/tmp"  # nosec B108  # noqa: S108  (the pod's own)
+TMP_DIR = "/tmp"  # nosec B108  # noqa: S108  (private to the pod)
 """Directory that a component may write to."""
 _OWN_VOLUMES = {"tls": TLS_DIR, "tmp": TMP_DIR}
 _IMAGE = (

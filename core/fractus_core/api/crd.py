@@ -26,7 +26,7 @@ _DROPPED = {"title", "additionalProperties", "properties", "items", "anyOf", "$r
 
 
 def crd(kind: type[Resource]) -> Schema:
-    """The CustomResourceDefinition of a kind."""
+    """Return the CustomResourceDefinition of a kind."""
     schema = kind.model_json_schema(by_alias=True, mode="validation")
     definitions = schema.get("$defs", {})
     properties = {
@@ -82,7 +82,7 @@ def crd(kind: type[Resource]) -> Schema:
 
 
 def _without_rules(schema: Schema) -> Schema:
-    """The schema without CEL rules at any depth."""
+    """Return the schema without CEL rules at any depth."""
     out: Schema = {key: value for key, value in schema.items() if key != "x-kubernetes-validations"}
     for key in ("items", "additionalProperties"):
         if isinstance(out.get(key), dict):
@@ -93,10 +93,10 @@ def _without_rules(schema: Schema) -> Schema:
 
 
 def structural(schema: Schema, definitions: dict[str, Schema], path: str) -> Schema:
-    """A JSON Schema as a Kubernetes structural schema.
+    """Convert a JSON Schema to a Kubernetes structural schema.
 
     Raises:
-        ValueError: it uses a keyword that has no structural form.
+        ValueError: The schema uses a keyword that has no structural form.
     """
     merged = _resolved(schema, definitions)
     unknown = set(merged) - _KEPT - _DROPPED
@@ -127,7 +127,7 @@ def structural(schema: Schema, definitions: dict[str, Schema], path: str) -> Sch
 
 
 def _resolved(schema: Schema, definitions: dict[str, Schema]) -> Schema:
-    """The schema with its reference and its nullable wrapper unfolded; outer keywords win."""
+    """Return the schema with its reference and its nullable wrapper replaced by their content. Outer keywords win."""
     merged = dict(schema)
     while True:
         if "$ref" in merged:

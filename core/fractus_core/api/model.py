@@ -37,10 +37,10 @@ def quantity(text: str | float) -> float:
     return float(match.group(1)) * _SCALE[match.group(3)]
 
 
-def _checked_quantity(given: object) -> str:
-    text = str(given) if type(given) is int else given
+def _checked_quantity(value: object) -> str:
+    text = str(value) if type(value) is int else value
     if not isinstance(text, str) or len(text) > _QUANTITY_LENGTH or re.fullmatch(_QUANTITY, text) is None:
-        raise ValueError(f"{given!r:.40} is not a quantity such as 250m, '1.5' or 512Mi")
+        raise ValueError(f"{value!r:.40} is not a quantity such as 250m, '1.5' or 512Mi")
     return text
 
 
@@ -64,13 +64,13 @@ _TIMESTAMP = (
 )
 
 
-def _checked_timestamp(given: object) -> object:
-    if isinstance(given, datetime):
-        return given
+def _checked_timestamp(value: object) -> object:
+    if isinstance(value, datetime):
+        return value
     try:
-        return datetime.fromisoformat(given if isinstance(given, str) and re.fullmatch(_TIMESTAMP, given) else "")
+        return datetime.fromisoformat(value if isinstance(value, str) and re.fullmatch(_TIMESTAMP, value) else "")
     except ValueError:
-        raise ValueError(f"must be a time with its zone, such as 2026-06-01T12:00:00Z, not {given!r:.40}") from None
+        raise ValueError(f"must be a time with its zone, such as 2026-06-01T12:00:00Z, not {value!r:.40}") from None
 
 
 Timestamp = Annotated[
@@ -217,7 +217,7 @@ class Resource(Model):
         """Parse an object from the API server or a manifest.
 
         Raises:
-            InvalidObject: with one sentence that names the field and the remedy.
+            InvalidObject: The object is invalid. The message is one sentence with the field and the remedy.
         """
         try:
             # Validate as JSON in strict mode, because the API server does not convert strings to numbers either.
@@ -292,9 +292,9 @@ class InvalidObject(ValueError):
             joint = "" if not inner or inner.startswith("[") or not path else "."
             return cls((path + joint + inner).lstrip("."), context.problem)
         problem = str(context) if context is not None else _problem(finding)
-        shown = finding.get("input")
-        if context is None and finding["type"] != "extra_forbidden" and isinstance(shown, (str, int, float, bool)):
-            text = repr(shown)
+        value = finding.get("input")
+        if context is None and finding["type"] != "extra_forbidden" and isinstance(value, (str, int, float, bool)):
+            text = repr(value)
             problem += f", not {text if len(text) <= 80 else text[:77] + '...'}"
         return cls(path.lstrip("."), problem[:1].lower() + problem[1:])
 

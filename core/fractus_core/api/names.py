@@ -50,7 +50,7 @@ LabelValue = Annotated[str, Field(max_length=63, pattern=LABEL_VALUE)]
 
 SHAPES = {
     DNS_LABEL: "lowercase letters, digits and hyphens, with a letter or digit first and last",
-    DNS_SUBDOMAIN: "lowercase letters, digits, hyphens and dots, with a letter or digit beside each dot, first and last",
+    DNS_SUBDOMAIN: "lowercase letters, digits, hyphens and dots, with a letter or digit first, last, and on both sides of each dot",
     COMPONENT_NAME: "letters, digits and hyphens, with a letter first and no hyphen last",
     HEURISTIC_KIND: "letters, digits, hyphens, underscores and dots, with a letter first and a letter or digit last",
     LABEL_KEY: "letters, digits, hyphens, underscores and dots, with an optional DNS name and slash before them",
@@ -105,10 +105,10 @@ _READABLE = re.compile(
 
 
 def _read(name: str) -> tuple[str, str, str | None] | None:
-    found = _READABLE.fullmatch(name)
-    if found is None or _ends_in_hash(name, _NAME_DIGITS):
+    match = _READABLE.fullmatch(name)
+    if match is None or _ends_in_hash(name, _NAME_DIGITS):
         return None
-    return found["application"], found["component"], found["node"]
+    return match["application"], match["component"], match["node"]
 
 
 def _hash(text: str, digits: int) -> str:

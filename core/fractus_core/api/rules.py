@@ -51,7 +51,7 @@ def rule(cel: str, message: str) -> Callable[[Callable[[M], Violation]], Any]:
 
 
 def referenced_by(kind: str, referrers: str) -> Any:
-    """Return the rule that objects of a kind have names that fit into the fields of the kinds that refer to them."""
+    """Return the rule that the name of an object fits into the fields of the kinds that refer to the object."""
 
     @rule(
         f"self.metadata.name.size() <= 63 && self.metadata.name.matches('{DNS_LABEL}')",

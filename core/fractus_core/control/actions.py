@@ -76,7 +76,7 @@ class Brake:
 
 @dataclass(frozen=True, slots=True)
 class HoldPosition:
-    """Hover for the driver, unless something else begins first."""
+    """Hover for the driver, unless a motion or task begins first."""
 
 
 @dataclass(frozen=True, slots=True)

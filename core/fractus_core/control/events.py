@@ -228,7 +228,7 @@ class ModeChangeEnded:
         mode: Requested mode.
         before: Mode that was expected before the request.
         done: True if the autopilot confirmed the change.
-        refused: True if the autopilot refused the change. If neither is True, its answers may have been lost.
+        refused: True if the autopilot refused the change. If neither is True, its acknowledgements may have been lost.
     """
 
     mode: FlightMode
@@ -262,7 +262,7 @@ class MotorStart:
 
     Attributes:
         begins: True at the beginning.
-        unanswered: True if the autopilot received the request and did not refuse. Its answers may have been lost.
+        unanswered: True if the autopilot received the request and did not refuse. Its acknowledgements may have been lost.
     """
 
     begins: bool

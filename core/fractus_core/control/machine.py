@@ -95,9 +95,9 @@ UNATTENDED = "NoControlAuthority"
 """Code of the takeover of a vehicle without control authority. It results from a fault of the service."""
 
 MAX_UNATTENDED = 3
-"""Number of such takeovers in one flight, because a task that always fails would be restarted forever.
+"""Maximum number of such takeovers in one flight. Without a maximum, a task that always fails would be restarted forever.
 
-After that the supervisor stops the heartbeats, and the autopilot's own failsafe brings the vehicle home.
+After the last one the supervisor stops the heartbeats, and the autopilot's own failsafe brings the vehicle home.
 """
 
 CANCELLED_DESCENT_S = 0.3
@@ -137,7 +137,8 @@ def transition(state: ControlState, event: Event, now: float) -> tuple[ControlSt
         _on_tick(update)
     else:
         assert_never(event)
-    # A driver must not keep or wait for the vehicle of an ended mission: it could arm beside the pilot who landed it.
+    # A driver must neither keep nor await the vehicle of an ended mission. It could arm the vehicle next to the pilot who
+    # landed it.
     lease = update.state.lease
     mission = update.state.missions.get(lease.key) if lease is not None else None
     if mission is not None and mission.outcome is not None:
@@ -186,7 +187,7 @@ def _open_stream(update: StateUpdate, event: StreamOpened) -> None:
     if lease is not None and lease.key != event.key and not lease.granted and update.state.flies_for(event.key):
         update.lose_lease("another application has the drone")
         lease = None
-    if (lease is not None and lease.key != event.key) or update.state.taken(event.key):
+    if (lease is not None and lease.key != event.key) or update.state.armed_for_other(event.key):
         reason = "another application has the drone; try again when it is back"
         update.act(RefuseStream(event.lease_id, "ControlHeld", reason))
         return
@@ -202,7 +203,12 @@ def _grant_control(update: StateUpdate, lease_id: int) -> None:
     lease = state.lease
     if lease is None or lease.lease_id != lease_id or lease.granted:
         return
-    if state.authority is Authority.PILOT or state.home_for_good or not state.decided or state.taken(lease.key):
+    if (
+        state.authority is Authority.PILOT
+        or state.home_for_good
+        or not state.decided
+        or state.armed_for_other(lease.key)
+    ):
         return
     mission = update.mission(lease.key, lease.identity)
     update.stop_task()

@@ -34,7 +34,7 @@ def not_ready_reason(state: ControlState, key: str, readiness: Readiness) -> str
     reasons = (
         (not vehicle.connected, readiness.absent or NOT_CONNECTED),
         (not state.decided, "it is not known yet who has control of the drone"),
-        (state.taken(key), "another application has the drone"),
+        (state.armed_for_other(key), "another application has the drone"),
         (bool(readiness.unverified), f"the autopilot's failsafes are not verified: {readiness.unverified}"),
         (state.authority is Authority.PILOT, f"a human pilot has the drone ({vehicle.mode.name})"),
         (state.home_for_good, "the system brings the drone home"),

@@ -17,7 +17,7 @@ class Authority(Enum):
 
 
 class ModeKind(Enum):
-    """Meaning of a flight mode for control, independent of its number in the autopilot.
+    """Class of a flight mode by its meaning for control.
 
     COMMANDED: The autopilot follows the companion (GUIDED).
     RETURNING, LANDING: The autopilot brings the vehicle down by itself.
@@ -236,7 +236,7 @@ class Grace:
 
 @dataclass(frozen=True, slots=True)
 class ControlState:
-    """Complete state that determines who commands the vehicle and what the system does with it.
+    """State that determines the control authority over the vehicle and the task of the system.
 
     Times are monotonic seconds.
 
@@ -333,7 +333,7 @@ class ControlState:
 
     @property
     def granted(self) -> bool:
-        """True if there is a lease and it is granted."""
+        """True if a driver has a granted lease."""
         return self.lease is not None and self.lease.granted
 
     @property
@@ -384,7 +384,7 @@ class ControlState:
         """Return True if the vehicle is armed for this mission."""
         return self.vehicle.armed and self.active == key
 
-    def taken(self, key: str) -> bool:
+    def armed_for_other(self, key: str) -> bool:
         """Return True if the vehicle is armed for a different mission."""
         return self.vehicle.armed and self.mission is not None and self.mission.key != key
 

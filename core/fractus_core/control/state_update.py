@@ -167,7 +167,7 @@ class StateUpdate:
         self.set(grace=Grace(until, mission.key, reason, code) if waits else None)
 
     def follow_descent(self, kind: TaskKind, *, found: bool = False) -> None:
-        """Supervise a descent that the autopilot started by itself, and complete it if the autopilot stops."""
+        """Supervise a descent that the autopilot started without a command, and complete it if the autopilot stops."""
         self.set(authority=Authority.SYSTEM)
         self.start(kind, found=found)
         self.set(returning=True)

@@ -36,9 +36,9 @@ the companion again. Only the mode shows that the failsafe acted.
 """
 
 UNCONFIRMED_S = 10.0
-"""Seconds for which a requested mode or motor start may still take effect after its answer timed out.
+"""Seconds for which a requested mode or motor start may still take effect after its acknowledgement timed out.
 
-The autopilot may have accepted the request while its answers were lost.
+The autopilot may have accepted the request while its acknowledgements were lost.
 """
 
 ARMED_BY_OTHERS = "armed the drone"
@@ -69,7 +69,7 @@ def on_vehicle(update: StateUpdate, event: VehicleEvent) -> None:
         case ModeChangeEnded(mode, before, done, refused):
             changes = max(update.state.mode_changes - 1, 0)
             update.set(mode_changes=changes, own_modes=update.state.own_modes if changes else frozenset())
-            # A failed change is no longer expected. If only its answers were lost, the vehicle may still report the mode.
+            # A failed change is no longer expected. If only its acknowledgements were lost, the vehicle may still report the mode.
             if done:
                 update.set(unconfirmed=None)
             elif update.state.expected_mode == mode and update.state.vehicle.mode != mode:

@@ -44,7 +44,7 @@ def area_polygon(frame: LocalFrame, area: Area, *, within: bool = False) -> shap
     Args:
         frame: Frame of the result.
         area: Polygon or circle.
-        within: Inscribe a circle instead, so that the result never exceeds it.
+        within: True to inscribe a circle, so that the result never exceeds the circle.
 
     Raises:
         InvalidObject: A ring crosses itself or encloses nothing, or a hole leaves the exterior.
@@ -60,7 +60,7 @@ def _circle(frame: LocalFrame, circle: Circle, *, within: bool) -> shapely.Polyg
     x, y = frame.xy(circle.center.lat, circle.center.lon)
     radius_m, segments = _circumscribed(circle.radius)
     if within:
-        # The frame shortens distances far from its origin, so the same number of its metres would exceed the circle.
+        # The frame shortens distances far from its origin, so a circle of the same radius in the frame would be too large.
         furthest = (math.hypot(x, y) + circle.radius) / _MIN_CURVATURE_M
         radius_m = circle.radius * math.sqrt(max(1.0 - furthest * furthest, 0.0))
     return shapely.Point(x, y).buffer(radius_m, quad_segs=segments)
@@ -83,13 +83,13 @@ def _polygon(frame: LocalFrame, spec: Polygon) -> shapely.Polygon:
 def _ring(frame: LocalFrame, ring: Sequence[Point], field: str) -> shapely.Polygon:
     shape = shapely.Polygon(points_xy(frame, ring))
     if not shape.is_valid:
-        at = shapely.is_valid_reason(shape)
-        where = ""
-        if "[" in at:
-            x, y = (float(v) for v in at[at.index("[") + 1 : at.index("]")].split()[:2])
+        reason = shapely.is_valid_reason(shape)
+        location = ""
+        if "[" in reason:
+            x, y = (float(v) for v in reason[reason.index("[") + 1 : reason.index("]")].split()[:2])
             lat, lon = frame.latlon(x, y)
-            where = f" near lat {lat:.6f}, lon {lon:.6f}"
-        raise InvalidObject(field, f"the ring crosses itself{where}; list the points in order around the area")
+            location = f" near lat {lat:.6f}, lon {lon:.6f}"
+        raise InvalidObject(field, f"the ring crosses itself{location}; list the points in order around the area")
     if shape.area < 1e-6:
         raise InvalidObject(field, "the ring encloses no area; give at least three points that are not in line")
     return shape
@@ -126,8 +126,8 @@ def check_extent(area: Area) -> None:
     centre = area_center(area)
     for i, point in enumerate(area.polygon.exterior if area.polygon is not None else ()):
         if distance_m(centre, point) > MAX_EXTENT_M:
-            how = f"is more than {MAX_EXTENT_M / 1000:.0f} km from the middle; split the area"
-            raise InvalidObject(f"polygon.exterior[{i}]", how)
+            problem = f"is more than {MAX_EXTENT_M / 1000:.0f} km from the middle; split the area"
+            raise InvalidObject(f"polygon.exterior[{i}]", problem)
 
 
 def area_center(area: Area) -> Point:
@@ -222,7 +222,7 @@ def _parts(shapes: Iterable[BaseGeometry]) -> list[shapely.Polygon]:
 
 
 def _turns(ring: Sequence[tuple[float, float]]) -> bool:
-    """Return True if an unwrapped ring encloses a pole: it ends a whole turn from its start."""
+    """Return True if an unwrapped ring encloses a pole. Its end is then 360 degrees from its start."""
     return abs(ring[-1][0] - ring[0][0]) > 180.0
 
 
@@ -269,8 +269,7 @@ Line = npt.NDArray[np.float64]
 _AT_ONCE = 64
 """Number of pieces compared with all others at a time. For 30,000 pieces this makes a million pairs."""
 _MAX_PAIRS = 2_500_000
-"""Number of pairs of pieces examined at most, within a second. A route of two thousand parallel pieces has this many.
-"""
+"""Maximum number of pairs of pieces that are examined, which takes a second. Two thousand parallel pieces have as many pairs."""
 
 
 def count_crossings(lines: Sequence[Line], at_most: int) -> int:
@@ -287,17 +286,18 @@ def count_crossings(lines: Sequence[Line], at_most: int) -> int:
     ends = np.concatenate([line[1:] for line in lines]) if lines else np.empty((0, 2))
     pieces = shapely.linestrings(np.stack([starts, ends], axis=1)) if len(starts) else np.empty(0, dtype=object)
     tree = shapely.STRtree(pieces)
-    count = looked_at = 0
+    count = 0
+    examined = 0
     for first in range(0, len(pieces), _AT_ONCE):
         first_index, second_index = tree.query(pieces[first : first + _AT_ONCE])
         later = second_index > first_index + first
         first_index = first_index[later] + first
         second_index = second_index[later]
-        looked_at += len(first_index)
+        examined += len(first_index)
         count += int(
             np.count_nonzero(_cross(starts[first_index], ends[first_index], starts[second_index], ends[second_index]))
         )
-        if count > at_most or looked_at > _MAX_PAIRS:
+        if count > at_most or examined > _MAX_PAIRS:
             return at_most + 1
     return count
 
@@ -311,8 +311,8 @@ def _cross(a: Line, b: Line, c: Line, d: Line) -> npt.NDArray[np.bool_]:
     return apart & (_side(c, d, a) * _side(c, d, b) < 0)
 
 
-def _side(start: Line, end: Line, place: Line) -> npt.NDArray[np.float64]:
-    """Return the side of the line from start to end on which a place is: positive on the left."""
+def _side(start: Line, end: Line, point: Line) -> npt.NDArray[np.float64]:
+    """Return the side of the line from start to end on which a point lies: positive on the left."""
     direction = end - start
-    offset = place - start
+    offset = point - start
     return np.sign(direction[:, 0] * offset[:, 1] - direction[:, 1] * offset[:, 0])

@@ -43,7 +43,7 @@ class Authority:
 
     @classmethod
     def generate(cls, now: datetime) -> Self:
-        """Make a new authority, valid for ten years."""
+        """Create a new authority, valid for ten years."""
         key = ec.generate_private_key(ec.SECP256R1())
         name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, f"{GROUP} authority")])
         certificate = (
@@ -87,7 +87,7 @@ class Authority:
         return self.certificate.public_bytes(serialization.Encoding.PEM)
 
     def issue_component(self, identity: str, now: datetime, life: timedelta = COMPONENT_LIFE) -> Data:
-        """Make a key and a client certificate for a component instance.
+        """Create a key and a client certificate for a component instance.
 
         Args:
             identity: SPIFFE ID of the instance, the only subject alternative name.
@@ -106,7 +106,7 @@ class Authority:
         return self._data(key, certificate)
 
     def issue_node(self, node: str, now: datetime, life: timedelta = NODE_LIFE) -> Data:
-        """Make a key and the certificate of a node's services, for nodes without an agent that has its own key.
+        """Create a key and the certificate of a node's services, for nodes without an agent that has its own key.
 
         Args:
             node: Name of the node.
@@ -117,7 +117,7 @@ class Authority:
         return self._data(key, self._node_certificate(key.public_key(), node, now, life))
 
     def issue_signer(self, now: datetime) -> tuple[ec.EllipticCurvePrivateKey, x509.Certificate]:
-        """Make a key and a certificate that is valid only for signing Grants."""
+        """Create a key and a certificate that is valid only for signing Grants."""
         key = ec.generate_private_key(ec.SECP256R1())
         pem = self._issue(
             key.public_key(),

@@ -21,7 +21,7 @@ _MAX_VERIFIED = 4096
 
 
 class GrantSigner:
-    """Signs Grants with a key that never leaves this process and that a certificate of the authority proves.
+    """Signs Grants with a key that never leaves this process. A certificate of the authority belongs to the key.
 
     Args:
         authority: Authority that all nodes trust.
@@ -45,7 +45,7 @@ class GrantSigner:
         now = self._clock()
         key, certificate = self._present_signer(now)
         before = replaces.spec.issued_at if replaces is not None else None
-        # A time after the expiry of the certificate is forged or damaged. Following it would make all signing impossible.
+        # A time after the expiry of the certificate is forged or damaged. A later time of issue could not be signed.
         if before is not None and before.tzinfo is not None and before < certificate.not_valid_after_utc:
             self._last_issued = max(self._last_issued, before)
         # The time must increase even if the clock stops or goes back, because nodes keep the latest Grant.
@@ -81,10 +81,10 @@ class GrantSigner:
 
 
 def _mission(body: dict[str, Any], replaces: Grant | None) -> str:
-    """Return the mission of a Grant: the one in its spec, or that of the replaced object, or a new one.
+    """Return the mission of a Grant: that of its spec, or of the Grant that it replaces, or a new mission.
 
-    `metadata.uid` is used as the mission of objects that do not come from an API server. A Grant on another node starts a new
-    mission, because the first node ended the old one when the Grant left it and would refuse to fly it again.
+    A new mission is identified by the uid of the Grant if it has one. A Grant on another node starts a new mission: the
+    first node ended the old mission when the Grant left it, and would refuse to fly it again.
     """
     uid = (body.get("metadata") or {}).get("uid")
     kept = None

@@ -29,12 +29,12 @@ class Ledger:
         for component, node in kept:
             self._kept.setdefault(node, {})[component.name] = requests(component)
 
-    def shortage(self, node: str, wanted: Mapping[str, float], requesters: Collection[str]) -> str | None:
+    def shortage(self, node: str, requested: Mapping[str, float], requesters: Collection[str]) -> str | None:
         """Return the first insufficient resource with its amounts, or None if all are available.
 
         Args:
             node: Name of the host.
-            wanted: Total requests by resource name.
+            requested: Total requests by resource name.
             requesters: Names of the requesting components, whose own reservations are available to them.
         """
         host = self._hosts[node]
@@ -44,7 +44,7 @@ class Ledger:
             for name, amounts in self._kept.get(node, {}).items()
             if name not in requesters and name not in placed
         ]
-        for resource, amount in wanted.items():
+        for resource, amount in requested.items():
             free = host.allocatable.get(resource, 0.0) - host.requested.get(resource, 0.0)
             free -= sum(amounts.get(resource, 0.0) for amounts in (*placed.values(), *kept))
             if amount > free + 1e-9:
@@ -78,7 +78,7 @@ class Check:
         return not self.reason
 
     def rejection(self, component: Component | str, node: str) -> Rejection:
-        """Return the failed check as an entry of the plan."""
+        """Return the failed check as an entry for the plan's list of rejected nodes."""
         name = component if isinstance(component, str) else component.name
         return Rejection(component=name, node=node, reason=self.reason, message=self.message)
 
@@ -126,13 +126,13 @@ def check_services(offered: NodeServices, components: Iterable[Component]) -> Ch
 
 def check_resources(ledger: Ledger, node: str, components: Iterable[Component]) -> Check:
     """Check that all components together fit into the free resources of a node."""
-    wanted: dict[str, float] = {}
+    requested: dict[str, float] = {}
     names: list[str] = []
     for component in components:
         names.append(component.name)
         for resource, amount in requests(component).items():
-            wanted[resource] = wanted.get(resource, 0.0) + amount
-        shortage = ledger.shortage(node, wanted, names)
+            requested[resource] = requested.get(resource, 0.0) + amount
+        shortage = ledger.shortage(node, requested, names)
         if shortage is not None:
             fit = "does not fit" if len(names) == 1 else "do not fit together"
             return Check(INSUFFICIENT, f"{', '.join(names)} {fit} ({shortage})")

@@ -65,8 +65,8 @@ def default_score(facts: DroneFacts) -> float:
 def find_drones(builder: PlanBuilder, area: OperationArea) -> DroneCandidates:
     """Return the drones in range of the start. Without a driver, include airborne drones that visit all points of interest."""
     leader = builder.spec.driver or next(builder.spec.on("drone"))
-    flying = _flying_by(builder, leader) if builder.spec.driver is None else []
-    names = set(_standing(builder, area, leader, flying))
+    flying = _flying_past(builder, leader) if builder.spec.driver is None else []
+    names = set(_parked_in_range(builder, area, leader, flying))
     builder.set_candidates(leader, [*names, *flying], len(builder.located.stands) + len(builder.located.homeless))
     idle = [builder.inventory.drones[name] for name in sorted(names - set(flying)) if name in builder.inventory.drones]
     return DroneCandidates(tuple(idle), tuple(builder.inventory.drones[name] for name in flying))
@@ -94,7 +94,7 @@ def choose_drone(builder: PlanBuilder, area: OperationArea, candidates: DroneCan
         fallback = f"none of the {known} known drones is near the start" if known else "no Drone exists"
         raise builder.infeasible(leader, reason, f"no drone can fly {leader.name}", fallback)
     ranked.sort(key=lambda r: (not builder.was_selected(r.drone.name, shared=r.used), -r.score, r.drone.name))
-    best, way, conflict = _legal_first(builder, area, ranked, leader)
+    best, route, conflict = _legal_first(builder, area, ranked, leader)
     for component in components:
         builder.place(component, "drone", best.drone.name)
     home = home_of(best.drone, builder.inventory.depots)
@@ -106,11 +106,11 @@ def choose_drone(builder: PlanBuilder, area: OperationArea, candidates: DroneCan
         node=best.drone.name,
         score=round(best.score, 6),
         shared_with="/".join(builder.inventory.flights[best.drone.name].holder) if best.used else None,
-        mission=_mission(best.mission, way) if best.mission is not None else None,
+        mission=_mission(best.mission, route) if best.mission is not None else None,
         transit=tuple(legs),
         alternatives=tuple(Alternative(node=r.drone.name, score=round(r.score, 6)) for r in others[:_ALTERNATIVES]),
     )
-    return way.add_to(choice, conflict) if way is not None else choice
+    return route.add_to(choice, conflict) if route is not None else choice
 
 
 def _legal_first(
@@ -118,14 +118,14 @@ def _legal_first(
 ) -> tuple[_Ranked, MissionRoute | None, str | None]:
     """Select the first drone whose route the policies allow, and reject the drones before it.
 
-    If there is none, select the first drone of all, with the conflict. A drone of the previous plan is kept in spite of a
-    conflict, unless conflicts are forbidden.
+    If the policies allow no route, select the first drone, with the conflict. A drone of the previous plan is kept in spite
+    of a conflict, unless conflicts are forbidden.
 
     Returns:
         The drone, its route, and the policy conflict if there is one.
 
     Raises:
-        Infeasible: There is no such drone, and conflicts are forbidden.
+        Infeasible: The policies allow no route, and conflicts are forbidden.
     """
     judge = RouteJudge(builder.application, area, builder.inventory, builder.settings)
     forbids = builder.settings.policy_conflicts == "forbid"
@@ -134,10 +134,10 @@ def _legal_first(
         if judge.exhausted:
             break
         kept = builder.was_selected(candidate.drone.name, shared=candidate.used)
-        way = judge.way(candidate.drone, candidate.mission)
+        route = judge.route(candidate.drone, candidate.mission)
         available = candidate.mission.available_min if candidate.mission is not None and not kept else None
-        conflict = way.conflict(available) if way is not None else None
-        tried.append((candidate, way, conflict))
+        conflict = route.conflict(available) if route is not None else None
+        tried.append((candidate, route, conflict))
         if conflict is None or (kept and not forbids):
             break
     legal = tried[-1][2] is None
@@ -157,7 +157,7 @@ def _legal_first(
 # -- drones in range --
 
 
-def _standing(builder: PlanBuilder, area: OperationArea, leader: Component, flying: Sequence[str]) -> list[str]:
+def _parked_in_range(builder: PlanBuilder, area: OperationArea, leader: Component, flying: Sequence[str]) -> list[str]:
     """Return the drones parked in range of the start, and reject the nearest ones out of range."""
     located = builder.located
     settings = builder.settings
@@ -175,14 +175,14 @@ def _standing(builder: PlanBuilder, area: OperationArea, leader: Component, flyi
         reason = "TooFar" if named is None else "OtherDepot"
         if named is None:
             kept = frozenset().union(*(located.kept_in(name) for name in _depots_around(builder, centre)))
-    wanted = f"not in {named}" if reason == "OtherDepot" else f"more than {limit:.0f} m"
+    requirement = f"not in {named}" if reason == "OtherDepot" else f"more than {limit:.0f} m"
     in_range = {name for name, _ in located.stands.within(centre, limit)} | kept
     for name, distance in located.stands.nearest(centre, settings.near_misses, limit, settings.near_miss_m):
         if name not in in_range and name in builder.inventory.drones:
             relation = "is"
             if reason == "OtherDepot":
                 relation = f"is kept in {builder.inventory.drones[name].spec.depot or 'no depot'},"
-            message = f"{name} {relation} {distance:.0f} m from the start, {wanted}"
+            message = f"{name} {relation} {distance:.0f} m from the start, {requirement}"
             builder.reject(leader, name, Check(reason, message), far=True)
     for name in sorted(located.homeless - kept - set(flying))[: settings.near_misses]:
         message = f"{name} has neither a depot that exists nor a home; set spec.depot or spec.home"
@@ -190,29 +190,29 @@ def _standing(builder: PlanBuilder, area: OperationArea, leader: Component, flyi
     return sorted(in_range)
 
 
-def _depots_around(builder: PlanBuilder, place: Point) -> Iterable[str]:
-    near: list[Near] = builder.located.depots.within(place, builder.located.widest_depot_m)
+def _depots_around(builder: PlanBuilder, center: Point) -> Iterable[str]:
+    near: list[Near] = builder.located.depots.within(center, builder.located.widest_depot_m)
     return [n for n, m in near if n in builder.inventory.depots and m <= builder.inventory.depots[n].spec.radius]
 
 
-def _flying_by(builder: PlanBuilder, leader: Component) -> list[str]:
+def _flying_past(builder: PlanBuilder, leader: Component) -> list[str]:
     """Return the drones of other applications whose flights visit all points of interest, and reject some of the others."""
     poi = builder.spec.points_of_interest
-    found = []
-    noted = 0
+    visiting = []
+    listed = 0
     for name, flight in sorted(builder.inventory.flights.items()):
         if poi is None or name not in builder.inventory.drones or flight.holder == builder.application.key:
             continue
         missed = first_missed(poi.points, flight, builder.settings.safety_radius_m, ordered=poi.ordered)
         if missed is None:
-            found.append(name)
-        elif noted < builder.settings.near_misses:
-            noted += 1
+            visiting.append(name)
+        elif listed < builder.settings.near_misses:
+            listed += 1
             holder = "/".join(flight.holder)
             order = " in this order" if poi.ordered else ""
             message = f"{name} flies for {holder}, which does not visit pointsOfInterest.points[{missed}]{order}"
             builder.reject(leader, name, Check("PathMissesPoint", message), far=True)
-    return found
+    return visiting
 
 
 # -- requirements on a drone --
@@ -226,8 +226,8 @@ def _rank(
     kept = builder.was_selected(drone.name, shared=used)
     home = home_of(drone, builder.inventory.depots)
     mission = estimator.estimate(home, drone) if home is not None and not used else None
-    check = _lasting(builder, drone, components, mission, kept=kept) and (
-        _passing(builder, drone, components, mission, kept=kept, used=used)
+    check = _check_permanent(builder, drone, components, mission, kept=kept) and (
+        _check_temporary(builder, drone, components, mission, kept=kept, used=used)
     )
     if not check:
         builder.reject(leader, drone.name, check)
@@ -244,7 +244,7 @@ def _rank(
     return _Ranked(drone, score, used, mission)
 
 
-def _lasting(
+def _check_permanent(
     builder: PlanBuilder, drone: Drone, components: list[Component], mission: Estimate | None, *, kept: bool
 ) -> Check:
     """Check permanent requirements: services, altitude, flight time with a full battery."""
@@ -264,7 +264,7 @@ def _lasting(
     return SUITABLE
 
 
-def _passing(
+def _check_temporary(
     builder: PlanBuilder, drone: Drone, components: list[Component], mission: Estimate | None, *, kept: bool, used: bool
 ) -> Check:
     """Check temporary requirements: other applications, host, state, battery, free resources.
@@ -296,8 +296,8 @@ def _too_long(drone: Drone, mission: Estimate, available_min: float, when: str) 
     )
 
 
-def _mission(estimate: Estimate, way: MissionRoute | None) -> Mission:
-    flown = way if way is not None and way.legs and way.denied is None else estimate
+def _mission(estimate: Estimate, route: MissionRoute | None) -> Mission:
+    flown = route if route is not None and route.legs and route.denied is None else estimate
     return Mission(
         distance=round(flown.distance_m, 1),
         duration=round(flown.needed_min, 3),

@@ -27,7 +27,7 @@ class Location:
         index: Index of the location in the component.
         nodes: Edge nodes in the location: current hosts first, then the nearest first.
         hosts: Selected nodes.
-        seen: Number of nodes that were checked. None of them is free any more.
+        seen: Number of nodes at the beginning of `nodes` that were checked. None of them is free any more.
     """
 
     component: Component
@@ -47,11 +47,11 @@ def find_static(builder: PlanBuilder, component: Component) -> list[Location]:
     located = builder.located.edge_nodes
     known = builder.inventory.edge_nodes
     before = {(p.location, p.node) for p in builder.previous_placements if p.component == component.name}
-    found = []
+    matches = []
     for i, spot in enumerate(component.locations):
         near = [(name, distance) for name, distance in located.within(spot.center, spot.radius) if name in known]
-        found.append(Location(component, i, tuple(_current_hosts_first(builder, component, i, near, before))))
-    inside = {name for location in found for name in location.nodes}
+        matches.append(Location(component, i, tuple(_current_hosts_first(builder, component, i, near, before))))
+    inside = {name for location in matches for name in location.nodes}
     builder.set_candidates(component, inside, len(located))
     for i, spot in enumerate(component.locations):
         for name, distance in located.nearest(
@@ -60,7 +60,7 @@ def find_static(builder: PlanBuilder, component: Component) -> list[Location]:
             if name not in inside and name in known:
                 message = f"{name} is {distance:.0f} m from the centre of locations[{i}], more than {spot.radius:.0f} m"
                 builder.reject(component, name, Check("OutsideLocation", message), far=True)
-    return found
+    return matches
 
 
 def place_static(builder: PlanBuilder, locations: Sequence[Location]) -> None:
@@ -72,18 +72,18 @@ def place_static(builder: PlanBuilder, locations: Sequence[Location]) -> None:
     Raises:
         Infeasible: A location that needs instances gets none.
     """
-    seating = _NodeMatching(builder)
+    matching = _NodeMatching(builder)
     numbered = [location for location in locations if location.spot.instances != "*"]
-    seating.fill(numbered)
+    matching.fill(numbered)
     starved = _first_empty(numbered)
     if starved is not None:
         # Give each location one instance before any location gets a second one.
-        seating.clear(numbered)
-        seating.fill(numbered, at_most=1)
+        matching.clear(numbered)
+        matching.fill(numbered, at_most=1)
         starved = _first_empty(numbered)
-        seating.fill(numbered)
-    seating.sweep(locations)
-    seating.clear_bookings()
+        matching.fill(numbered)
+    matching.sweep(locations)
+    matching.clear_bookings()
     for location in locations:
         chosen = set(location.hosts)
         for name in location.nodes[: location.seen]:
@@ -97,8 +97,8 @@ def place_static(builder: PlanBuilder, locations: Sequence[Location]) -> None:
 class _NodeMatching:
     """Assignment of nodes to locations.
 
-    A location without a free node takes a node from another location that can find a new one, and so on: an augmenting
-    path of bipartite matching (H. W. Kuhn 1955). If all instances request equal resources, the result has the maximum
+    A location without a free node takes a node from another location, which gets another node in the same way: an
+    augmenting path of bipartite matching (H. W. Kuhn 1955). If all instances request equal resources, the result has the maximum
     number of instances. It depends only on the order of components, locations and nodes. Running instances yield to the
     first instance of a location, but not to further ones.
     """
@@ -110,8 +110,8 @@ class _NodeMatching:
     def fill(self, locations: Iterable[Location], at_most: int | None = None) -> None:
         """Assign nodes to locations, in order, until each has the requested number of instances or `at_most`."""
         for location in locations:
-            wanted = at_most or int(location.spot.instances)
-            while len(location.hosts) < wanted and self._seat(location, {location}, first=not location.hosts):
+            count = at_most or int(location.spot.instances)
+            while len(location.hosts) < count and self._assign(location, {location}, first=not location.hosts):
                 pass
 
     def sweep(self, locations: Iterable[Location]) -> None:
@@ -138,8 +138,8 @@ class _NodeMatching:
             for location in holders:
                 self._builder.ledger.release(name, location.component)
 
-    def _seat(self, location: Location, visited: set[Location], *, first: bool) -> bool:
-        """Assign one more node to a location. Return False if there is none."""
+    def _assign(self, location: Location, visited: set[Location], *, first: bool) -> bool:
+        """Assign another node to a location. Return False if no node is left for it."""
         while location.seen < len(location.nodes):
             name = location.nodes[location.seen]
             location.seen += 1
@@ -154,7 +154,7 @@ class _NodeMatching:
                 if self._fits(location, name):
                     visited.add(other)
                     self._take(location, name)
-                    if self._seat(other, visited, first=first):
+                    if self._assign(other, visited, first=first):
                         return True
                     self._release(location, name)
                 self._take(other, name)
@@ -199,9 +199,9 @@ def _no_node(builder: PlanBuilder, starved: Location, locations: Iterable[Locati
             if other.component is component and name in starved.nodes:
                 message = f"{name} hosts {component.name} for locations[{other.index}], which has no other node"
                 builder.reject(component, name, Check("NeededElsewhere", message))
-    where = f"{spot.radius:.0f} m of {spot.center.lat:.6f}, {spot.center.lon:.6f}"
+    surroundings = f"{spot.radius:.0f} m of {spot.center.lat:.6f}, {spot.center.lon:.6f}"
     problem = f"no node can host {component.name} at locations[{starved.index}]"
-    return builder.infeasible(component, "NoEdgeNode", problem, f"there is no edge node within {where}")
+    return builder.infeasible(component, "NoEdgeNode", problem, f"there is no edge node within {surroundings}")
 
 
 def _current_hosts_first(
@@ -232,70 +232,72 @@ class HybridHosts:
     nodes: dict[str, None] = field(default_factory=dict)
 
 
-def place_beside(builder: PlanBuilder, component: Component, static: PlannedInstance, hosts: HybridHosts) -> None:
+def place_near(builder: PlanBuilder, component: Component, static: PlannedInstance, hosts: HybridHosts) -> None:
     """Place an instance of a hybrid component for a static instance: on the same node, or on the nearest node in direct range.
 
     A node that already hosts the component also serves this instance. If no node is suitable, the cloud instance serves it.
     """
-    here = builder.inventory.edge_nodes[static.node or ""]
+    origin = builder.inventory.edge_nodes[static.node or ""]
     served = [
         p.node
         for p in builder.previous_placements
         if p.component == component.name
         and p.role == "hybrid-edge"
-        and p.serves == Serves(component=static.component, node=here.name)
+        and p.serves == Serves(component=static.component, node=origin.name)
     ]
     # Other nodes are searched only if the node itself is not suitable, which is rare.
-    for names in (served, [here.name], None):
-        nodes = _in_direct_range(builder, component, here) if names is None else names
+    for names in (served, [origin.name], None):
+        nodes = _in_direct_range(builder, component, origin) if names is None else names
         for name in nodes:
             if name in hosts.nodes:
                 return
             node = builder.inventory.edge_nodes.get(name or "")
-            if node is None or (names is served and not _reaches(here, node)):
+            if node is None or (names is served and not _reaches(origin, node)):
                 continue
             check = builder.check_edge(node, component)
             if check:
                 hosts.nodes[node.name] = None
-                serves = Serves(component=static.component, node=here.name)
+                serves = Serves(component=static.component, node=origin.name)
                 builder.place(component, "hybrid-edge", node.name, serves=serves)
                 return
             builder.reject(component, node.name, check)
 
 
-def _in_direct_range(builder: PlanBuilder, component: Component, here: EdgeNode) -> list[str]:
+def _in_direct_range(builder: PlanBuilder, component: Component, origin: EdgeNode) -> list[str]:
     """Return the nodes in direct range of a node, nearest first, and reject nearby nodes without a matching interface."""
-    ours = direct_range_m(here.spec.interfaces)
-    found = []
-    if ours is None:
+    range_m = direct_range_m(origin.spec.interfaces)
+    matches = []
+    if range_m is None:
         return []
-    for name, distance in builder.located.edge_nodes.within(ground_point(here.spec.location), ours):
-        if name == here.name or name not in builder.inventory.edge_nodes:
+    for name, distance in builder.located.edge_nodes.within(ground_point(origin.spec.location), range_m):
+        if name == origin.name or name not in builder.inventory.edge_nodes:
             continue
-        reach = direct_reach_m(here.spec.interfaces, builder.inventory.edge_nodes[name].spec.interfaces)
+        reach = direct_reach_m(origin.spec.interfaces, builder.inventory.edge_nodes[name].spec.interfaces)
         if reach is None:
-            message = f"{name} has no interface that pairs with {here.name}'s"
+            message = f"{name} has no interface that pairs with {origin.name}'s"
             builder.reject(component, name, Check("NoDirectInterface", message))
         elif distance > reach:
-            message = f"{name} is {distance:.0f} m from {here.name}, beyond their direct reach of {reach:.0f} m"
+            message = f"{name} is {distance:.0f} m from {origin.name}, beyond their direct reach of {reach:.0f} m"
             builder.reject(component, name, Check("OutOfReach", message))
         else:
-            found.append(name)
-    return found
+            matches.append(name)
+    return matches
 
 
-def _reaches(here: EdgeNode, node: EdgeNode) -> bool:
-    if here.name == node.name:
+def _reaches(origin: EdgeNode, node: EdgeNode) -> bool:
+    if origin.name == node.name:
         return True
-    reach = direct_reach_m(here.spec.interfaces, node.spec.interfaces)
-    return reach is not None and distance_m(ground_point(here.spec.location), ground_point(node.spec.location)) <= reach
+    reach = direct_reach_m(origin.spec.interfaces, node.spec.interfaces)
+    return (
+        reach is not None and distance_m(ground_point(origin.spec.location), ground_point(node.spec.location)) <= reach
+    )
 
 
 # -- hybrid components along the flight path --
 
 
 @dataclass(frozen=True, slots=True)
-class AlongTheWay:
+class PathCandidates:
     """Edge nodes in direct range of a drone within the operation area: names, positions, ranges."""
 
     drone: Drone
@@ -305,15 +307,15 @@ class AlongTheWay:
     reach_m: np.ndarray[tuple[int], np.dtype[np.float64]]
 
 
-def find_along(builder: PlanBuilder, component: Component, drone: Drone, area: OperationArea) -> AlongTheWay:
+def find_along(builder: PlanBuilder, component: Component, drone: Drone, area: OperationArea) -> PathCandidates:
     """Return the candidates, and reject nodes in range without a matching interface and the nearest nodes out of range."""
-    ours = direct_range_m(drone.spec.interfaces)
+    range_m = direct_range_m(drone.spec.interfaces)
     names: list[str] = []
     xy = np.empty((0, 2))
-    if ours is not None:
-        names, xy = builder.located.edge_nodes.near_area(area.frame, area.shape, ours)
+    if range_m is not None:
+        names, xy = builder.located.edge_nodes.near_area(area.frame, area.shape, range_m)
     reaches = _Reaches(drone.spec.interfaces)
-    found: list[int] = []
+    matches: list[int] = []
     reach_m: list[float] = []
     for i, name in enumerate(names):
         node = builder.inventory.edge_nodes.get(name)
@@ -322,15 +324,15 @@ def find_along(builder: PlanBuilder, component: Component, drone: Drone, area: O
             message = f"{name} has no interface that pairs with {drone.name}'s"
             builder.reject(component, name, Check("NoDirectInterface", message))
         elif reach is not None:
-            found.append(i)
+            matches.append(i)
             reach_m.append(reach)
     builder.set_candidates(component, names, len(builder.located.edge_nodes))
     _reject_out_of_range(builder, component, drone, area, set(names))
-    return AlongTheWay(drone, area, [names[i] for i in found], xy[found], np.array(reach_m, dtype=np.float64))
+    return PathCandidates(drone, area, [names[i] for i in matches], xy[matches], np.array(reach_m, dtype=np.float64))
 
 
 def place_along(
-    builder: PlanBuilder, component: Component, other: Component, along: AlongTheWay, hosts: HybridHosts
+    builder: PlanBuilder, component: Component, other: Component, along: PathCandidates, hosts: HybridHosts
 ) -> None:
     """Select nodes along the flight path, and place the component on them."""
     occupied = np.array([name in hosts.nodes for name in along.names], dtype=bool)
@@ -378,10 +380,10 @@ def _reject_out_of_range(
 ) -> None:
     """Reject the nodes nearest to the centre of the area that are out of range of the drone everywhere in it."""
     lat, lon = area.frame.latlon(*(float(v) for v in area.shape.centroid.coords[0]))
-    wanted = builder.settings.near_misses
+    count = builder.settings.near_misses
     reaches = _Reaches(drone.spec.interfaces)
     closest = builder.located.edge_nodes.nearest(
-        Point(lat=lat, lon=lon), wanted + min(len(near), wanted), within_m=builder.settings.near_miss_m
+        Point(lat=lat, lon=lon), count + min(len(near), count), within_m=builder.settings.near_miss_m
     )
     for name, _ in closest:
         node = builder.inventory.edge_nodes.get(name)

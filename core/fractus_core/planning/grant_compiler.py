@@ -41,10 +41,10 @@ ROUNDING_M = 0.01
 MAX_ROUNDING_M = 0.16
 """Maximum tolerance for an outline with more points than a ring may have."""
 
-AROUND_WAY_M = 100.0
+AROUND_CORRIDOR_M = 100.0
 """Zones further than this from the corridor of a drone do not affect its route."""
 
-_ONLY_THERE = frozenset({"inclusion", "grant"})
+_PERMITTING_KINDS = frozenset({"inclusion", "grant"})
 """Kinds of policies that allow something only in their zones, so zones out of reach matter as well."""
 
 _Bounds = tuple[Point, float]
@@ -139,9 +139,9 @@ def flight_grant(application: Application, drone: Drone, inventory: Inventory, a
     leader = application.spec.leader or next(application.spec.on("drone"))
     grant = _drone_grant(application, drone, inventory, area, component=leader.name, instance=leader.name)
     corners = shapely.get_coordinates([area_polygon(area.frame, part) for part in grant.corridor])
-    reach_m = float(np.hypot(*corners.T).max()) + AROUND_WAY_M
-    middle_of_way = Point(lat=area.frame.lat, lon=area.frame.lon)
-    policies = _policies(grant, inventory, (), (middle_of_way, reach_m))
+    reach_m = float(np.hypot(*corners.T).max()) + AROUND_CORRIDOR_M
+    center = Point(lat=area.frame.lat, lon=area.frame.lon)
+    policies = _policies(grant, inventory, (), (center, reach_m))
     services = (ServiceRequest(service="mobility", methods=MOBILITY_METHODS),)
     return grant.model_copy(update={"policies": policies, "services": services, "control": "full"})
 
@@ -157,14 +157,14 @@ def _drone_grant(
         base = ground_point(home)
     stand = Area(circle=Circle(center=base, radius=depot.spec.radius if depot is not None else 30.0))
     shape = _outlined(area.shape)
-    way = shapely.union(shape, area_polygon(area.frame, stand)).convex_hull
+    corridor = shapely.union(shape, area_polygon(area.frame, stand)).convex_hull
     return GrantSpec(
         node=drone.name,
         application=application_reference(application),
         component=component,
         instance=instance,
         operation_area=areas_of_shape(area.frame, shape),
-        corridor=areas_of_shape(area.frame, way.simplify(ROUNDING_M)),
+        corridor=areas_of_shape(area.frame, corridor.simplify(ROUNDING_M)),
         depot=depot.spec.location if depot is not None else None,
         home=home,
         limits=GrantedLimits(max_altitude=mobility.max_altitude, max_speed=mobility.max_speed) if mobility else None,
@@ -256,7 +256,8 @@ def _policies(
         grant: Grant whose application, component and node select the policies.
         inventory: Current inventory.
         last: Policies of the previous Grant as a fallback, or None for a new Grant.
-        bounds: Position and distance up to which zones matter, whether valid or not, or None for the range of the node.
+        bounds: Position and distance up to which zones matter, or None for the range of the node. With bounds, invalid zones
+            out of reach are ignored.
 
     Raises:
         InvalidObject: A policy is invalid, and `last` is None.
@@ -273,15 +274,15 @@ def _policies(
         if known and not policy_applies(policy.spec, grant.application, grant.component, attributes):
             continue
         try:
-            found = _granted(policy, inventory, bounds, beyond)
+            selected = _granted(policy, inventory, bounds, beyond)
         except (ValueError, ArithmeticError, shapely.errors.ShapelyError) as error:
             if last is None:
                 if isinstance(error, InvalidObject):
                     raise
                 raise InvalidObject(f"Policy {name}", str(error)) from error
-            found = kept.get(name)
-        if found is not None:
-            granted[name] = found
+            selected = kept.get(name)
+        if selected is not None:
+            granted[name] = selected
     return tuple(granted[name] for name in sorted(granted))
 
 
@@ -299,13 +300,15 @@ def _granted(
     zones = [
         _zone(policy, i, name, inventory)
         for i, name in enumerate(named)
-        if beyond is None or policy.spec.kind in _ONLY_THERE or not surely_beyond(inventory.zones.get(name), *beyond)
+        if beyond is None
+        or policy.spec.kind in _PERMITTING_KINDS
+        or not surely_beyond(inventory.zones.get(name), *beyond)
     ]
-    if bounds is None or policy.spec.kind in _ONLY_THERE:
+    if bounds is None or policy.spec.kind in _PERMITTING_KINDS:
         near = zones
     else:
         base, reach_m = bounds
-        if beyond is None and _regards_pictures(policy.spec):
+        if beyond is None and _concerns_pictures(policy.spec):
             reach_m += MAX_SIGHT_M
         near = [zone for zone in zones if zone.is_within(reach_m, base)]
     if named and not near:
@@ -317,7 +320,7 @@ def _granted(
     return GrantedPolicy(name=policy.name, spec=policy.spec.model_copy(update={"selector": selector}), zones=granted)
 
 
-def _regards_pictures(spec: PolicySpec) -> bool:
+def _concerns_pictures(spec: PolicySpec) -> bool:
     """Return True if a policy also applies to zones that a camera sees from a distance."""
     return spec.type == "PrivacyControl" or not PICTURE_METHODS.isdisjoint(spec.methods)
 
@@ -341,7 +344,7 @@ def _bounds(grant: GrantSpec, node: Drone | EdgeNode | None, inventory: Inventor
     return (area_center(grant.operation_area[0]), reach_m) if grant.operation_area else None
 
 
-def _zone(policy: Policy, index: int, name: str, inventory: Inventory) -> SoundZone:
+def _zone(policy: Policy, index: int, name: str, inventory: Inventory) -> ValidatedZone:
     if name in inventory.unreadable_zones:
         raise InvalidObject(f"Zone {name}", inventory.unreadable_zones[name])
     if name not in inventory.zones:
@@ -349,10 +352,10 @@ def _zone(policy: Policy, index: int, name: str, inventory: Inventory) -> SoundZ
             f"Policy {policy.name} spec.selector.zones[{index}]",
             f"there is no Zone {name}; apply it, or correct the policy",
         )
-    return sound(inventory.zones[name])
+    return validated(inventory.zones[name])
 
 
-_GENEROUS = 1.05
+_DISTORTION = 1.05
 """Safety factor for the distortion of the frame of a large zone."""
 
 
@@ -363,17 +366,17 @@ def surely_beyond(zone: Zone | None, base: Point, reach_m: float) -> bool:
     ring = zone.spec.area.polygon.exterior
     # No point of a polygon is further from a corner than half the length of its outline.
     outline_m = sum(distance_m(a, b) for a, b in itertools.pairwise((*ring, ring[0])))
-    return distance_m(ring[0], base) > (reach_m + outline_m / 2) * _GENEROUS
+    return distance_m(ring[0], base) > (reach_m + outline_m / 2) * _DISTORTION
 
 
 def _circle_beyond(area: Area, base: Point, reach_m: float) -> bool:
     """Return True if an area is a circle that is certainly out of reach."""
     circle = area.circle
-    return circle is not None and distance_m(circle.center, base) > (reach_m + circle.radius) * _GENEROUS
+    return circle is not None and distance_m(circle.center, base) > (reach_m + circle.radius) * _DISTORTION
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SoundZone:
+class ValidatedZone:
     """A validated zone as in Grants, with its outline in a local frame. Instances are compared by identity."""
 
     granted: GrantedZone
@@ -389,11 +392,11 @@ class SoundZone:
         return float(self.outline.distance(shapely.Point(*self.frame.xy(base.lat, base.lon))))
 
 
-_SOUND: dict[int, SoundZone] = {}
+_VALIDATED: dict[int, ValidatedZone] = {}
 """Validated zones by the identity of their objects, because hashing all points would take longer than validating them."""
 
 
-def _looked_at(zone: Zone) -> SoundZone:
+def _validate(zone: Zone) -> ValidatedZone:
     name = zone.name
     spec = zone.spec
     try:
@@ -402,24 +405,24 @@ def _looked_at(zone: Zone) -> SoundZone:
     except InvalidObject as error:
         raise InvalidObject(f"Zone {name} spec.area.{error.field}", error.problem) from None
     granted = GrantedZone(name=name, area=spec.area, altitude=spec.altitude, schedule=spec.schedule)
-    return SoundZone(granted, frame, outline)
+    return ValidatedZone(granted, frame, outline)
 
 
-def sound(zone: Zone) -> SoundZone:
-    """Validate a zone for Grants. The result is cached as long as the object exists.
+def validated(zone: Zone) -> ValidatedZone:
+    """Validate a zone for Grants. The result is cached until the object is deleted.
 
     Raises:
         InvalidObject: The geometry of the zone is invalid.
     """
-    known = _SOUND.get(id(zone))
+    known = _VALIDATED.get(id(zone))
     if known is None:
-        known = _SOUND[id(zone)] = _looked_at(zone)
-        weakref.finalize(zone, _SOUND.pop, id(zone), None)
+        known = _VALIDATED[id(zone)] = _validate(zone)
+        weakref.finalize(zone, _VALIDATED.pop, id(zone), None)
     return known
 
 
 @lru_cache(maxsize=32)
-def zone_crossings(zones: tuple[SoundZone, ...], at_most: int) -> int:
+def zone_crossings(zones: tuple[ValidatedZone, ...], at_most: int) -> int:
     """Count the crossings of the edges of zones, up to `at_most` + 1."""
     lines = []
     for zone in zones if len(zones) > 1 else ():
@@ -433,7 +436,7 @@ def zone_crossings(zones: tuple[SoundZone, ...], at_most: int) -> int:
     return count_crossings(lines, at_most)
 
 
-def check_united(policy: Policy, zones: Sequence[SoundZone]) -> None:
+def check_united(policy: Policy, zones: Sequence[ValidatedZone]) -> None:
     """Refuse an inclusion policy whose enforcement would take too long to compute the union of its zones.
 
     Args:

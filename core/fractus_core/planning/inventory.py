@@ -22,7 +22,7 @@ class Host:
 
     Attributes:
         allocatable: Resources for pods, by resource name, in base units (cores, bytes, items).
-        requested: Resource requests of its pods in the same units, without those of the planned application.
+        requested: Resource requests of its pods in the same units, except for pods of the planned application.
         guarded: True if its kubelet rejects pods that do not tolerate the taint of drones and edge nodes, even with nodeName.
     """
 
@@ -81,7 +81,7 @@ class Inventory:
     _built: list[NodeLocations] = field(default_factory=list, init=False, compare=False, repr=False)
 
     def located(self) -> NodeLocations:
-        """Return the given indexes, or build them once from the mappings."""
+        """Return `locations`, or build the indexes once from the mappings."""
         if self.locations is not None:
             return self.locations
         if not self._built:
@@ -140,12 +140,12 @@ class Settings:
         climb_speed_mps: Assumed vertical speed.
         battery_reserve: Share of the full charge that must remain after landing, 0 to 1.
         excluded: Hosts that must not be used, with the reason (such as a refusal of the scheduler).
-        near_misses: Number of nodes out of range that a plan lists for each requested place.
-        near_miss_m: Maximum distance of these nodes from the place.
+        near_misses: Number of nodes out of range that a plan lists for each requested location.
+        near_miss_m: Maximum distance of these nodes from the location.
         rejections_listed: Maximum number of rejected nodes in a plan, so that it fits into a Kubernetes object.
         time_s: Start of the flight in seconds since 1970, or None to skip the legality check of the route.
-        policy_conflicts: Handling of a mission whose route policies do not allow with any drone: plan it with a warning, or
-            do not plan it.
+        policy_conflicts: Handling of a mission whose route the policies allow for no drone: `warn` plans it with a warning,
+            `forbid` does not plan it.
         flat_terrain: True to assume terrain level with home everywhere, as in the mobility service.
         score_drone: Replacement for the ranking of drones.
         cover: Replacement for the selection of nodes that cover the operation area.

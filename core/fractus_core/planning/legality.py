@@ -42,8 +42,8 @@ MAX_ROUTES = 10
 MAX_SEARCHES = 20
 """Maximum number of searches for detours around zones for one plan. Each of them blocks the operator for up to 80 ms."""
 
-MAX_LEFT = 100
-"""Maximum number of waypoints after a denied one that are judged from the point before it."""
+MAX_SKIP_TARGETS = 100
+"""Maximum number of waypoints that are judged as the next target of a driver that skips a denied waypoint."""
 
 _MAX_DENIED = 5
 """Number of denied legs after which the rest of a route is not judged."""
@@ -56,8 +56,8 @@ class MissionRoute:
     Attributes:
         legs: Legs that are not flown as requested, in order.
         distance_m: Ground distance including detours.
-        needed_min: Flight time in minutes with detours and limits of speed and altitude. Time and distance may be too low if
-            legs are denied, because the legs after them may not be judged.
+        needed_min: Flight time in minutes with detours and limits of speed and altitude. If legs are denied, time and distance
+            may be too low, because later legs may not have been judged.
     """
 
     legs: tuple[LegLegality, ...]
@@ -77,8 +77,8 @@ class MissionRoute:
         """
         denied = self.denied
         if denied is not None:
-            where = f"the leg to {denied.end.lat:.6f}, {denied.end.lon:.6f}"
-            return f"policies do not allow {where}: {denied.message}"
+            leg = f"the leg to {denied.end.lat:.6f}, {denied.end.lon:.6f}"
+            return f"policies do not allow {leg}: {denied.message}"
         if available_min is None or not self.legs or self.needed_min <= available_min:
             return None
         names = ", ".join(distinct(name for leg in self.legs for name in leg.policies)) or "the drone's limits"
@@ -114,8 +114,8 @@ class RouteJudge:
         """True if no further route should be judged."""
         return len(self._known) >= MAX_ROUTES or self._searches <= 0
 
-    def way(self, drone: Drone, mission: Estimate | None) -> MissionRoute | None:
-        """Return the route that a drone would fly, or None if it is not judged (no start time, or no flight of its own).
+    def route(self, drone: Drone, mission: Estimate | None) -> MissionRoute | None:
+        """Return the route that a drone would fly, or None without a start time or if the application shares a flight.
 
         Args:
             drone: Drone that flies.
@@ -157,7 +157,7 @@ class RouteJudge:
             flight = _Flight(now, system, stays if leader.control == "partial" else own, self._searches)
             flight.fly(list(mission_legs(self._application.spec, self._area, home, self._inventory.depots)))
             self._searches = flight.searches
-            self._known[key] = flight.way(self._settings.climb_speed_mps, stay_minutes(self._application.spec))
+            self._known[key] = flight.route(self._settings.climb_speed_mps, stay_minutes(self._application.spec))
         return self._known[key]
 
 
@@ -176,11 +176,11 @@ def with_legality(
     if choice is None or drone is None or area is None or home is None:
         return plan
     mission = MissionEstimator(application.spec, area, settings).estimate(home, drone)
-    way = RouteJudge(application, area, inventory, settings).way(drone, mission)
-    if way is None:
+    route = RouteJudge(application, area, inventory, settings).route(drone, mission)
+    if route is None:
         return plan
-    noted = way.add_to(choice, way.conflict(choice.mission.available if choice.mission is not None else None))
-    return plan if noted == choice else plan.model_copy(update={"drone": noted})
+    recorded = route.add_to(choice, route.conflict(choice.mission.available if choice.mission is not None else None))
+    return plan if recorded == choice else plan.model_copy(update={"drone": recorded})
 
 
 @dataclass(slots=True)
@@ -191,7 +191,7 @@ class _Flight:
     grant: CompiledGrant
     driver: CompiledGrant
     searches: int
-    noted: list[LegLegality] = field(default_factory=list)
+    recorded: list[LegLegality] = field(default_factory=list)
     distance_m: float = 0.0
     flown_s: float = 0.0
     climbed_m: float = 0.0
@@ -200,17 +200,17 @@ class _Flight:
         """Simulate the takeoff and the legs until too many are denied."""
         self._take_off(legs)
         for index, leg in enumerate(legs):
-            # The route is not legal, so further expensive searches are useless.
-            if [n.outcome for n in self.noted].count("Denied") >= _MAX_DENIED:
+            # The route is not legal, so further expensive searches would be useless.
+            if [n.outcome for n in self.recorded].count("Denied") >= _MAX_DENIED:
                 return
             if (leg.start.lat, leg.start.lon) != (leg.end.lat, leg.end.lon) or leg.end.alt is not None:
                 self._fly(leg, legs[index + 1 :])
 
-    def way(self, climb_speed_mps: float, stay_min: float) -> MissionRoute:
+    def route(self, climb_speed_mps: float, stay_min: float) -> MissionRoute:
         """Return the flown route, including the landing."""
         climbed_m = self.climbed_m + self.now.altitude_m
         needed_min = (self.flown_s + climbed_m / climb_speed_mps) / 60 + stay_min
-        return MissionRoute(tuple(self.noted), self.distance_m, needed_min)
+        return MissionRoute(tuple(self.recorded), self.distance_m, needed_min)
 
     def _take_off(self, legs: list[MissionLeg]) -> None:
         first = legs[0].end
@@ -232,7 +232,7 @@ class _Flight:
     def _fly(self, leg: MissionLeg, following: list[MissionLeg]) -> None:
         request = GotoArgs(leg.end.lat, leg.end.lon, leg.end.alt, leg.end.altitude_reference)
         verdict = judge(Call("Goto", request), self.now, self.driver if leg.flown_by == "driver" else self.grant)
-        if isinstance(verdict.args, GotoArgs) and _same_place(verdict.args, request):
+        if isinstance(verdict.args, GotoArgs) and _same_position(verdict.args, request):
             if verdict.action != "allow":
                 self._note(leg, "Corrected", verdict)
             self._arrive(verdict.args)
@@ -254,7 +254,7 @@ class _Flight:
 
     def _stranded(self, following: list[MissionLeg]) -> str:
         """Return a note if a driver that skips a denied waypoint cannot reach any of the following ones either."""
-        left = list(takewhile(lambda leg: leg.flown_by == "driver", following))[:MAX_LEFT]
+        left = list(takewhile(lambda leg: leg.flown_by == "driver", following))[:MAX_SKIP_TARGETS]
         ends = [GotoArgs(leg.end.lat, leg.end.lon, leg.end.alt, leg.end.altitude_reference) for leg in left]
         if not ends or any(judge(Call("Goto", end), self.now, self.driver).permits for end in ends):
             return ""
@@ -266,18 +266,18 @@ class _Flight:
         grant = self.grant
         begin = grant.locate(self.now)
         present_m = self.now.altitude_m
-        wanted = (
+        target_m = (
             present_m
             if request.alt is None
             else altitude_above_home_m(request.alt, request.reference, self.now.home, grant.flat_terrain)
         )
         goal = grant.frame.xy(request.lat, request.lon)
-        for height in dict.fromkeys((present_m if wanted is None else wanted, present_m)):
+        for height in dict.fromkeys((present_m if target_m is None else target_m, present_m)):
             if begin is None or self.searches <= 0:
                 return None
             self.searches -= 1
-            way = quick_route(begin, goal, self.now, grant, height, from_m=present_m)
-            parts = self._permitted([GotoArgs(*grant.frame.latlon(*place), height) for place in way or ()])
+            route = quick_route(begin, goal, self.now, grant, height, from_m=present_m)
+            parts = self._permitted([GotoArgs(*grant.frame.latlon(*point), height) for point in route or ()])
             if parts:
                 return parts
         return None
@@ -288,7 +288,7 @@ class _Flight:
         permitted = []
         for part in parts:
             verdict = judge(Call("Goto", part), now, self.grant)
-            if not isinstance(verdict.args, GotoArgs) or not _same_place(verdict.args, part):
+            if not isinstance(verdict.args, GotoArgs) or not _same_position(verdict.args, part):
                 return []
             permitted.append(verdict.args)
             height = now.altitude_m if verdict.args.alt is None else verdict.args.alt
@@ -313,21 +313,21 @@ class _Flight:
         leg: MissionLeg,
         outcome: Literal["Detour", "Corrected", "Denied"],
         verdict: Verdict,
-        how: str = "",
-        after: str = "",
+        prefix: str = "",
+        suffix: str = "",
     ) -> None:
-        self.noted.append(
+        self.recorded.append(
             LegLegality(
                 start=leg.start,
                 end=leg.end,
                 flown_by=leg.flown_by,
                 outcome=outcome,
                 reason=verdict.code,
-                message=how + verdict.reason + after,
+                message=prefix + verdict.reason + suffix,
                 policies=verdict.policies,
             )
         )
 
 
-def _same_place(a: GotoArgs, b: GotoArgs) -> bool:
+def _same_position(a: GotoArgs, b: GotoArgs) -> bool:
     return (a.lat, a.lon) == (b.lat, b.lon)

@@ -49,12 +49,12 @@ class PlannedLink:
 def plan_links(
     application: Application, plan: DeploymentPlanSpec, drone: Drone | None, edge_nodes: Mapping[str, EdgeNode]
 ) -> tuple[PlannedLink, ...]:
-    """Return the direct links of a plan: one to each edge node with a hybrid component that the drone's components use.
+    """Return the direct links of a plan. Each edge node with a hybrid component that the drone's components use has one.
 
     Args:
         application: Application of the plan.
         plan: Placements of its instances.
-        drone: Drone of the plan, or None if it has none or the drone does not exist any more.
+        drone: Drone of the plan, or None if the plan has no drone or the drone no longer exists.
         edge_nodes: Edge nodes by name. Missing nodes and nodes without a matching interface get no link.
     """
     if drone is None:

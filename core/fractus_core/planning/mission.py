@@ -92,13 +92,13 @@ def heights_m(route: Sequence[Position], home_amsl_m: float | None) -> list[floa
     """
     base = home_amsl_m
     heights = [0.0]
-    for place in route:
-        if place.alt is None or (place.altitude_reference == "amsl" and base is None):
+    for position in route:
+        if position.alt is None or (position.altitude_reference == "amsl" and base is None):
             heights.append(heights[-1])
-        elif place.altitude_reference == "amsl":
-            heights.append(max(place.alt - (base or 0.0), 0.0))
+        elif position.altitude_reference == "amsl":
+            heights.append(max(position.alt - (base or 0.0), 0.0))
         else:
-            heights.append(max(place.alt, 0.0))
+            heights.append(max(position.alt, 0.0))
     return heights[1:]
 
 
@@ -119,8 +119,8 @@ def stay_minutes(spec: ApplicationSpec) -> float:
 def home_of(drone: Drone, depots: Mapping[str, Depot]) -> Position | None:
     """Return the parking position of a drone on the ground, or None if it is unknown."""
     depot = depots.get(drone.spec.depot or "")
-    place = drone.spec.home or (depot.spec.location if depot is not None else None)
-    return Position(lat=place.lat, lon=place.lon) if place is not None else None
+    position = drone.spec.home or (depot.spec.location if depot is not None else None)
+    return Position(lat=position.lat, lon=position.lon) if position is not None else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,7 +128,7 @@ class MissionLeg:
     """A straight leg of a mission.
 
     Attributes:
-        flown_by: Control authority. The return flight counts as the system's, because every driver may leave it to the system.
+        flown_by: Control authority. The return flight counts as the system's, because every driver may leave the return to it.
         free: True if the driver chooses its own route, in a region.
     """
 
@@ -145,19 +145,19 @@ def mission_legs(
     driver = spec.driver
     at = home
     if driver is None:
-        for place in area.route:
-            yield MissionLeg(at, place, "system")
-            at = place
+        for position in area.route:
+            yield MissionLeg(at, position, "system")
+            at = position
     for point, route in zip(
         driver.control_points if driver is not None else (),
         control_routes(driver.control_points, depots) if driver is not None else (),
         strict=True,
     ):
-        for i, place in enumerate(route):
+        for i, position in enumerate(route):
             transit = i == 0 and driver is not None and driver.control == "partial"
             roams = point.region is not None and i == len(route) - 1
-            yield MissionLeg(at, place, "system" if transit else "driver", free=roams and not transit)
-            at = place
+            yield MissionLeg(at, position, "system" if transit else "driver", free=roams and not transit)
+            at = position
     yield MissionLeg(at, home, "system")
 
 
@@ -192,7 +192,8 @@ def flight_of(application: Application, depots: Mapping[str, Depot]) -> Flight:
             spec.driver.control_points, control_routes(spec.driver.control_points, depots), strict=True
         ):
             if point.region is not None:
-                # The route to a region is known only if it has a start. The route out of it is never known.
+                # The route to a region is known only if the control point has a start. The route out of a region is
+                # never known.
                 start = route[:1] if point.point is not None else []
                 legs.append((*open_leg, *start))
                 open_leg = []
@@ -204,10 +205,10 @@ def flight_of(application: Application, depots: Mapping[str, Depot]) -> Flight:
     return Flight(application.key, tuple(leg for leg in legs if leg))
 
 
-def remaining_flight(flight: Flight, place: Position, radius_m: float) -> Flight | None:
-    """Return the rest of a flight from the position of its drone on.
+def remaining_flight(flight: Flight, position: Position, radius_m: float) -> Flight | None:
+    """Return the rest of a flight from the position of its drone.
 
-    If the path passes the position more than once, the last passage counts, so that no visited point is promised again.
+    If the path passes the position more than once, the last passage counts, so that the rest contains no visited point.
 
     Returns:
         The rest of the flight, or None if the drone is not near its path and its route is therefore unknown.
@@ -215,16 +216,16 @@ def remaining_flight(flight: Flight, place: Position, radius_m: float) -> Flight
     if not flight.legs:
         return None
     path = [p for leg in flight.legs for p in leg]
-    frame = LocalFrame.at(center_of([*path, place]))
+    frame = LocalFrame.at(center_of([*path, position]))
     starts, ends = _segments(frame, replace(flight, reached=0))
-    near = np.flatnonzero(np.isfinite(_passages(starts, ends, _spot(frame, place, None), radius_m)[:, 0]))
+    near = np.flatnonzero(np.isfinite(_passages(starts, ends, _spot(frame, position, None), radius_m)[:, 0]))
     if not len(near):
         return None
     piece = int(near[-1])
     for i, leg in enumerate(flight.legs):
         pieces = max(len(leg) - 1, 1)
         if piece < pieces:
-            return replace(flight, legs=((place, *leg[piece + 1 :]), *flight.legs[i + 1 :]), reached=0)
+            return replace(flight, legs=((position, *leg[piece + 1 :]), *flight.legs[i + 1 :]), reached=0)
         piece -= pieces
     return None
 
@@ -266,9 +267,9 @@ _Spots = NDArray[np.float64]
 _DATUMS: dict[Reference, float] = exhaustive(Reference, {"home": 0.0, "terrain": 1.0, "amsl": 2.0})
 
 
-def _spot(frame: LocalFrame, place: Position, alt: float | None) -> list[float]:
-    x, y = frame.xy(place.lat, place.lon)
-    return [x, y, math.nan if alt is None else alt, _DATUMS[place.altitude_reference]]
+def _spot(frame: LocalFrame, position: Position, alt: float | None) -> list[float]:
+    x, y = frame.xy(position.lat, position.lon)
+    return [x, y, math.nan if alt is None else alt, _DATUMS[position.altitude_reference]]
 
 
 def _segments(frame: LocalFrame, flight: Flight) -> tuple[_Spots, _Spots]:
@@ -279,9 +280,9 @@ def _segments(frame: LocalFrame, flight: Flight) -> tuple[_Spots, _Spots]:
     for leg in flight.legs:
         spots = []
         alt: float | None = None
-        for place in leg:
-            alt = place.alt if place.alt is not None else alt
-            spots.append(_spot(frame, place, alt))
+        for position in leg:
+            alt = position.alt if position.alt is not None else alt
+            spots.append(_spot(frame, position, alt))
         # The drone is between the last reached point and the next one, so the segment between them counts.
         left = spots[max(passed - 1, 0) :] if passed < len(spots) else []
         passed = max(passed - len(spots), 0)

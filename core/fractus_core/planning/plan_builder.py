@@ -44,7 +44,7 @@ class Infeasible(Exception):
         self.message = message
         self.rejected = tuple(rejected)
         self.omitted = omitted
-        self.full = frozenset(each.node for each in self.rejected if each.reason == INSUFFICIENT)
+        self.full = frozenset(rejection.node for rejection in self.rejected if rejection.reason == INSUFFICIENT)
         super().__init__(message)
 
 
@@ -96,7 +96,7 @@ class PlanBuilder:
     # -- checks --
 
     def check_edge(self, node: EdgeNode, component: Component) -> Check:
-        """Check whether an edge node can host the component. Return the first failed requirement otherwise."""
+        """Check if an edge node can host the component. Otherwise return the first failed requirement."""
         kept = self.was_placed(component, node.name)
         return (
             check_host(self.inventory.hosts, node.name, self.settings, kept=kept)

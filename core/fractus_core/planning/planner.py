@@ -17,7 +17,7 @@ from fractus_core.planning.edge_placement import (
     find_along,
     find_static,
     place_along,
-    place_beside,
+    place_near,
     place_static,
 )
 from fractus_core.planning.inventory import Inventory, Settings
@@ -44,7 +44,7 @@ def plan(
     preferred, so a new plan moves as few instances as possible.
 
     The plan lists each node in range that was checked and rejected, with its first failed requirement. Of the nodes out of
-    range it lists only the nearest ones (`Settings.near_misses` per place), up to `Settings.rejections_listed` in total, and
+    range it lists only the nearest ones (`Settings.near_misses` per location), up to `Settings.rejections_listed` in total, and
     contains the number of omitted nodes. Nodes that did not have to be checked are not rejected.
 
     Raises:
@@ -56,8 +56,8 @@ def plan(
         try:
             next(steps)
         except StopIteration as done:
-            decided: DeploymentPlanSpec = done.value
-            return decided
+            result: DeploymentPlanSpec = done.value
+            return result
 
 
 def plan_in_steps(
@@ -68,15 +68,15 @@ def plan_in_steps(
 ) -> Generator[str, None, DeploymentPlanSpec]:
     """Plan like `plan`, and yield the name of each completed phase, for benchmarks.
 
-    The phases are those of the thesis: area, then for each kind of component (drone, static, hybrid, cloud) the search for
-    nodes in range (`drone.candidates`) and the choice among them (`drone.host`).
+    The phases are those of the thesis. After the area, each kind of component (drone, static, hybrid, cloud) has two phases:
+    the search for nodes in range (`drone.candidates`) and the choice of a node (`drone.host`).
     """
     try:
         return (yield from _plan_once(PlanBuilder(application, inventory, settings or Settings(), previous)))
     except Infeasible:
         if previous is None:
             raise
-    # Without reservations for running instances a plan may exist.
+    # Try again without reservations for running instances.
     return (
         yield from _plan_once(PlanBuilder(application, inventory, settings or Settings(), previous, reserving=False))
     )
@@ -97,12 +97,12 @@ def _plan_once(builder: PlanBuilder) -> Generator[str, None, DeploymentPlanSpec]
     yield "static.candidates"
     place_static(builder, locations)
     yield "static.host"
-    # Hybrid components are placed near other components, which therefore come first.
+    # Hybrid components come after the components near which they are placed.
     for placement in _IN_ORDER:
         for component in builder.spec.on(placement):
             match placement:
                 case "drone" | "edge":
-                    pass  # They are placed: all on one drone, and the static ones.
+                    pass  # Drone and static components are already placed.
                 case "hybrid":
                     _place_cloud(builder, component, 1)
                     yield "cloud.host"
@@ -113,7 +113,7 @@ def _plan_once(builder: PlanBuilder) -> Generator[str, None, DeploymentPlanSpec]
                 case _:
                     assert_never(placement)
     rejected, omitted = builder.listed_rejections()
-    decided = DeploymentPlanSpec(
+    result = DeploymentPlanSpec(
         application=application.name,
         application_generation=application.metadata.generation,
         application_digest=application.spec.mission_digest,
@@ -124,7 +124,7 @@ def _plan_once(builder: PlanBuilder) -> Generator[str, None, DeploymentPlanSpec]
         rejected_omitted=omitted or None,
     )
     yield "report"
-    return decided
+    return result
 
 
 def _place_hybrid(
@@ -136,7 +136,7 @@ def _place_hybrid(
         other = builder.spec.component(name)
         if other.placement == "edge":
             for static in [p for p in builder.placements if p.component == name]:
-                place_beside(builder, component, static, hosts)
+                place_near(builder, component, static, hosts)
             yield "hybrid-edge"
         elif area is not None and choice is not None:
             drone = builder.inventory.drones[choice.node]

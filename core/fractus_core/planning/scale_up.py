@@ -16,15 +16,15 @@ from fractus_core.planning.plan_builder import PlanBuilder
 def underfilled_locations(
     application: Application, current: DeploymentPlanSpec
 ) -> Iterator[tuple[Component, EdgeLocation]]:
-    """Return the locations that could have more instances than the plan has, each with its component.
+    """Return the locations that could have more instances than in the plan, each with its component.
 
-    These are locations for every suitable node (`instances: "*"`) and locations with fewer instances than requested.
+    They have fewer instances than requested, or request an instance on every suitable node (`instances: "*"`).
     """
     counts = Counter((placed.component, placed.location) for placed in current.placements)
     for component in application.spec.on("edge"):
-        for i, spot in enumerate(component.locations):
-            if spot.instances == "*" or counts[component.name, i] < spot.instances:
-                yield component, spot
+        for i, location in enumerate(component.locations):
+            if location.instances == "*" or counts[component.name, i] < location.instances:
+                yield component, location
 
 
 def next_free_node(
@@ -50,9 +50,9 @@ def _check_candidates(
 ) -> Iterator[tuple[str, Check]]:
     """Check each node in an underfilled location that does not host the component yet."""
     builder: PlanBuilder | None = None
-    for component, spot in underfilled_locations(application, current):
+    for component, location in underfilled_locations(application, current):
         builder = builder or PlanBuilder(application, inventory, settings, current)
-        for name, _ in builder.located.edge_nodes.within(spot.center, spot.radius):
+        for name, _ in builder.located.edge_nodes.within(location.center, location.radius):
             node = inventory.edge_nodes.get(name)
             if node is not None and not builder.was_placed(component, name):
                 yield name, builder.check_edge(node, component)

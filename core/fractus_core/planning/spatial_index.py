@@ -1,7 +1,7 @@
 """Positions of the nodes of an inventory: spatial queries, drones by depot, cloud hosts.
 
-The operator keeps these indexes beside its inventory and updates them for each changed node, so that a plan looks at few
-of many nodes.
+The operator keeps these indexes with its inventory and updates them for each changed node. So a plan examines few of many
+nodes.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ class SpatialIndex:
         """Return the position of a point.
 
         Raises:
-            KeyError: There is no point of that name.
+            KeyError: No point has this name.
         """
         slot = self._slots[name]
         return Point(lat=float(self._lats[slot]), lon=float(self._lons[slot]))
@@ -141,7 +141,7 @@ class SpatialIndex:
         certain = chords[(chords > beyond_m) & (chords <= min(within_m, _HALF_GLOBE_M))]
         limit_m = min(within_m, _HALF_GLOBE_M)
         if len(certain) >= count:
-            # All nearer points, and those that tie with the last one, have chords up to this arc.
+            # All nearer points, and points at the same distance as the last one, have chords up to this arc.
             limit_m = min(_longest_arc(float(np.partition(certain, count - 1)[count - 1])) + _TIE_M, limit_m)
         lower_m = _shortest_chord(beyond_m) - _ROUNDING_M
         slots = np.flatnonzero((chords >= lower_m) & (chords <= limit_m + _ROUNDING_M))

@@ -1,1 +1,1 @@
-"""Policy engine: compiles Grants and decides on calls and on the motion of a flying drone."""
+"""Policy engine: compiles Grants, and judges calls and the motion of a flying drone."""

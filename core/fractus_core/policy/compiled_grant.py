@@ -1,7 +1,4 @@
-"""Grants compiled for the engine: geometries in metres of a local frame, with spatial indexes.
-
-A check then takes microseconds.
-"""
+"""Grants compiled for the engine: geometries in metres of a local frame, with spatial indexes for checks in microseconds."""
 
 from __future__ import annotations
 
@@ -27,8 +24,7 @@ MAX_FRAME_REACH_M = 500_000.0
 MAX_UNINDEXED = 4
 """Up to this number of zones, testing each zone is faster than an index."""
 _PERMITTING_KINDS = frozenset({"inclusion", "grant"})
-"""Kinds of policies that permit something inside their zones. Approximations of these zones must not be larger than the
-zone."""
+"""Kinds of policies that permit something inside their zones. Approximations of such a zone must not exceed the zone."""
 OPERATION_AREA = "operation-area"
 """Policy name that verdicts use for the fence that every grant implies."""
 
@@ -65,7 +61,7 @@ class PolicyZone:
     schedule: tuple[ActiveTime, ...] = ()
 
     def in_force(self, time_s: float) -> bool:
-        """Return True if the policy is valid and its zone active at a time. With an uncertain clock: if both are possible."""
+        """Return True if the policy is valid and its zone active at a time, or may be at an uncertain time."""
         if not self.rule.in_force(time_s):
             return False
         return active_at(self.schedule, time_s) or (
@@ -146,8 +142,8 @@ class CompiledGrant:
     Attributes:
         methods: Granted methods of all services.
         denials: Per method, the policies that forbid it.
-        allowances: Per method, the policies that say where and when it is granted. A method without an entry is granted
-            by the grant itself.
+        allowances: Per method, the policies that grant it at certain places and times. A method without an entry is granted
+            everywhere.
         operation_area: Area in which services may be used. None means anywhere.
         flight_area: Area in which the instance may fly: operation area and corridor to home, or only the operation area
             under partial control. None means anywhere.

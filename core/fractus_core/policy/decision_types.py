@@ -60,7 +60,7 @@ class SetSpeedArgs:
 
 @dataclass(frozen=True, slots=True)
 class VelocityArgs:
-    """Fly with a velocity until the next setpoint arrives or the hold time ends, after which the drone is stopped.
+    """Fly with a velocity until the next setpoint arrives. If none arrives within the hold time, the drone is stopped.
 
     Attributes:
         north_mps: Velocity over ground.
@@ -99,9 +99,9 @@ class CaptureArgs:
 
 
 class UncertainTime(float):
-    """Unix time of a clock that was set back. Its value is the later reading.
+    """Unix time of a clock that was set back. Either the reading before or the reading after the step may be right.
 
-    The earlier reading may be right instead. A restriction holds if it holds at any time between the readings. A
+    The value of the number is the later reading. A restriction holds if it holds at any time between the readings. A
     permission holds only if it holds at both readings.
     """
 
@@ -109,9 +109,9 @@ class UncertainTime(float):
 
     def __new__(cls, latest: float, earliest: float) -> UncertainTime:
         """Create the time between two readings."""
-        moment = super().__new__(cls, latest)
-        moment.earliest = min(earliest, latest)
-        return moment
+        time_s = super().__new__(cls, latest)
+        time_s.earliest = min(earliest, latest)
+        return time_s
 
 
 def earliest_time(time_s: float) -> float:
@@ -224,12 +224,12 @@ class Situation:
         position_error_m: Bound of the horizontal position error.
         altitude_error_m: Bound of the vertical position error.
         latency_s: Longest time from this state until a decision affects the motion.
-        speed_setpoint_mps: Horizontal speed of legs, or of the current velocity setpoint if that is higher: the speed
-            that the present motion tends to.
+        speed_setpoint_mps: Horizontal speed that the autopilot controls to: the speed of legs, or of the current velocity
+            setpoint if that is higher.
         forward_mps2: Acceleration along the course, from the last velocities. Negative while slowing down, None if
             unknown.
         pending: Recent velocity setpoints (north, east, down) that neither velocity nor acceleration show yet. The
-            drone may take them up at any moment. The latest is last.
+            drone may follow any of them at any moment. The latest is last.
         vertical: True if the drone is taking off or landing. Lower altitude limits do not apply then.
         attitude: None if unknown. The camera may then look anywhere, unless a gimbal keeps it level.
         lens: None if the node's camera is not described. It may then see everything around it.
@@ -278,33 +278,33 @@ class Situation:
     @property
     def is_plausible(self) -> bool:
         """True if every number is finite and of a physically possible size."""
-        figures = (*_FIGURES(self), *_MOTION(self.airframe))
+        numbers = (*_SITUATION_NUMBERS(self), *_AIRFRAME_NUMBERS(self.airframe))
         if self.home is not None:
-            figures += (self.home.lat, self.home.lon, self.home.amsl_m)
+            numbers += (self.home.lat, self.home.lon, self.home.amsl_m)
         if self.attitude is not None:
-            figures += _TURNS(self.attitude)
+            numbers += _ATTITUDE_NUMBERS(self.attitude)
         if self.lens is not None:
-            figures += _VIEW(self.lens)
-        # The sum is small only if every term is small. A comparison with NaN is false.
-        size: float = sum(abs(figure) for figure in figures if figure is not None)
-        return size < _ABSURD
+            numbers += _LENS_NUMBERS(self.lens)
+        # The sum is small only if every term is small. If a term is NaN, the comparison is false.
+        size: float = sum(abs(number) for number in numbers if number is not None)
+        return size < _IMPLAUSIBLE
 
 
-_ABSURD = 1e12
+_IMPLAUSIBLE = 1e12
 """Larger than any number of a Situation, including its time (seconds since 1970)."""
 
-_FIGURES = attrgetter(
+_SITUATION_NUMBERS = attrgetter(
     "time_s", "lat", "lon", "altitude_m", "north_mps", "east_mps", "down_mps", "position_error_m", "altitude_error_m",
     "latency_s", "speed_setpoint_mps", "forward_mps2", "relief_m",
 )  # fmt: skip
-_MOTION = attrgetter(*(f.name for f in fields(Airframe)))
-_TURNS = attrgetter(*(f.name for f in fields(Attitude)))
-_VIEW = attrgetter(*(f.name for f in fields(Lens)))
+_AIRFRAME_NUMBERS = attrgetter(*(f.name for f in fields(Airframe)))
+_ATTITUDE_NUMBERS = attrgetter(*(f.name for f in fields(Attitude)))
+_LENS_NUMBERS = attrgetter(*(f.name for f in fields(Lens)))
 
 
 @dataclass(frozen=True, slots=True)
 class Filter:
-    """Processing of a picture before it is returned to a component.
+    """Step of the processing of a picture before it is returned to a component.
 
     Attributes:
         action: Black out the picture, blur all of it, hide faces, or keep only moving objects.

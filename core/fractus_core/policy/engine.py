@@ -62,7 +62,7 @@ def judge(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
         now = _with_unknown_motion(now)
     verdict = _judge_once(call, now, grant)
     if verdict.action == "correct" and call.method in _ARGUMENT_TYPES:
-        verdict = settle_correction(call, verdict, lambda again: _judge_once(again, now, grant))
+        verdict = settle_correction(call, verdict, lambda corrected: _judge_once(corrected, now, grant))
     if verdict.brake_first or not is_moving(now):
         return verdict
     # A moving drone stops first if it is taken over, or if it is on its way into a fence.
@@ -89,7 +89,7 @@ def _judge_once(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
 
 
 def _with_unknown_motion(now: Situation) -> Situation:
-    """Return a situation with unknown position and motion, to be used instead of one with implausible numbers.
+    """Return a situation with unknown position and motion, which replaces a situation with implausible numbers.
 
     Raises:
         ValueError: The time is not a number.
@@ -102,8 +102,8 @@ def _with_unknown_motion(now: Situation) -> Situation:
 # Access to methods
 
 PICTURE_METHODS = frozenset({"CaptureImage", "RetrieveImage"})
-"""Methods that return pictures. They are denied by what a picture may show, and permitted only inside the operation
-area."""
+"""Methods that return pictures. A denial applies to them if the picture may show one of its zones. They are permitted only
+inside the operation area."""
 
 
 def judge_access(call: Call, now: Situation, grant: CompiledGrant) -> Verdict | None:
@@ -161,7 +161,7 @@ def _outside_operation_area(method: str, now: Situation, grant: CompiledGrant) -
 
 
 def _is_allowed(index: PolicyIndex, now: Situation, grant: CompiledGrant) -> bool:
-    """Return True if some policy of an index certainly holds at both readings of an uncertain time."""
+    """Return True if at least one policy of an index certainly holds, for an uncertain time at both readings."""
     readings = {float(now.time_s), earliest_time(now.time_s)}
     return all(_rules_here(index, replace(now, time_s=t), grant, 0.0, certain=True) for t in readings)
 

@@ -39,7 +39,7 @@ class Footprint:
     """Ground and air that a picture may show, in metres east and north in the frame of a grant.
 
     Attributes:
-        sight: Plan of the air between the camera and the ground that it shows, both included.
+        sight: Horizontal outline of the air between the camera and the visible ground, including both.
         margin_m: Bound of the camera's position error. It applies around `sight`.
         upper_m: Height above home of the highest visible point. Infinite if the picture may show sky.
         farthest_m: Distance from the camera to the farthest ground shown. Infinite at the horizon.
@@ -58,7 +58,7 @@ class Footprint:
         """Return True if a picture may show part of a volume, or of the ground below it.
 
         Args:
-            shape: Plan of the volume.
+            shape: Horizontal outline of the volume.
             lower_m: Floor of the volume above home.
             upper_m: Ceiling of the volume above home.
         """

@@ -86,13 +86,13 @@ class FreeSpace:
             for zone in limiting
         )
 
-    def allows_return_from(self, place: XY) -> bool:
-        """Return True if the autopilot's own return from a place is legal."""
+    def allows_return_from(self, point: XY) -> bool:
+        """Return True if the autopilot's straight return from a point is legal."""
         if self.now.airframe.retraces:
             return True
         margin = self.margin_m
         slack = self.height_margin_m
-        return check_straight_return(place, self.upper_m, self.now, self.grant, margin=margin, slack=slack) is None
+        return check_straight_return(point, self.upper_m, self.now, self.grant, margin=margin, slack=slack) is None
 
     def corners(self, obstacle: PolicyZone | int) -> Floats:
         """Return the corners at which routes may turn around an obstacle.
@@ -106,7 +106,7 @@ class FreeSpace:
         return _corners(_outline(self.required_areas[obstacle][0], -away), -1.0)
 
     def nearest_exit(self, obstacle: PolicyZone | int, begin: shapely.Point) -> Floats:
-        """Return the nearest free place outside an obstacle, as a corner without neighbours. Empty if none is free."""
+        """Return the nearest point outside an obstacle as a corner without neighbours. Empty if the obstacle fills all space."""
         away = self.margin_m + CORNER_M
         outline = (
             _outline(obstacle.shape, away)
@@ -121,7 +121,7 @@ class FreeSpace:
 
 def _outline(shape: BaseGeometry, away_m: float) -> BaseGeometry:
     """Return a shape grown or shrunk by at least a distance, with few corners."""
-    # GEOS rounds the number of pieces, so a piece may span half as much again as its share of a quarter circle.
+    # GEOS rounds the number of pieces, so a piece may span up to one and a half times its share of a quarter circle.
     away_m /= math.cos(0.75 * math.pi / 2 / _SEGMENTS)
     if shapely.get_num_coordinates(shape) > _MAX_EXACT_CORNERS:
         return shape.buffer(away_m + math.copysign(_SIMPLIFY_TOLERANCE_M, away_m), quad_segs=_SEGMENTS).simplify(
@@ -139,13 +139,13 @@ def _corners(shape: BaseGeometry, turning: float) -> Floats:
     for part in shapely.get_parts(shape):
         if not isinstance(part, shapely.Polygon) or part.is_empty:
             continue
-        whole = shapely.orient_polygons(part)
-        for ring in (whole.exterior, *whole.interiors):
+        polygon = shapely.orient_polygons(part)
+        for ring in (polygon.exterior, *polygon.interiors):
             points = shapely.get_coordinates(ring)[:-1]
             before = np.roll(points, 1, axis=0)
             after = np.roll(points, -1, axis=0)
-            there = points - before
-            away = after - points
-            turn = there[:, 0] * away[:, 1] - there[:, 1] * away[:, 0]
+            incoming = points - before
+            outgoing = after - points
+            turn = incoming[:, 0] * outgoing[:, 1] - incoming[:, 1] * outgoing[:, 0]
             corners.append(np.hstack((points, before, after))[turn * turning > 0])
     return np.vstack(corners)

@@ -48,7 +48,7 @@ RTL_CONE_SLOPE = 3.0
 owner configures that (ArduPilot parameter RTL_CONE_SLOPE)."""
 
 BISECTION_STEPS = 24
-"""Steps of the search for the point where a leg is far enough from a fence. The result is accurate to a millimetre."""
+"""Steps of the search for the point at which a leg is far enough from a fence. The result is accurate to a millimetre."""
 
 _SAMPLES = 24
 """Number of sample points on the illegal part of a leg at which its distance to the border must not shrink."""
@@ -232,10 +232,10 @@ def _comes_level(zone: PolicyZone, leg: Leg, now: Situation, grant: CompiledGran
 
 
 def _leaves_height(zone: PolicyZone, leg: Leg, now: Situation, grant: CompiledGrant, height_margin_m: float) -> bool:
-    """Return True if a leg too close below or above a zone sinks or climbs on the spot until it is far enough.
+    """Return True if a drone that is too close below or above a zone sinks or climbs on the spot until it is far enough.
 
-    This excludes legs to another place. The axes move independently, so a drone beside a zone could be over or under it
-    first.
+    A leg to another place does not count. The axes move independently, so a drone next to a zone could come over or under
+    the zone before it reaches its altitude.
     """
     west, south, east, north = shapely.bounds(leg.ground)
     if max(east - west, north - south) > STATIONARY_LEG_M:
@@ -282,7 +282,7 @@ def _crossing_reason(zone: PolicyZone, leg: Leg) -> str:
     inside_m = zone.shape.intersection(leg.line).length
     if inside_m >= 0.05:
         return f"the leg crosses zone {zone.name} for {inside_m:.1f} m"
-    # The ground that a moving drone sweeps is wider than the line from where it could come to rest.
+    # A moving drone sweeps more ground than the line from its point of rest to the target.
     return f"the {'leg' if zone.shape.intersects(leg.line) else 'turn onto the leg'} touches zone {zone.name}"
 
 
@@ -387,9 +387,9 @@ def _path_from_rest(certain: BaseGeometry, leg: Leg) -> BaseGeometry:
 def _only_gains_distance(
     leg: Leg, keeps: Callable[[BaseGeometry], bool], clearance: Callable[[BaseGeometry], float]
 ) -> bool:
-    """Return True if a leg that begins too close only gains distance, until it keeps its distance to the end.
+    """Return True if a leg that begins too close to a fence gains distance until it is far enough, and then stays so.
 
-    The fence is tested as it is, because growing or shrinking a shape of ten thousand corners takes seconds.
+    Distances are measured to the original fence, because growing or shrinking a shape of ten thousand corners takes seconds.
     """
     if keeps(leg.line):
         return True

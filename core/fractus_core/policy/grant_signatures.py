@@ -46,8 +46,8 @@ class UnknownAuthority(BadSignature):
 def signed_bytes(grant: Grant) -> bytes:
     """Return the signed content: name and spec as JSON with sorted keys, without fields at their default value.
 
-    A field added by a later release therefore invalidates no signature of a Grant that does not use it, and another
-    spelling of numbers by the API server or a disk has no effect.
+    So a field that a later release adds does not invalidate Grants that do not use it, and a different spelling of
+    numbers by the API server has no effect.
     """
     spec = grant.spec.model_dump(mode="json", by_alias=True, exclude_defaults=True)
     signed = {"kind": grant.KIND, "name": grant.name, "spec": spec}
@@ -122,7 +122,7 @@ def verify(grant: Grant, authorities: Sequence[x509.Certificate]) -> datetime:
 
 
 def _signing_key(certificate: x509.Certificate) -> ec.EllipticCurvePublicKey:
-    """Return the key of a certificate that is valid for signing Grants and for nothing else."""
+    """Return the key of a certificate that is valid only for signing Grants."""
     try:
         names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
         usage = certificate.extensions.get_extension_for_class(x509.KeyUsage).value

@@ -50,10 +50,10 @@ def _exceeds_stationary_speed(north_mps: float, east_mps: float, down_mps: float
 
 
 def pending_outcomes(now: Situation, position: XY) -> list[tuple[XY, Situation]]:
-    """Return the states the drone may reach by its pending velocity setpoints before a decision takes effect.
+    """Return the states that the drone may reach by its pending velocity setpoints before a decision takes effect.
 
-    The drone may take up a pending setpoint from now on, with full acceleration. The results are the extreme cases. In
-    between it may have followed several setpoints in succession.
+    The drone may follow a pending setpoint from now on, with full acceleration. The results are the extreme cases. The
+    drone may also follow several setpoints in succession, which leads to a state between these cases.
 
     Returns:
         Position in frame metres and situation, for each extreme case.
@@ -61,7 +61,7 @@ def pending_outcomes(now: Situation, position: XY) -> list[tuple[XY, Situation]]
     if not now.pending:
         return []
     airframe = now.airframe
-    points = []
+    outcomes = []
     for north, east, down in _bounding_velocities(now.pending):
         dn, de = _velocity_change(
             (now.north_mps, now.east_mps), (north, east), airframe.accel_mps2, airframe.jerk_mps3, now.latency_s
@@ -69,19 +69,19 @@ def pending_outcomes(now: Situation, position: XY) -> list[tuple[XY, Situation]]
         climb, _ = _velocity_change(
             (now.down_mps, 0.0), (down, 0.0), airframe.climb_accel_mps2, airframe.jerk_mps3, now.latency_s
         )
-        begun = (now.north_mps + dn / 2, now.east_mps + de / 2)
-        place = position[0] + begun[1] * now.latency_s, position[1] + begun[0] * now.latency_s
+        mean = (now.north_mps + dn / 2, now.east_mps + de / 2)
+        outcome_position = position[0] + mean[1] * now.latency_s, position[1] + mean[0] * now.latency_s
         altitude_m = now.altitude_m - (now.down_mps + climb / 2) * now.latency_s
-        later = replace(
+        outcome = replace(
             now, north_mps=now.north_mps + dn, east_mps=now.east_mps + de, down_mps=now.down_mps + climb,
             altitude_m=altitude_m, latency_s=0.0, forward_mps2=0.0, pending=(),
         )  # fmt: skip
-        points.append((place, later))
-    return points
+        outcomes.append((outcome_position, outcome))
+    return outcomes
 
 
 def _velocity_change(present: XY, target_velocity: XY, accel: float, jerk: float, lasting_s: float) -> XY:
-    """Return the change of a velocity toward a wanted one, including the change while the acceleration decays."""
+    """Return the change of a velocity toward a target velocity, including the change while the acceleration decays."""
     change = math.dist(present, target_velocity)
     share = min(accel * (lasting_s + accel / (2 * jerk)) / change, 1.0) if change > 0 else 0.0
     return (target_velocity[0] - present[0]) * share, (target_velocity[1] - present[1]) * share
@@ -136,9 +136,9 @@ def motion_before_reaction(situation: Situation) -> MotionBeforeReaction:
     forward = min(max(forward, -airframe.accel_mps2), airframe.accel_mps2)
     if forward <= 0.0:
         # A braking drone keeps braking, so its speed is lower when the command takes effect.
-        left = max(speed + forward * situation.latency_s, 0.0)
+        reduced = max(speed + forward * situation.latency_s, 0.0)
         braking_delay_s *= 1.0 + forward / airframe.accel_mps2
-        return MotionBeforeReaction(left, (speed + left) / 2 * situation.latency_s + left * braking_delay_s)
+        return MotionBeforeReaction(reduced, (speed + reduced) / 2 * situation.latency_s + reduced * braking_delay_s)
     late_s = situation.latency_s
     jerk_limit_s = forward / airframe.jerk_mps3
     first = speed + forward * late_s
@@ -327,7 +327,7 @@ def goto_leg(now: Situation, position: XY, target: XY, altitude_m: float) -> Leg
 def velocity_leg(now: Situation, position: XY, args: VelocityArgs) -> Leg:
     """Return the leg of a drone that takes up a velocity, keeps it for its hold time, and stops.
 
-    The ground is the convex hull of the possible positions, whether latency delays the beginning, the end, or neither.
+    The ground is the convex hull of the possible positions. Latency may delay the beginning, the end, or neither.
     The target is the last possible point of rest.
     """
     airframe = now.airframe
@@ -342,9 +342,9 @@ def velocity_leg(now: Situation, position: XY, args: VelocityArgs) -> Leg:
     known = now.forward_mps2 is not None and not now.pending
     braked = reaction.speed_mps if known else speed - airframe.accel_mps2 * now.latency_s
     slowest = max(min(speed, braked), 0.0)
-    ways = _displacements((ahead[0] * slowest, ahead[1] * slowest), target_velocity, lasting_s, airframe, control)
+    positions = _displacements((ahead[0] * slowest, ahead[1] * slowest), target_velocity, lasting_s, airframe, control)
     late = (ahead[0] * reaction.run_m, ahead[1] * reaction.run_m)
-    ways += [
+    positions += [
         (x + late[0], y + late[1]) for x, y in _displacements(present, target_velocity, lasting_s, airframe, control)
     ]
     climb = -now.down_mps
@@ -353,7 +353,7 @@ def velocity_leg(now: Situation, position: XY, args: VelocityArgs) -> Leg:
     climbs += [(up + late_m, 0.0) for up, _ in climbs]
     for (x, y), other in pending_outcomes(now, (0.0, 0.0)):
         displacements = _displacements((other.east_mps, other.north_mps), target_velocity, lasting_s, airframe, control)
-        ways[:0] = [(x, y), stop_point(other, (x, y)), *((x + dx, y + dy) for dx, dy in displacements)]
+        positions[:0] = [(x, y), stop_point(other, (x, y)), *((x + dx, y + dy) for dx, dy in displacements)]
         rise = other.altitude_m - now.altitude_m
         displacements = _displacements(
             (-other.down_mps, 0.0), (-args.down_mps, 0.0), lasting_s, airframe, (airframe.climb_accel_mps2, 1.0)
@@ -364,7 +364,7 @@ def velocity_leg(now: Situation, position: XY, args: VelocityArgs) -> Leg:
             *((rise + up, 0.0) for up, _ in displacements),
         ]
     heights = [now.altitude_m, stop_altitude_m(now), *(now.altitude_m + climb for climb, _ in climbs)]
-    corners = tuple((position[0] + x, position[1] + y) for x, y in ways)
+    corners = tuple((position[0] + x, position[1] + y) for x, y in positions)
     stop = stop_point(now, position)
     return Leg(position, stop, stop, corners[-1], min(heights), max(heights), corners, follows_velocity=True)
 
@@ -374,7 +374,7 @@ def _displacements(
 ) -> list[XY]:
     """Return displacements whose hull contains the motion from one velocity to another and to rest.
 
-    The last is the rest.
+    The last displacement is that of the point of rest.
     """
     accel, gain = control
     change_s = math.dist(present, target_velocity) / accel

@@ -65,12 +65,11 @@ def _corner(angle: float, aspect: float) -> tuple[float, float] | None:
 
 
 def _any_lens(half: float, aspect: float) -> tuple[float, float] | None:
-    """Return bounds for every lens that has an axis and shows at its corners no more than an orthographic fisheye.
+    """Return bounds for every rotationally symmetric lens that shows at its corners at most as much as an orthographic fisheye.
 
     Of all lenses with the same angle at their sides, an orthographic fisheye compresses the outer parts most. The
     bounds therefore cover pinholes, the other fisheyes (stereographic, equidistant, equisolid) and real lenses in the
-    Brown-Conrady model. Rays closer to the middle than the sides have a smaller angle, and nothing else is known of
-    them.
+    Brown-Conrady model. Only the angle of rays closer to the middle is known: it is smaller than that of the sides.
     """
     sine = math.sin(half) * math.hypot(1.0, aspect)
     corner = _corner(math.asin(sine), aspect) if sine < 1.0 else None

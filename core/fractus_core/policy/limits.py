@@ -1,7 +1,6 @@
 """Limits on altitude and speed.
 
-Values are corrected to enforced limits and denied by the others. Corrections are judged again until nothing is left to
-correct.
+Enforced limits correct a value, and other limits deny it. Corrections are judged again until nothing is left to correct.
 """
 
 from __future__ import annotations
@@ -96,7 +95,7 @@ def altitude_bounds(grant: CompiledGrant, now: Situation, air: AirVolume) -> tup
 def lowest_ceiling_m(bounds: Sequence[Bound], unknown: Sequence[Rule], present_m: float) -> float:
     """Return the lowest upper limit above home.
 
-    If one has an unknown datum, the result is at most `present_m`, so the drone does not climb.
+    If an upper limit has a datum of unknown height, the result is at most `present_m`, so the drone does not climb.
     """
     ceiling = min((bound.upper for bound in bounds if bound.upper is not None), default=math.inf)
     return min(ceiling, present_m) if any(rule.spec.upper_limit is not None for rule in unknown) else ceiling

@@ -43,12 +43,12 @@ TRACKING_SHARE = 0.3
 """Fraction of the tracking margin of permitted legs that the monitor keeps as well."""
 
 AIM_SHARE = 0.1
-"""A drone whose course misses a target by at most this fraction of the distance counts as flying to it, because gusts
-turn its velocity."""
+"""A drone counts as flying to a target if its course misses the target by at most this fraction of the distance. Gusts turn
+its velocity."""
 
 SINKING_MPS = 0.5
-"""Vertical speed in two rules. A drone that climbs no faster may continue while its altitude limits are unknown. A
-drone that the system flies, and that sinks faster, is returning below a limit."""
+"""Vertical speed used by two rules: a drone that climbs more slowly may continue while its altitude limits are unknown, and
+a drone that the system flies and that sinks faster counts as returning below a limit."""
 
 CLIMBING_MPS = 0.2
 """A drone that holds its altitude climbs no faster than this."""
@@ -111,12 +111,16 @@ def monitor(
     )
     if worst is not None:
         return replace(worst, brake_first=worst.action == "takeover" and is_moving(now))
-    for begin, then in outlooks:
+    for outcome_position, outcome in outlooks:
         # The drone's way may end before the fence. It is stopped now, and taken over only if it really goes too far.
         further = _stopping_path(
-            then, begin, stop_point(then, begin), margin, _rest_altitude_m(then, current_leg, grant)
+            outcome,
+            outcome_position,
+            stop_point(outcome, outcome_position),
+            margin,
+            _rest_altitude_m(outcome, current_leg, grant),
         )
-        worst = _worst(_fence_reactions(then, grant, further, system_flies=True))
+        worst = _worst(_fence_reactions(outcome, grant, further, system_flies=True))
         if worst is not None:
             return replace(worst, action="deny", takeover="hover")
     if fences_changed and current_leg is not None:
@@ -149,9 +153,9 @@ def _worst(findings: list[tuple[int, Verdict]]) -> Verdict | None:
 def _rest_position(now: Situation, start: XY, stop: XY, target: XY) -> XY:
     """Return the point of rest of a drone that flies to a target.
 
-    This is the target itself as long as the drone can brake for it as planned. A drone commanded to stop flies on for
-    its reaction time, but it already brakes for the target. So its way to rest may lead beyond the target only by that
-    reaction and by its tracking error.
+    The result is the target while the drone can brake for it as planned. A drone commanded to stop flies on for its
+    reaction time, but it already brakes for the target. So its point of rest may lie beyond the target only by the
+    distance of that reaction and by its tracking error.
     """
     (dx, dy), (tx, ty) = ((x - start[0], y - start[1]) for x, y in (stop, target))
     run = math.hypot(dx, dy)
@@ -208,12 +212,18 @@ def must_stop_first(now: Situation, grant: CompiledGrant) -> bool:
     outlooks = [(position, replace(now, forward_mps2=0.0)), *pending_outcomes(now, position)]
     return any(
         _fence_reactions(
-            then,
+            outcome,
             grant,
-            _stopping_path(then, begin, stop_point(then, begin), then.margin_m, stop_altitude_m(then)),
+            _stopping_path(
+                outcome,
+                outcome_position,
+                stop_point(outcome, outcome_position),
+                outcome.margin_m,
+                stop_altitude_m(outcome),
+            ),
             system_flies=True,
         )
-        for begin, then in outlooks
+        for outcome_position, outcome in outlooks
     )
 
 
@@ -258,12 +268,18 @@ class _Fence:
 
 @dataclass(frozen=True, slots=True)
 class _Finding:
-    """Effect of a drone's motion on a fence: it is on the wrong side, or its motion makes things worse, or both."""
+    """Violation of a fence by a drone.
+
+    Attributes:
+        broken: True if the drone is on the wrong side.
+        worse: True if its motion leads to the wrong side, or farther into it.
+        description: Relation of the drone to the fence, for the reason.
+    """
 
     fence: _Fence
     broken: bool
     worse: bool
-    what: str
+    description: str
 
 
 def _fence_reactions(
@@ -341,19 +357,19 @@ def _check_inclusion(
     return _Finding(fence, outside, worse, "is outside" if outside else "is about to leave")
 
 
-def _reaction(findings: _Finding, *, system_flies: bool) -> Verdict | None:
+def _reaction(finding: _Finding, *, system_flies: bool) -> Verdict | None:
     """Return the verdict on a fence that is broken or about to be broken.
 
     A policy that takes over the drone does so in both cases. A policy with action ignore only stops motion that makes
     things worse.
     """
-    fence = findings.fence
+    fence = finding.fence
     takeover = TAKEOVERS[fence.action]
-    code = fence.broken if findings.broken else fence.ahead
-    reason = f"the drone {findings.what} {fence.name}"
-    if takeover is not None and (findings.worse or (findings.broken and not system_flies)):
+    code = fence.broken if finding.broken else fence.ahead
+    reason = f"the drone {finding.description} {fence.name}"
+    if takeover is not None and (finding.worse or (finding.broken and not system_flies)):
         return Verdict("takeover", None, code, reason, (fence.policy,), takeover)
-    if findings.worse:
+    if finding.worse:
         return Verdict("deny", None, code, f"{reason}; the motion is stopped", (fence.policy,), "hover")
     return None
 
@@ -406,15 +422,15 @@ class _LimitViolation:
     reason: str
 
 
-def _altitude_correction(findings: _LimitViolation, now: Situation, grant: CompiledGrant, stop: XY) -> Verdict:
+def _altitude_correction(violation: _LimitViolation, now: Situation, grant: CompiledGrant, stop: XY) -> Verdict:
     """Return the correction to an altitude, or a stop if zones block the way to it."""
-    names = (findings.bound.name,) if findings.bound.name else ()
-    column = vertical_leg(stop, min(now.altitude_m, findings.height_m), max(now.altitude_m, findings.height_m))
+    names = (violation.bound.name,) if violation.bound.name else ()
+    column = vertical_leg(stop, min(now.altitude_m, violation.height_m), max(now.altitude_m, violation.height_m))
     if find_breaches(column, now, grant, 0.0, 0.0):
-        reason = f"{findings.reason}; zones block the way back, so the drone hovers"
-        return Verdict("deny", None, findings.code, reason, names, "hover")
+        reason = f"{violation.reason}; zones block the way back, so the drone hovers"
+        return Verdict("deny", None, violation.code, reason, names, "hover")
     lat, lon = grant.frame.latlon(*stop)
-    return Verdict("correct", GotoArgs(lat, lon, findings.height_m), findings.code, findings.reason, names)
+    return Verdict("correct", GotoArgs(lat, lon, violation.height_m), violation.code, violation.reason, names)
 
 
 def _check_speed(now: Situation, grant: CompiledGrant, start: XY) -> Verdict | None:

@@ -21,28 +21,28 @@ ZONE_FLOOR_CLEARANCE_M = 0.5
 """Distance below a zone's floor beyond the margin, because a drone does not hold its altitude exactly."""
 
 MAX_LOWERED_ALTITUDES = 4
-"""Maximum number of zones below which a return route is searched. A search without a result takes a second or two, and
-the drone waits."""
+"""Maximum number of zones below which a return route is searched. The drone waits during a search, and a search without a
+result takes a second or two."""
 
 
-def return_altitudes_m(now: Situation, grant: CompiledGrant, worth_m: float) -> tuple[float, ...]:
+def return_altitudes_m(now: Situation, grant: CompiledGrant, worthwhile_m: float) -> tuple[float, ...]:
     """Return the altitudes above home at which the system flies a drone home, best first.
 
-    First comes the return altitude, or the present one if that is higher, within the altitude limits of the straight
-    route. Then the same within the limits at the present position, and within the limits that hold everywhere. Then
-    altitudes just below the surrounding zones.
+    The preferred altitude is the return altitude, or the present altitude if that is higher. It is limited to the altitude
+    limits of the straight route, then to those at the present position, then to those that hold everywhere. Altitudes
+    just below the surrounding zones follow.
 
     Args:
         now: Position, home and airframe. Position and home are known.
         grant: Permissions and restrictions that apply.
-        worth_m: Altitude up to which a climb is worthwhile.
+        worthwhile_m: Altitude up to which a climb is worthwhile.
     """
     position = grant.locate(now)
     if position is None or now.home is None:
         return (now.altitude_m,)
     home = grant.frame.xy(now.home.lat, now.home.lon)
     lane = shapely.linestrings((position, home)) if position != home else shapely.points(position)
-    best = max(now.altitude_m, min(now.airframe.return_altitude_m, worth_m))
+    best = max(now.altitude_m, min(now.airframe.return_altitude_m, worthwhile_m))
     altitudes = []
     for ground in (lane, shapely.points(position), shapely.Point()):
         bounds, unknown = altitude_bounds(grant, now, AirVolume(ground, now.margin_m, -math.inf, math.inf))
@@ -98,21 +98,21 @@ def return_bounds(now: Situation, grant: CompiledGrant) -> ReturnBounds:
 def may_change_altitude(now: Situation, grant: CompiledGrant, altitude_m: float) -> bool:
     """Return True if the drone may climb or sink to an altitude at its position.
 
-    A drone too close below or above a zone may leave that zone first, even beside another zone, because it comes no
-    closer to that.
+    A drone that is too close below or above a zone may move away from it, even next to another zone: a vertical motion
+    does not bring it closer to the other zone.
     """
     position = grant.locate(now)
     if position is None:
         return False
     column = vertical_leg(position, min(now.altitude_m, altitude_m), max(now.altitude_m, altitude_m))
-    here = vertical_leg(position, now.altitude_m, now.altitude_m)
+    present = vertical_leg(position, now.altitude_m, now.altitude_m)
 
     def broken(leg: Leg, room_m: float) -> set[str]:
-        # The reason of a zone's breach depends on the ground only, which is the same here.
+        # Both legs have the same ground, so a breach of one zone has the same reason in both.
         return {breach.reason for breach in find_breaches(leg, now, grant, now.margin_m, room_m)}
 
-    left = broken(column, now.height_margin_m)
-    return not left or left <= broken(here, 0.0) < broken(here, now.height_margin_m)
+    on_the_way = broken(column, now.height_margin_m)
+    return not on_the_way or on_the_way <= broken(present, 0.0) < broken(present, now.height_margin_m)
 
 
 def descent_enters_fence(now: Situation, grant: CompiledGrant) -> bool:
@@ -122,6 +122,6 @@ def descent_enters_fence(now: Situation, grant: CompiledGrant) -> bool:
         return False
     position = stop_point(now, position)
     room = (now.margin_m, now.height_margin_m)
-    here = vertical_leg(position, now.altitude_m, now.altitude_m)
+    present = vertical_leg(position, now.altitude_m, now.altitude_m)
     column = vertical_leg(position, 0.0, now.altitude_m)
-    return not find_breaches(here, now, grant, *room) and bool(find_breaches(column, now, grant, *room))
+    return not find_breaches(present, now, grant, *room) and bool(find_breaches(column, now, grant, *room))

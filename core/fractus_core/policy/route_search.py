@@ -24,8 +24,8 @@ MAX_LEGS_TESTED = 3000
 """A search gives up after this number of legs, about half a second of work."""
 
 MAX_EXCESS = 1.2
-"""Factor by which a route may be longer than the shortest one, for the sake of a quicker search. A percent or two is
-usual."""
+"""Maximum ratio of the length of a route to that of the shortest route. It makes the search quicker, and usually the route
+is only a percent or two longer."""
 
 QUICK_MAX_LEGS_TESTED = 250
 QUICK_MAX_EXCESS = 5.0
@@ -51,8 +51,8 @@ def find_route(
     itself too close to a fence the first leg leads away from it. If the autopilot returns in a straight line (not
     `now.airframe.retraces`), its return must be legal from every waypoint, including the target.
 
-    If the route with the preferred clearance is a fifth longer than one with the smallest clearance, the latter is
-    returned.
+    If the route with the preferred clearance is a fifth longer than the route with the smallest clearance, the shorter one
+    is returned.
 
     The result is deterministic. `judge` permits each leg as a `Goto` from standstill, unless limits that hold
     everywhere correct its altitude or speed, under a grant whose operation area includes the corridor
@@ -82,10 +82,10 @@ def route_steps(
     start: XY, target: XY, now: Situation, grant: CompiledGrant, altitude_m: float, *, from_m: float | None = None
 ) -> RouteSteps:
     """Search as `find_route` in steps of a fraction of a millisecond. The generator returns the route."""
-    figures = (*start, *target, altitude_m, altitude_m if from_m is None else from_m)
-    if now.home is None or not now.is_plausible or not all(math.isfinite(figure) for figure in figures):
+    numbers = (*start, *target, altitude_m, altitude_m if from_m is None else from_m)
+    if now.home is None or not now.is_plausible or not all(math.isfinite(number) for number in numbers):
         return None
-    roomy, narrow = (_Search(start, target, _spaces(now, grant, figures[-2:], room_m)) for room_m in CLEARANCES_M)
+    roomy, narrow = (_Search(start, target, _spaces(now, grant, numbers[-2:], room_m)) for room_m in CLEARANCES_M)
     result = yield from roomy.steps()
     if result is not None and _length_m(start, result) <= _MAX_CLEARANCE_DETOUR * math.dist(start, target):
         return (yield from roomy.rounded(result))
@@ -185,8 +185,8 @@ class _Search:
         self._known: set[tuple[int, int]] = set()
         self._clear: dict[tuple[int, int], bool] = {}
         self._returns: dict[int, bool] = {}
-        # Ends that are too close to a fence themselves. Legs from and to them are judged by the engine's own rules.
-        self._odd: set[int] = set()
+        # Ends of the route that are too close to a fence. The engine's rules judge the legs from and to them.
+        self._blocked_ends: set[int] = set()
 
     def steps(self) -> RouteSteps:
         """Search leg by leg. The generator returns the route, or None."""
@@ -195,13 +195,13 @@ class _Search:
         begin = shapely.points(self._ends[0])
         start_blockers = self._leaving.blockers(begin)
         target_blockers = self._space.blockers(shapely.points(self._ends[1]))
-        self._odd = {node for node, result in ((_START, start_blockers), (_TARGET, target_blockers)) if result}
+        self._blocked_ends = {node for node, result in ((_START, start_blockers), (_TARGET, target_blockers)) if result}
         if not self._space.allows_return_from(self._ends[1]) or (
             target_blockers and not self._space.allows_leg(self._ends[1], self._ends[1])
         ):
             return None
         for obstacle in start_blockers:
-            # Add the nearest exit first, because no corner need lie there.
+            # Add the nearest exit first, because the obstacle may have no corner near it.
             self._add(self._leaving.nearest_exit(obstacle, begin))
             self._learn([obstacle], self._ends[0], self._leaving)
         self._expand(_START)
@@ -213,7 +213,7 @@ class _Search:
             self._cost[end] = cost
             self._parent[end] = begin
             if end == _TARGET:
-                return self._way()
+                return self._route()
             self._expand(end)
         return None
 
@@ -237,12 +237,14 @@ class _Search:
         return tuple(points[1:])
 
     def _clears(self, a: XY, b: XY) -> bool:
-        odd = (_START in self._odd and a == self._ends[0]) or (_TARGET in self._odd and b == self._ends[1])
+        blocked = (_START in self._blocked_ends and a == self._ends[0]) or (
+            _TARGET in self._blocked_ends and b == self._ends[1]
+        )
         space = self._leaving if a == self._ends[0] else self._space
-        free = not space.blockers(shapely.linestrings((a, b))) or (odd and space.allows_leg(a, b))
+        free = not space.blockers(shapely.linestrings((a, b))) or (blocked and space.allows_leg(a, b))
         return free and space.allows_return_from(b)
 
-    def _way(self) -> tuple[XY, ...]:
+    def _route(self) -> tuple[XY, ...]:
         at = _TARGET
         route = []
         while at != _START:
@@ -279,17 +281,17 @@ class _Search:
 
     def _test(self, begin: int, end: int) -> bool:
         """Return True if a leg is legal. Obstacles that block it are added."""
-        a, b = (self._ends[n] if n <= _TARGET else self._place(n) for n in (begin, end))
+        a, b = (self._ends[n] if n <= _TARGET else self._position(n) for n in (begin, end))
         space = self._leaving if begin == _START else self._space
         blockers = space.blockers(shapely.linestrings((a, b)))
-        if blockers and (self._odd.isdisjoint((begin, end)) or not space.allows_leg(a, b)):
+        if blockers and (self._blocked_ends.isdisjoint((begin, end)) or not space.allows_leg(a, b)):
             self._learn(blockers, a, space)
             return False
         if end > _TARGET and end not in self._returns:
             self._returns[end] = self._space.allows_return_from(b)
         return self._returns.get(end, True)
 
-    def _place(self, node: int) -> XY:
+    def _position(self, node: int) -> XY:
         x, y = self._nodes[node, :2]
         return float(x), float(y)
 
@@ -306,9 +308,9 @@ class _Search:
         new = [o for o in obstacles if key(o) not in self._known]
         if not new:
             return
-        here = shapely.points(begin)
+        origin = shapely.points(begin)
         zones = [o for o in new if isinstance(o, PolicyZone)]
-        nearest = min(zones, key=lambda o: (o.shape.distance(here), o.rule.name, o.name), default=None)
+        nearest = min(zones, key=lambda o: (o.shape.distance(origin), o.rule.name, o.name), default=None)
         new = [o for o in new if o is nearest or isinstance(o, int)]
         self._known.update(key(o) for o in new)
         corners = np.vstack([space.corners(obstacle) for obstacle in new])

@@ -155,8 +155,8 @@ def _schedule(feature: dict[str, Any], field: str) -> list[dict[str, Any]]:
 def _daily(day: dict[str, Any], field: str) -> dict[str, Any]:
     """Return days and times of day in UTC. Empty means always."""
     reject_unknown_fields(day, _OF_DAY, field)
-    given = day.get("day") or []
-    named = given if isinstance(given, list) else [given]
+    value = day.get("day") or []
+    named = value if isinstance(value, list) else [value]
     unknown = [name for name in named if name not in (*_DAYS, "ANY")]
     if unknown:
         raise InvalidObject(f"{field}.day", f"{unknown[0]!r:.40} is not MON to SUN or ANY; name the days of the week")
@@ -177,18 +177,18 @@ def _daily(day: dict[str, Any], field: str) -> dict[str, Any]:
     return times if whole_week else {"days": [list(_DAYS.values())[i] for i in sorted(set(days))], **times}
 
 
-def _minutes(given: Any, field: str, *, last: bool = False) -> int:
+def _minutes(value: Any, field: str, *, last: bool = False) -> int:
     """Return minutes from midnight UTC of the named day, negative on the previous day.
 
     Second 59 counts as the end of its minute.
     """
-    match = _TIME.fullmatch(given) if isinstance(given, str) else None
+    match = _TIME.fullmatch(value) if isinstance(value, str) else None
     minutes = int(match[1]) * 60 + int(match[2]) if match is not None else _DAY_MIN + 1
     if match is None or minutes > (_DAY_MIN if last else _DAY_MIN - 1):
-        raise InvalidObject(field, f"must be a time of day with its zone, such as 08:00Z, not {given!r:.40}")
+        raise InvalidObject(field, f"must be a time of day with its zone, such as 08:00Z, not {value!r:.40}")
     seconds = int(match[3] or 0)
     if seconds and not (last and seconds == 59):
-        raise InvalidObject(field, f"must be a whole minute, not {given}")
+        raise InvalidObject(field, f"must be a whole minute, not {value}")
     offset = int(match[5] or 0) * 60 + int(match[6] or 0)
     return minutes + bool(seconds) + (offset if match[4] == "-" else -offset)
 

@@ -27,8 +27,8 @@ MAX_BEND_M = 0.5
 points."""
 
 MAX_POINTS = 300_000
-"""Maximum number of points of all rings of a file, including intermediate points. A small file may need thousands of
-times its size."""
+"""Maximum number of points of all rings of a file, including intermediate points. Long edges in a small file may need
+millions of intermediate points."""
 
 CORNERS = 64
 """Corners of the polygon that replaces a circle in formats without circles."""
@@ -51,10 +51,10 @@ class Exported:
 
 
 class InexactFeatures(InvalidObject):
-    """Features that cannot be imported exactly. Field and problem are those of the first.
+    """Features that cannot be imported exactly. Field and problem are those of the first feature.
 
     Attributes:
-        every: The problem of each of these features.
+        every: The problems of all these features.
     """
 
     def __init__(self, every: Sequence[InvalidObject]) -> None:
@@ -67,10 +67,10 @@ class _TooLarge(InvalidObject):
 
 
 class ZoneBuilder:
-    """Zones while a file is read: each gets a unique name and is validated.
+    """Collects the zones of a file, gives each a unique name, and validates them.
 
-    A zone has exactly the area, altitude and time of the file, or the import fails. A larger zone would exclude
-    permitted drones, or release drones that must stay inside.
+    A zone has exactly the area, altitude and time of the file, or the import fails. A larger exclusion zone would keep out
+    permitted drones, and a larger inclusion zone would let drones leave the permitted area.
 
     Args:
         without: Titles of features that are left out.
@@ -89,7 +89,7 @@ class ZoneBuilder:
         self._wrong: list[InvalidObject] = []
 
     def take(self, title: str, read: Callable[[], None]) -> None:
-        """Read a feature unless it is to be left out. Its problem is reported with those of all others."""
+        """Read a feature, unless its title is in `without`. If it cannot be read, store the problem for `result`."""
         if title in self._without:
             self._left_out.add(title)
             self.note(title, "left out as requested")
@@ -142,10 +142,10 @@ class ZoneBuilder:
         return {"polygon": {"exterior": exterior} | ({"holes": holes} if holes else {})}
 
     def properties(self, title: str, properties: Mapping[str, Any], known: Collection[str], field: str) -> None:
-        """Note the properties that a Zone cannot represent, and reject those that state its altitude or time.
+        """Note the properties that a Zone cannot represent, and reject properties that state its altitude or time.
 
         Raises:
-            InvalidObject: A property states altitude or time and is not to be dropped.
+            InvalidObject: A property states altitude or time and is not in `drop`.
         """
         self._dropped.update(set(properties) & set(self._drop))
         stated = {name for name, value in properties.items() if value not in (None, "", [], {})}
@@ -235,7 +235,7 @@ def optional_object(value: Any, field: str) -> dict[str, Any]:
     if value is None:
         return {}
     if not isinstance(value, dict):
-        raise InvalidObject(field, f"must be an object, not {_shown(value)}")
+        raise InvalidObject(field, f"must be an object, not {_short_repr(value)}")
     return value
 
 
@@ -257,7 +257,7 @@ def is_number(value: Any) -> TypeGuard[float]:
     return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
-def _shown(value: Any) -> str:
+def _short_repr(value: Any) -> str:
     text = repr(value) if not isinstance(value, int) or abs(value) < 10**12 else "a number of many digits"
     return text if len(text) <= 40 else text[:37] + "..."
 
@@ -277,7 +277,7 @@ def parse_point(value: Any, field: str, *, lat_first: bool = False) -> Point:
     if not (-90 <= lat <= 90 and -180 <= lon <= 180):
         order = "lat, lon" if lat_first else "lon, lat"
         raise InvalidObject(
-            field, f"{_shown(pair[0])}, {_shown(pair[1])} is not a place on Earth; the order is {order}"
+            field, f"{_short_repr(pair[0])}, {_short_repr(pair[1])} is not a place on Earth; the order is {order}"
         )
     return Point(lat=lat, lon=lon)
 
@@ -336,7 +336,7 @@ def circle_area(centre: Point, radius_m: Any, field: str) -> dict[str, Any]:
         InvalidObject: The radius is not a length.
     """
     if not is_number(radius_m) or not 0 < radius_m <= MAX_RADIUS_M:
-        raise InvalidObject(field, f"must be 0 to {MAX_RADIUS_M:.0f} metres, not {_shown(radius_m)}")
+        raise InvalidObject(field, f"must be 0 to {MAX_RADIUS_M:.0f} metres, not {_short_repr(radius_m)}")
     return {"circle": {"center": centre.to_dict(), "radius": float(radius_m)}}
 
 
@@ -404,7 +404,7 @@ def unsupported_parts(zones: Iterable[Zone], *parts: str) -> list[str]:
 
 
 _WORD = re.compile(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])")
-_SAYING = re.compile(
+_ALTITUDE_OR_TIME = re.compile(
     r"""(
     alt | altitudes? | heights? | elevation | levels? | floor | ceiling | lower | upper | bottom | top | base | vertical |
     agl | [am]msl | asl | msl | fl | feet | ft |
@@ -419,6 +419,6 @@ _SAYING = re.compile(
 def suggests_altitude_or_time(name: str) -> bool:
     """Return True if the name of a property contains a word for altitude or time.
 
-    Examples are `upperLimit`, `VALID_FROM` and `height (AGL)`.
+    Such names are `upperLimit`, `VALID_FROM` and `height (AGL)`.
     """
-    return any(_SAYING.fullmatch(word.lower()) for word in _WORD.findall(name))
+    return any(_ALTITUDE_OR_TIME.fullmatch(word.lower()) for word in _WORD.findall(name))

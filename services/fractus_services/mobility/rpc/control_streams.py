@@ -70,7 +70,7 @@ class ControlStreams:
         reported = ""
         while control.lease is lease:
             reason = control.not_ready_reason(lease.key)
-            if control.state.taken(lease.key):
+            if control.state.armed_for_other(lease.key):
                 raise PreconditionFailed("ControlHeld", "another application has the drone; try again when it is back")
             if reason is None:
                 if lease.grant.spec.control != "partial":

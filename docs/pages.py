@@ -1,6 +1,6 @@
-"""What the site has beside the files of docs/: pages of the repository's root, and the reference, generated from the code.
+"""MkDocs hook that adds pages to the site: pages from outside docs/, and the reference generated from the code.
 
-A hook of MkDocs, see mkdocs.yml. Run as a program, it writes the charts' README.md.
+mkdocs.yml configures the hook. Run as a program, this module writes the README.md of each chart.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ ROOT_PAGES = {
     "CHANGELOG.md": "changelog.md",
     "examples/heuristic-plugin/README.md": "heuristics.md",
 }
-"""Where files outside of docs/ are on the site."""
+"""Path on the site of each page outside docs/."""
 
 _LINK = re.compile(r"(!?)\[((?:[^\[\]]|\[[^\]]*\])*)\]\(([^)#\s]+)(#[^)\s]*)?\)")
 _VALUE = re.compile(r"^( *)(\w[\w-]*):(?: +(.*))?$")
 
 
 def on_files(files: Files, *, config: MkDocsConfig) -> Files:
-    """Add the pages that are not in docs/."""
+    """Add pages from outside docs/ and generated pages."""
     texts = {site: (ROOT / name).read_text() for name, site in ROOT_PAGES.items()}
     texts |= {
         "decisions/index.md": "\n\n".join(decisions()),
@@ -53,47 +53,50 @@ def on_files(files: Files, *, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, *, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Lead links to where a file is on the site; what the site does not have is named without a link."""
+    """Change links between files of the repository to links between pages of the site.
+
+    Links to files that are not on the site are replaced by their text.
+    """
     source = next((name for name, site in ROOT_PAGES.items() if site == page.file.src_uri), None)
     folder = posixpath.dirname(source or "docs/" + page.file.src_uri)
 
-    def led(found: re.Match[str]) -> str:
-        mark = found.group(1)
-        text = found.group(2)
-        target = found.group(3)
-        anchor = found.group(4) or ""
+    def site_link(match: re.Match[str]) -> str:
+        mark = match.group(1)
+        text = match.group(2)
+        target = match.group(3)
+        anchor = match.group(4) or ""
         if "://" in target or target.startswith(("mailto:", "/")):
-            return found.group()
+            return match.group()
         path = posixpath.normpath(posixpath.join(folder, target))
         site = ROOT_PAGES.get(path) or (path.removeprefix("docs/") if path.startswith("docs/") else None)
         if path == "docs/decisions":
             site = "decisions/index.md"
         if site is None or files.get_file_from_path(site) is None:
             return text if text.startswith("`") or mark else f"{text} (`{path}`)" if text != path else f"`{text}`"
-        here = posixpath.dirname(page.file.src_uri)
-        return f"{mark}[{text}]({posixpath.relpath(site, here or '.')}{anchor})"
+        page_folder = posixpath.dirname(page.file.src_uri)
+        return f"{mark}[{text}]({posixpath.relpath(site, page_folder or '.')}{anchor})"
 
-    return _LINK.sub(led, markdown)
+    return _LINK.sub(site_link, markdown)
 
 
 def decisions() -> Iterator[str]:
-    """The list of decisions."""
+    """Yield the list of decisions as Markdown."""
     yield "# Decisions"
-    found = sorted((ROOT / "docs" / "decisions").glob("*.md"))
-    yield "\n".join(f"- [{path.read_text().splitlines()[0].lstrip('# ')}]({path.name})" for path in found)
+    paths = sorted((ROOT / "docs" / "decisions").glob("*.md"))
+    yield "\n".join(f"- [{path.read_text().splitlines()[0].lstrip('# ')}]({path.name})" for path in paths)
 
 
 def kinds() -> Iterator[str]:
-    """Every field of every kind, from the CustomResourceDefinitions."""
+    """Yield a table of all fields of each kind, from the CustomResourceDefinitions."""
     yield "# Kinds"
-    yield "All are of the group `fractus.dev`, version `v1alpha1`; `kubectl explain KIND.spec` says the same."
+    yield "All kinds have the group `fractus.dev` and the version `v1alpha1`. `kubectl explain KIND.spec` prints the same descriptions."
     for path in sorted((ROOT / "crds").glob("*.yaml")):
         body = yaml.safe_load(path.read_text())["spec"]
         names = body["names"]
         schema = body["versions"][0]["schema"]["openAPIV3Schema"]
         short = ", ".join(f"`{name}`" for name in names.get("shortNames", ()))
         yield f"## {names['kind']}"
-        yield f"{schema.get('description', '')} {body['scope']}; `kubectl get {names['plural']}`, short {short}."
+        yield f"{schema.get('description', '')} Scope: {body['scope']}. `kubectl get {names['plural']}`, short name {short}."
         for part in ("spec", "status"):
             if part in schema["properties"]:
                 yield f"### {names['kind']}.{part}"
@@ -105,10 +108,10 @@ def kinds() -> Iterator[str]:
                     yield "\n".join(f"- {_cell(message)}" for message in rules)
 
 
-def _fields(schema: dict[str, Any], above: str) -> Iterator[str]:
+def _fields(schema: dict[str, Any], prefix: str) -> Iterator[str]:
     required = set(schema.get("required", ()))
     for name, field in schema.get("properties", {}).items():
-        path = f"{above}{name}"
+        path = f"{prefix}{name}"
         inner = field
         kind = field.get("type", "any")
         if kind == "array":
@@ -128,7 +131,7 @@ def _fields(schema: dict[str, Any], above: str) -> Iterator[str]:
 
 
 def calls() -> Iterator[str]:
-    """Services and messages, from the .proto files and their comments."""
+    """Yield tables of all services and messages, from the .proto files and their comments."""
     yield "# Calls"
     yield "The gRPC services of a node, from `proto/`. Components reach them through the [SDK](sdk.md)."
     with tempfile.TemporaryDirectory() as folder:
@@ -136,63 +139,63 @@ def calls() -> Iterator[str]:
         names = [str(path.relative_to(PROTO)) for path in sorted(PROTO.glob("fractus_proto/v1/*.proto"))]
         arguments = ["protoc", f"-I{PROTO}", f"-I{Path(protoc.__file__).parent / '_proto'}"]
         if protoc.main([*arguments, "--include_source_info", f"--descriptor_set_out={out}", *names]) != 0:
-            raise ValueError("the .proto files cannot be read")
-        described = FileDescriptorSet.FromString(out.read_bytes())
-    for file in described.file:
-        said = {tuple(place.path): _comment(place) for place in file.source_code_info.location}
+            raise ValueError("protoc cannot compile the .proto files")
+        descriptors = FileDescriptorSet.FromString(out.read_bytes())
+    for file in descriptors.file:
+        comments = {tuple(location.path): _comment(location) for location in file.source_code_info.location}
         for i, service in enumerate(file.service):
             yield f"## {service.name}"
-            yield said.get((6, i), "")
-            rows = ["| Call | Takes | Gives | Meaning |", "|---|---|---|---|"]
+            yield comments.get((6, i), "")
+            rows = ["| Call | Request | Response | Meaning |", "|---|---|---|---|"]
             for j, method in enumerate(service.method):
-                gives = ("stream of " if method.server_streaming else "") + _plain(method.output_type)
-                rows.append(
-                    f"| `{method.name}` | {_plain(method.input_type)} | {gives} | {_cell(said.get((6, i, 2, j), ''))} |"
-                )
+                request = _type_name(method.input_type)
+                response = ("stream of " if method.server_streaming else "") + _type_name(method.output_type)
+                meaning = _cell(comments.get((6, i, 2, j), ""))
+                rows.append(f"| `{method.name}` | {request} | {response} | {meaning} |")
             yield "\n".join(rows)
         for i, message in enumerate(file.message_type):
             if not message.field:
                 continue
             yield f"### {message.name}"
-            yield said.get((4, i), "")
+            yield comments.get((4, i), "")
             rows = ["| Field | Number | Meaning |", "|---|---|---|"]
             rows += [
-                f"| `{field.name}` | {field.number} | {_cell(said.get((4, i, 2, j), ''))} |"
+                f"| `{field.name}` | {field.number} | {_cell(comments.get((4, i, 2, j), ''))} |"
                 for j, field in enumerate(message.field)
             ]
             yield "\n".join(rows)
 
 
-def _comment(place: Any) -> str:
-    return " ".join((place.leading_comments + place.trailing_comments).split())
+def _comment(location: Any) -> str:
+    return " ".join((location.leading_comments + location.trailing_comments).split())
 
 
-def _plain(name: str) -> str:
+def _type_name(name: str) -> str:
     return f"`{name.rsplit('.', maxsplit=1)[-1]}`"
 
 
 def values() -> Iterator[str]:
-    """Every value of every chart, from the comments of values.yaml."""
+    """Yield a table of all values of each chart, from the comments of values.yaml."""
     yield "# Chart values"
     for chart in charts():
-        described = yaml.safe_load((chart / "Chart.yaml").read_text())
-        yield f"## {described['name']}"
-        yield f"{described['description']}."
+        metadata = yaml.safe_load((chart / "Chart.yaml").read_text())
+        yield f"## {metadata['name']}"
+        yield f"{metadata['description']}."
         yield _value_table(chart)
 
 
 def charts() -> list[Path]:
-    """The folders of the charts."""
+    """Return the folders of the charts."""
     return sorted(path.parent for path in (ROOT / "charts").glob("*/Chart.yaml"))
 
 
 def chart_readme(chart: Path) -> str:
-    """What `helm show readme` prints of a chart."""
-    described = yaml.safe_load((chart / "Chart.yaml").read_text())
+    """Return the README.md of a chart, which `helm show readme` prints."""
+    metadata = yaml.safe_load((chart / "Chart.yaml").read_text())
     parts = [
-        f"# {described['name']}",
-        f"{described['description']}.",
-        f"For Kubernetes `{described['kubeVersion']}`. Installation: [README](../../README.md#install-on-your-own-cluster),"
+        f"# {metadata['name']}",
+        f"{metadata['description']}.",
+        f"For Kubernetes `{metadata['kubeVersion']}`. Installation: [README](../../README.md#install-on-your-own-cluster),"
         " [clusters](../../docs/clusters.md), [upgrades](../../docs/upgrades.md).",
         "## Values",
         _value_table(chart),
@@ -207,30 +210,30 @@ def _value_table(chart: Path) -> str:
 
 
 def _values(lines: list[str], schema: dict[str, Any]) -> Iterator[str]:
-    above: list[tuple[int, str]] = []
-    said: list[str] = []
+    parents: list[tuple[int, str]] = []
+    comment: list[str] = []
     for line in lines:
         text = line.strip()
         if text.startswith("#"):
-            said.append(text.lstrip("# "))
+            comment.append(text.lstrip("# "))
             continue
-        found = _VALUE.match(line)
-        if found is None:
-            said = []
+        match = _VALUE.match(line)
+        if match is None:
+            comment = []
             continue
-        indent = len(found.group(1))
-        above = [(depth, name) for depth, name in above if depth < indent]
-        default = (found.group(3) or "").strip()
-        if default or said:
-            path = [*(name for _, name in above), found.group(2)]
-            meaning = " ".join(said) or _description(schema, path)
+        indent = len(match.group(1))
+        parents = [(depth, name) for depth, name in parents if depth < indent]
+        default = (match.group(3) or "").strip()
+        if default or comment:
+            path = [*(name for _, name in parents), match.group(2)]
+            meaning = " ".join(comment) or _description(schema, path)
             yield f"| `{'.'.join(path)}` | {f'`{_cell(default)}`' if default else ''} | {_cell(meaning)} |"
-        above.append((indent, found.group(2)))
-        said = []
+        parents.append((indent, match.group(2)))
+        comment = []
 
 
 def _description(schema: dict[str, Any], path: list[str]) -> str:
-    """What the schema says of a value; empty where it says nothing."""
+    """Return the schema's description of a value, or an empty string if there is none."""
     part = schema
     for name in path:
         part = part.get("properties", {}).get(name, {})
@@ -240,23 +243,23 @@ def _description(schema: dict[str, Any], path: list[str]) -> str:
 
 
 def commands() -> Iterator[str]:
-    """The help of every command."""
+    """Yield the help of every command."""
     yield "# Help of every command"
-    yield "What `fractus COMMAND --help` prints. [Which need what](../cli.md)."
+    yield "This page contains the output of `fractus COMMAND --help`. [Command line](../cli.md) lists the requirements of commands."
     root = click.Context(fractus, info_name="fractus", terminal_width=100)
     for name in sorted(fractus.list_commands(root)):
         yield from _help(fractus.get_command(root, name), root, name)
 
 
-def _help(command: click.Command | None, above: click.Context, name: str) -> Iterator[str]:
+def _help(command: click.Command | None, parent: click.Context, name: str) -> Iterator[str]:
     if command is None or command.hidden:
         return
-    context = click.Context(command, info_name=name, parent=above, terminal_width=100)
+    context = click.Context(command, info_name=name, parent=parent, terminal_width=100)
     yield f"## {context.command_path}"
     yield f"```text\n{command.get_help(context)}\n```"
     if isinstance(command, click.Group):
-        for below in sorted(command.list_commands(context)):
-            yield from _help(command.get_command(context, below), context, below)
+        for subcommand in sorted(command.list_commands(context)):
+            yield from _help(command.get_command(context, subcommand), context, subcommand)
 
 
 def _cell(text: str) -> str:

@@ -19,8 +19,8 @@ NO_PARENT = b""
 
 
 @dataclass(frozen=True)
-class Seen:
-    """An exported span."""
+class ReceivedSpan:
+    """An exported span, with attributes of its process."""
 
     service: str
     node: str
@@ -31,15 +31,14 @@ class Seen:
         return str(self.span.name)
 
     @property
-    def told(self) -> dict[str, Any]:
-        """Attributes of the span."""
-        return {one.key: value_of(one.value) for one in self.span.attributes}
+    def attributes(self) -> dict[str, Any]:
+        return {attribute.key: value_of(attribute.value) for attribute in self.span.attributes}
 
 
 def value_of(value: Any) -> Any:
     kind = value.WhichOneof("value")
     if kind == "array_value":
-        return [value_of(one) for one in value.array_value.values]
+        return [value_of(item) for item in value.array_value.values]
     return getattr(value, kind)
 
 
@@ -48,7 +47,7 @@ class Collector(trace_service_pb2_grpc.TraceServiceServicer):
     """Stores received spans."""
 
     address: str = field(default_factory=lambda: f"127.0.0.1:{free_port()}")
-    spans: list[Seen] = field(default_factory=list)
+    spans: list[ReceivedSpan] = field(default_factory=list)
     arrived: threading.Condition = field(default_factory=threading.Condition)
 
     @property
@@ -59,37 +58,43 @@ class Collector(trace_service_pb2_grpc.TraceServiceServicer):
     def Export(self, request: Any, context: Any) -> Any:  # noqa: N802
         del context
         with self.arrived:
-            for one in request.resource_spans:
-                told = {attribute.key: value_of(attribute.value) for attribute in one.resource.attributes}
-                for scope in one.scope_spans:
-                    self.spans += [Seen(told["service.name"], told.get("fractus.node", ""), s) for s in scope.spans]
+            for group in request.resource_spans:
+                process = {attribute.key: value_of(attribute.value) for attribute in group.resource.attributes}
+                service = process["service.name"]
+                node = process.get("fractus.node", "")
+                for scope in group.scope_spans:
+                    self.spans += [ReceivedSpan(service, node, span) for span in scope.spans]
             self.arrived.notify_all()
         return trace_service_pb2.ExportTraceServiceResponse()
 
-    def wait(self, condition: Callable[[list[Seen]], Any], timeout_s: float = 60.0) -> Any:
+    def wait(self, condition: Callable[[list[ReceivedSpan]], Any], timeout_s: float = 60.0) -> Any:
         """Wait until a function of the spans returns a true value, and return that value."""
         deadline = time.monotonic() + timeout_s
         with self.arrived:
-            while not (found := condition(self.spans)):
-                left_s = deadline - time.monotonic()
-                assert left_s > 0, sorted({f"{one.service}: {one.name}" for one in self.spans})
-                self.arrived.wait(left_s)
-            return found
+            while not (result := condition(self.spans)):
+                remaining_s = deadline - time.monotonic()
+                assert remaining_s > 0, sorted({f"{span.service}: {span.name}" for span in self.spans})
+                self.arrived.wait(remaining_s)
+            return result
 
-    def one(self, name: str, kind: int = Span.SPAN_KIND_SERVER, **told: Any) -> Seen:
-        """Wait for a span with this name, kind and attributes, and return the first. `a__b` stands for the attribute a.b."""
-        wanted = {key.replace("__", "."): value for key, value in told.items()}
+    def find(self, name: str, kind: int = Span.SPAN_KIND_SERVER, **attributes: Any) -> ReceivedSpan:
+        """Wait for a span with this name, kind and attributes, and return the first one. Write the attribute a.b as `a__b`."""
+        expected = {key.replace("__", "."): value for key, value in attributes.items()}
 
-        def matching(spans: list[Seen]) -> list[Seen]:
-            return [
-                s for s in spans if s.name == name and s.span.kind == kind and wanted.items() <= _flat(s.told).items()
-            ]
+        def matches(span: ReceivedSpan) -> bool:
+            return (
+                span.name == name and span.span.kind == kind and expected.items() <= _hashable(span.attributes).items()
+            )
 
-        return matching(self.wait(lambda spans: matching(spans) and spans))[0]
+        def matching(spans: list[ReceivedSpan]) -> list[ReceivedSpan]:
+            return [span for span in spans if matches(span)]
+
+        spans: list[ReceivedSpan] = self.wait(matching)
+        return spans[0]
 
 
-def _flat(told: dict[str, Any]) -> dict[str, Any]:
-    return {key: tuple(value) if isinstance(value, list) else value for key, value in told.items()}
+def _hashable(attributes: dict[str, Any]) -> dict[str, Any]:
+    return {key: tuple(value) if isinstance(value, list) else value for key, value in attributes.items()}
 
 
 @contextmanager

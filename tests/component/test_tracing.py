@@ -124,11 +124,11 @@ async def test_child_spans_belong_to_the_call_in_its_tasks_too(close: Callable[[
     part, failed, call = collector.spans
     assert [one.name for one in collector.spans] == ["part", "failed", METHOD]
     assert {part.span.parent_span_id, failed.span.parent_span_id} == {call.span.span_id}
-    assert part.told == {"fractus.verdict.action": "deny"}
-    assert failed.told == {"error.type": "OSError"}, "the text of an error may contain a position"
+    assert part.attributes == {"fractus.verdict.action": "deny"}
+    assert failed.attributes == {"error.type": "OSError"}, "the text of an error may contain a position"
     assert not failed.span.events
     assert not failed.span.status.message
-    assert call.told["rpc.grpc.status_code"] == 0
+    assert call.attributes["rpc.grpc.status_code"] == 0
 
 
 @pytest.mark.parametrize(
@@ -142,7 +142,7 @@ def test_call_span_has_the_status_of_a_failed_call(
         raise error
     close()
     (call,) = collector.spans
-    assert call.told["rpc.grpc.status_code"] == status
+    assert call.attributes["rpc.grpc.status_code"] == status
     assert "50.1" not in str(call.span)
 
 

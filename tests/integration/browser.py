@@ -1,4 +1,4 @@
-"""The page of `fractus view`, as it is served and in a real Chromium."""
+"""Helpers that serve the page of `fractus view` and open it in Chromium."""
 
 from __future__ import annotations
 
@@ -23,59 +23,60 @@ SOFTWARE_GL = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swi
 
 
 @contextlib.contextmanager
-def launched(playwright: Playwright, *more: str) -> Iterator[Browser]:
-    browser = playwright.chromium.launch(executable_path=CHROMIUM, args=[*QUIET, *more], timeout=TIMEOUT_MS)
+def launched(playwright: Playwright, *arguments: str) -> Iterator[Browser]:
+    """Run Chromium with additional arguments."""
+    browser = playwright.chromium.launch(executable_path=CHROMIUM, args=[*QUIET, *arguments], timeout=TIMEOUT_MS)
     yield browser
     browser.close()
 
 
 @contextlib.contextmanager
 def serving(*arguments: str | Path) -> Iterator[str]:
-    """The address that `fractus view` prints."""
+    """Run `fractus view`, and yield the address that it prints."""
     command = [sys.executable, "-m", "fractus_cli", "view", "--listen", "127.0.0.1:0", *map(str, arguments)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         try:
             assert process.stdout is not None
-            found = re.search(r"http://\S+", process.stdout.readline())
-            assert found is not None
-            yield found[0]
+            match = re.search(r"http://\S+", process.stdout.readline())
+            assert match is not None
+            yield match[0]
         finally:
             process.send_signal(signal.SIGTERM)
         assert process.wait(20) == 0
 
 
-def told_to_pages(address: str, *words: str) -> None:
-    """Wait until pages of those who have the token are told all of these words; no one else is told anything."""
+def wait_for_events(address: str, *words: str) -> None:
+    """Wait until the event stream contained all words. Check that the page is refused without the token."""
     plain, _, token = address.partition("?token=")
     with pytest.raises(urllib.error.HTTPError) as refused:
         urllib.request.urlopen(plain, timeout=20)
     assert refused.value.code == 401
     request = urllib.request.Request(f"{plain}stream", headers={"Authorization": f"Bearer {token}"})
     missing = set(words)
-    with urllib.request.urlopen(request, timeout=20) as answer:
+    with urllib.request.urlopen(request, timeout=20) as response:
         while missing:
-            line = answer.readline().decode()
+            line = response.readline().decode()
             assert line, f"the stream ended without {missing}"
             missing = {word for word in missing if word not in line}
 
 
 @contextlib.contextmanager
-def opened(browser: Browser, address: str, **how: str) -> Iterator[Page]:
-    """The page, without an error on its console, and without a request to anything else."""
-    context = browser.new_context(viewport={"width": 1280, "height": 800}, **how)  # type: ignore[arg-type]
+def opened(browser: Browser, address: str, **options: str) -> Iterator[Page]:
+    """Open the page, and fail if it logs an error on its console or requests another server."""
+    context = browser.new_context(viewport={"width": 1280, "height": 800}, **options)  # type: ignore[arg-type]
     context.set_default_timeout(TIMEOUT_MS)
     page = context.new_page()
-    wrong = list[str]()
-    page.on("console", lambda said: wrong.append(said.text) if said.type == "error" else None)
-    page.on("pageerror", lambda error: wrong.append(str(error)))
+    problems = list[str]()
+    page.on("console", lambda message: problems.append(message.text) if message.type == "error" else None)
+    page.on("pageerror", lambda error: problems.append(str(error)))
 
-    def local(route: Route) -> None:
+    def check_address(route: Route) -> None:
         if not route.request.url.startswith(address.partition("?")[0]):
-            wrong.append(route.request.url)
+            problems.append(route.request.url)
         route.continue_()
 
-    page.route("**/*", local)
+    page.route("**/*", check_address)
     page.goto(address)
     yield page
-    assert wrong == []
+    assert problems == []
     context.close()

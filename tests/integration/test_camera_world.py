@@ -1,4 +1,4 @@
-"""The camera world as a process and a server: behind the real simulated vehicle, and against clients of all kinds."""
+"""Camera world: as a process that follows the simulated vehicle, and as an HTTP server with slow and malformed clients."""
 
 from __future__ import annotations
 
@@ -31,37 +31,37 @@ def get(port: int, path: str, timeout_s: float = 60.0) -> tuple[int, dict[str, s
     connection = http.client.HTTPConnection("127.0.0.1", port, timeout=timeout_s)
     try:
         connection.request("GET", path)
-        answer = connection.getresponse()
-        return answer.status, dict(answer.getheaders()), answer.read()
+        response = connection.getresponse()
+        return response.status, dict(response.getheaders()), response.read()
     finally:
         connection.close()
 
 
-def eventually(look: Callable[[], int | None], timeout_s: float = 60.0) -> int:
+def eventually(poll: Callable[[], int | None], timeout_s: float = 60.0) -> int:
     end = time.monotonic() + timeout_s
     while time.monotonic() < end:
-        found = look()
-        if found is not None:
-            return found
+        result = poll()
+        if result is not None:
+            return result
         time.sleep(0.1)
-    raise TimeoutError(f"nothing within {timeout_s:.0f} s")
+    raise TimeoutError(f"no result within {timeout_s:.0f} s")
 
 
-def pictured(port: int, path: str) -> tuple[int, dict[str, str], bytes]:
-    """The first answer with a picture: on a machine that is busy, a vehicle may be silent for a while."""
-    answers: list[tuple[int, dict[str, str], bytes]] = []
+def wait_for_picture(port: int, path: str) -> tuple[int, dict[str, str], bytes]:
+    """Return the first response with a picture. On a busy machine, a vehicle may be silent for a while."""
+    responses: list[tuple[int, dict[str, str], bytes]] = []
 
-    def look() -> int | None:
-        answers.append(get(port, path))
-        return answers[-1][0] if answers[-1][0] == 200 else None
+    def status_if_ok() -> int | None:
+        responses.append(get(port, path))
+        return responses[-1][0] if responses[-1][0] == 200 else None
 
-    eventually(look)
-    return answers[-1]
+    eventually(status_if_ok)
+    return responses[-1]
 
 
 @contextlib.contextmanager
 def running_world(*arguments: str) -> Iterator[int]:
-    """The camera world as a process; its port."""
+    """Run the camera world as a process, and yield its port."""
     command = [sys.executable, "-m", "fractus_world", "--listen", "127.0.0.1:0", *arguments]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     assert process.stderr is not None
@@ -79,7 +79,7 @@ def running_world(*arguments: str) -> Iterator[int]:
 
 @pytest.fixture
 def served() -> Iterator[CameraServer]:
-    """A server in this process, whose camera is on a mast."""
+    """A server in this process, with a camera at a fixed position."""
     frame_pose = Pose(50.8637, 4.6785, 40.0, yaw_deg=20.0)
     api = CameraApi(
         WorldAround(7, (50.8637, 4.6785)), FixedPose(frame_pose), Intrinsics(320, 180), Mount(), now=lambda: 1000.0
@@ -101,8 +101,8 @@ def picture_of(body: bytes) -> np.ndarray:
     return picture
 
 
-def test_camera_follows_the_vehicle_and_survives_its_restart() -> None:
-    """503 before, pictures while it flies, 503 when it is gone, pictures again."""
+def test_camera_world_follows_vehicle_and_its_restart() -> None:
+    """The server returns 503 while no vehicle is connected, and pictures while one is."""
     links = [f"tcp:127.0.0.1:{free_port()}" for _ in range(2)]
     origin = f"{HOME[0]},{HOME[1]}"
     small = "/snapshot.jpg?width=320&height=180"
@@ -114,7 +114,7 @@ def test_camera_follows_the_vehicle_and_survives_its_restart() -> None:
             eventually(lambda: get(port, small)[0] == 200 or None)
             pilot = Client(links[0])
             pilot.take_off(20.0)
-            status, headers, body = pictured(port, small)
+            status, headers, body = wait_for_picture(port, small)
             assert status == 200
             assert headers["Content-Type"] == "image/jpeg"
             assert picture_of(body).shape == (180, 320, 3)
@@ -128,19 +128,19 @@ def test_camera_follows_the_vehicle_and_survives_its_restart() -> None:
             eventually(lambda: get(port, small)[0] == 200 or None)
 
 
-def test_snapshot_and_truth_agree(served: CameraServer) -> None:
+def test_camera_world_truth_belongs_to_its_snapshot(served: CameraServer) -> None:
     status, headers, first = get(served.port, "/snapshot.jpg?time=77.5")
     assert status == 200
     assert headers["X-Fractus-Time"] == "77.500"
-    assert get(served.port, "/snapshot.jpg?time=77.5")[2] == first, "same pose and time, same bytes"
+    assert get(served.port, "/snapshot.jpg?time=77.5")[2] == first, "same pose and time, but different bytes"
     assert get(served.port, "/snapshot.jpg?time=77.5&band=ir")[2] != first
     truth = json.loads(get(served.port, f"/truth.json?snapshot={headers['X-Fractus-Snapshot']}")[2])
     assert truth["time"] == 77.5
     assert truth["band"] == "rgb"
-    assert json.loads(get(served.port, "/truth.json")[2])["band"] == "ir", "without a number: the last one"
+    assert json.loads(get(served.port, "/truth.json")[2])["band"] == "ir", "without a number, not the last snapshot"
 
 
-def test_orthophoto_and_page(served: CameraServer) -> None:
+def test_camera_world_serves_orthophoto_and_page(served: CameraServer) -> None:
     status, headers, body = get(served.port, "/orthophoto.png?metres=100&pixels=200")
     assert status == 200
     assert headers["Content-Type"] == "image/png"
@@ -174,16 +174,16 @@ def test_orthophoto_and_page(served: CameraServer) -> None:
         ("/snapshot.jpg?" + "&".join(f"a{n}=1" for n in range(40)), 400, "query"),
     ],
 )
-def test_bad_requests_get_a_sentence(served: CameraServer, path: str, status: int, words: str) -> None:
+def test_camera_world_rejects_bad_request_with_reason(served: CameraServer, path: str, status: int, words: str) -> None:
     if "999999" in path:
         get(served.port, "/snapshot.jpg")
-    answer = get(served.port, path)
-    assert answer[0] == status
-    assert words in answer[2].decode()
+    response = get(served.port, path)
+    assert response[0] == status
+    assert words in response[2].decode()
 
 
-def test_idle_slow_and_vanishing_clients_stall_no_other(served: CameraServer, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As many clients as fit that say nothing; they are thrown out, and a picture is served afterwards: only that one."""
+def test_camera_world_disconnects_idle_and_slow_clients(served: CameraServer, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Clients that send no complete request occupy all connections. They are disconnected and cause no picture."""
     monkeypatch.setattr(server_module, "CLIENT_LIFE_S", 0.5)
     monkeypatch.setattr(server_module, "MAX_CLIENTS", 8)
     idle = [socket.create_connection(("127.0.0.1", served.port), timeout=5) for _ in range(24)]
@@ -211,19 +211,19 @@ def _status(port: int) -> int | None:
         return None
 
 
-def test_many_clients_at_once_get_pictures_or_are_told_to_wait(served: CameraServer) -> None:
-    answers: list[int | None] = []
-    threads = [threading.Thread(target=lambda: answers.append(_status(served.port))) for _ in range(24)]
+def test_camera_world_returns_picture_or_503_to_many_clients(served: CameraServer) -> None:
+    statuses: list[int | None] = []
+    threads = [threading.Thread(target=lambda: statuses.append(_status(served.port))) for _ in range(24)]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join(60)
-    assert len(answers) == 24
-    assert set(answers) <= {200, 503}
-    assert answers.count(200) >= 8
+    assert len(statuses) == 24
+    assert set(statuses) <= {200, 503}
+    assert statuses.count(200) >= 8
 
 
-def test_other_methods_are_refused(served: CameraServer) -> None:
+def test_camera_world_rejects_other_http_methods(served: CameraServer) -> None:
     connection = http.client.HTTPConnection("127.0.0.1", served.port, timeout=10)
     connection.request("POST", "/snapshot.jpg", body=b"x" * 100)
     assert connection.getresponse().status == 501
@@ -243,7 +243,7 @@ def test_other_methods_are_refused(served: CameraServer) -> None:
         (("--photos", "/nowhere"), "/nowhere"),
     ],
 )
-def test_bad_options_are_named(arguments: tuple[str, ...], words: str) -> None:
+def test_camera_world_command_rejects_bad_option_with_reason(arguments: tuple[str, ...], words: str) -> None:
     from click.testing import CliRunner
     from fractus_world.__main__ import camera_world
 
@@ -252,7 +252,7 @@ def test_bad_options_are_named(arguments: tuple[str, ...], words: str) -> None:
     assert words in result.output
 
 
-def test_photos_instead_of_a_world(tmp_path: Path) -> None:
+def test_camera_world_serves_nearest_photo_if_configured(tmp_path: Path) -> None:
     save(tmp_path / "near.jpg", 50.0, 4.0, 60.0, (200, 20, 20))
     save(tmp_path / "far.jpg", 50.01, 4.0, 60.0, (20, 20, 200))
     save(tmp_path / "ir" / "a.jpg", 50.01, 4.0, 60.0, (90, 90, 90))

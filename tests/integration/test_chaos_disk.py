@@ -51,7 +51,7 @@ def is_full(path: Path) -> bool:
     return False
 
 
-def test_disk_fault_leaves_no_space_until_it_ends(disk: Path) -> None:
+def test_chaos_disk_fault_leaves_no_space_until_it_ends(disk: Path) -> None:
     append(disk / "log", 100_000)
     append(disk / "old", 1_000_000)
     with inject(FAULTS["disk-full"], target_on(disk), Random(1)) as description:
@@ -64,7 +64,7 @@ def test_disk_fault_leaves_no_space_until_it_ends(disk: Path) -> None:
     assert [path.name for path in disk.iterdir() if path.is_file()] == ["log"]
 
 
-def test_mounting_a_disk_again_keeps_its_content(disk: Path, tmp_path: Path) -> None:
+def test_node_disk_keeps_its_content_when_mounted_again(disk: Path, tmp_path: Path) -> None:
     append(disk / "log", 10)
     mount_disk(tmp_path / "disk.img", disk, 64 * 2**20)
     unmount_below(tmp_path)
@@ -73,7 +73,7 @@ def test_mounting_a_disk_again_keeps_its_content(disk: Path, tmp_path: Path) -> 
     assert (disk / "log").stat().st_size == 10
 
 
-def test_disk_fault_is_rejected_on_the_disk_of_the_machine(tmp_path: Path) -> None:
+def test_chaos_disk_fault_is_rejected_on_the_disk_of_the_machine(tmp_path: Path) -> None:
     with (
         pytest.raises(ExperimentError, match="has no separate disk"),
         inject(FAULTS["disk-full"], target_on(tmp_path), Random(1)),

@@ -1,4 +1,4 @@
-"""A member that is added to a closed set is noticed by mypy wherever it must be handled."""
+"""mypy reports every place that does not handle a new member of a closed set."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from pathlib import Path
 ROOT = Path(__file__).parents[2]
 
 
-def test_mypy_notices_a_filter_that_is_not_applied(tmp_path: Path) -> None:
-    """The pipeline is checked against the models with a filter more: mypy names the line that lacks it."""
+def test_mypy_reports_filter_that_is_not_applied(tmp_path: Path) -> None:
+    """Check the filter pipeline with mypy against models that contain an additional filter."""
     api = tmp_path / "fractus_core"
     subprocess.run(["cp", "-r", ROOT / "core/fractus_core", api], check=True)
     policies = api / "api/policies.py"
@@ -21,5 +21,5 @@ def test_mypy_notices_a_filter_that_is_not_applied(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "mypy", "--config-file", ROOT / "pyproject.toml", "--follow-imports=silent"]
     command += ["--cache-dir", tmp_path / "cache", pipeline]
     paths = ":".join(map(str, (tmp_path, ROOT / "services")))
-    found = subprocess.run(command, env={"MYPYPATH": paths}, capture_output=True, text=True, cwd=tmp_path, check=False)
-    assert 'Argument 1 to "assert_never" has incompatible type "Literal[\'mosaic\']"' in found.stdout, found.stdout
+    result = subprocess.run(command, env={"MYPYPATH": paths}, capture_output=True, text=True, cwd=tmp_path, check=False)
+    assert 'Argument 1 to "assert_never" has incompatible type "Literal[\'mosaic\']"' in result.stdout, result.stdout

@@ -1,4 +1,4 @@
-"""A cluster's nodes on the simulated radio: real namespaces, devices, vehicle and radio process, without Kubernetes."""
+"""Nodes of the embedded cluster on the simulated radio: real namespaces, devices, vehicle and radio, without Kubernetes."""
 
 from __future__ import annotations
 
@@ -59,13 +59,13 @@ def spec_of(edge_lat: float) -> ClusterSpec:
 
 
 def _udp() -> socket.socket:
-    found = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    found.settimeout(1.0)
-    return found
+    udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    udp.settimeout(1.0)
+    return udp
 
 
 class Site:
-    """Two wired nodes with their radio."""
+    """A drone and an edge node with network namespaces and a simulated radio."""
 
     def __init__(self, edge_lat: float) -> None:
         self.spec = spec_of(edge_lat)
@@ -75,7 +75,7 @@ class Site:
         self.radio = Radio(NAME, self.state)
         network.wire_control_plane(self.wiring)
         self.wire()
-        self._over = threading.Event()
+        self._closed = threading.Event()
         self._echoes = list[threading.Thread]()
         for node in (None, "edge-1"):
             self.echo(node)
@@ -96,40 +96,42 @@ class Site:
             self.run(node, "ip", "link", "set", "wlan0", "up")
 
     def ping(self, node: str, address: str, count: int = 1) -> list[float]:
-        """Round-trip times of the datagrams that come back, ms."""
-        found = []
-        with in_namespace(self.wiring.namespace_path(node), _udp) as asking:
+        """Return the round-trip times of echoed datagrams, in ms. Lost datagrams are omitted."""
+        round_trips_ms = []
+        with in_namespace(self.wiring.namespace_path(node), _udp) as client:
             for number in range(count):
                 begun = time.monotonic()
                 with contextlib.suppress(OSError):
-                    asking.sendto(b"%d" % number, (address, PORT))
-                    while asking.recv(100) != b"%d" % number:
+                    client.sendto(b"%d" % number, (address, PORT))
+                    while client.recv(100) != b"%d" % number:
                         pass
-                    found.append((time.monotonic() - begun) * 1e3)
-        return found
+                    round_trips_ms.append((time.monotonic() - begun) * 1e3)
+        return round_trips_ms
 
     def echo(self, node: str | None) -> None:
-        """Send back what comes in a namespace, until the end."""
-        answering = in_namespace(self.wiring.namespace_path(node), _udp)
-        answering.bind(("", PORT))
+        """Echo datagrams in the namespace of a node (None: of the control plane) until the site is closed."""
+        server = in_namespace(self.wiring.namespace_path(node), _udp)
+        server.bind(("", PORT))
 
-        def answer() -> None:
-            with answering:
-                while not self._over.is_set():
+        def serve() -> None:
+            with server:
+                while not self._closed.is_set():
                     with contextlib.suppress(OSError):
-                        data, sender = answering.recvfrom(100)
-                        answering.sendto(data, sender)
+                        data, sender = server.recvfrom(100)
+                        server.sendto(data, sender)
 
-        self._echoes.append(threading.Thread(target=answer))
+        self._echoes.append(threading.Thread(target=serve))
         self._echoes[-1].start()
 
-    def until(self, node: str, address: str, *, answers: bool, timeout_s: float = 30.0) -> None:
+    def wait_until_reachable(self, node: str, address: str, *, reachable: bool, timeout_s: float = 30.0) -> None:
+        """Wait until an address responds to a node, or until it no longer responds."""
         deadline = time.monotonic() + timeout_s
-        while bool(self.ping(node, address)) != answers:
-            assert time.monotonic() < deadline, f"{address} {'does not answer' if answers else 'still answers'}"
+        while bool(self.ping(node, address)) != reachable:
+            state = "does not respond" if reachable else "still responds"
+            assert time.monotonic() < deadline, f"{address} {state} to {node}"
 
     def close(self) -> None:
-        self._over.set()
+        self._closed.set()
         for thread in self._echoes:
             thread.join()
         self.branch.kill_all()
@@ -140,50 +142,50 @@ class Site:
 @pytest.fixture
 def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> Iterator[Site]:
     monkeypatch.setenv("FRACTUS_STATE", str(tmp_path))
-    found = Site(getattr(request, "param", 50.0005))
-    yield found
-    found.close()
+    site = Site(getattr(request, "param", 50.0005))
+    yield site
+    site.close()
 
 
-def test_a_mobile_uplink_delays_and_is_cut_like_a_wire(site: Site) -> None:
+def test_cluster_radio_delays_and_cuts_mobile_uplink(site: Site) -> None:
     hub = str(site.wiring.addressing.control_plane)
     assert min(site.ping("drone-1", hub, 4)) >= 120.0
     assert min(site.ping("edge-1", hub, 8)) < 120.0
     site.nodes[0].cut_link()
     assert network.links_cut(site.wiring) == {0}
-    site.until("drone-1", hub, answers=False)
+    site.wait_until_reachable("drone-1", hub, reachable=False)
     site.wire()
     assert network.links_cut(site.wiring) == set()
-    site.until("drone-1", hub, answers=True)
+    site.wait_until_reachable("drone-1", hub, reachable=True)
     site.radio.command(uplink="drone-1", off=True)
-    site.until("drone-1", hub, answers=False)
+    site.wait_until_reachable("drone-1", hub, reachable=False)
     site.radio.command(uplink="drone-1", off=False)
-    site.until("drone-1", hub, answers=True)
+    site.wait_until_reachable("drone-1", hub, reachable=True)
 
 
-def test_neighbours_hear_each_other_until_a_fault(site: Site) -> None:
+def test_cluster_radio_connects_nodes_in_range_until_fault(site: Site) -> None:
     site.address_wifi()
-    site.until("drone-1", "169.254.9.2", answers=True)
-    for fault, cure in (({"silent": True}, {"silent": False}), ({"loss_db": 90}, {"loss_db": 0})):
+    site.wait_until_reachable("drone-1", "169.254.9.2", reachable=True)
+    for fault, repair in (({"silent": True}, {"silent": False}), ({"loss_db": 90}, {"loss_db": 0})):
         site.radio.command(station="edge-1", **fault)
-        site.until("drone-1", "169.254.9.2", answers=False)
-        site.radio.command(station="edge-1", **cure)
-        site.until("drone-1", "169.254.9.2", answers=True)
+        site.wait_until_reachable("drone-1", "169.254.9.2", reachable=False)
+        site.radio.command(station="edge-1", **repair)
+        site.wait_until_reachable("drone-1", "169.254.9.2", reachable=True)
 
 
 @pytest.mark.parametrize("site", [50.002], indirect=True)
-def test_the_radio_knows_where_the_vehicle_is(site: Site) -> None:
-    """The edge node stands 222 m from the drone's home as the file has it, and the vehicle is put beside it."""
+def test_cluster_radio_uses_position_of_vehicle(site: Site) -> None:
+    """The edge node is 222 m from home, out of range. Then the vehicle starts at another home, next to the edge node."""
     site.address_wifi()
     assert not site.ping("drone-1", "169.254.9.2", 2)
     moved = site.spec.model_dump(by_alias=True)
     moved["nodes"][0]["hardware"]["vehicle"]["home"] = {"lat": 50.0019, "lon": 4.0, "alt": 25}
-    elsewhere = parse_spec(moved, source="test")
-    Node(elsewhere.nodes[0], 0, site.wiring, site.state, site.branch).start_hardware()
-    site.until("drone-1", "169.254.9.2", answers=True, timeout_s=60.0)
+    moved_spec = parse_spec(moved, source="test")
+    Node(moved_spec.nodes[0], 0, site.wiring, site.state, site.branch).start_hardware()
+    site.wait_until_reachable("drone-1", "169.254.9.2", reachable=True, timeout_s=60.0)
 
 
-def test_a_radio_that_died_is_replaced(site: Site) -> None:
+def test_cluster_radio_is_replaced_after_its_process_was_killed(site: Site) -> None:
     hub = str(site.wiring.addressing.control_plane)
     record = read_record(site.state.process("radio"))
     assert record is not None
@@ -198,5 +200,5 @@ def test_a_radio_that_died_is_replaced(site: Site) -> None:
     with pytest.raises(ClusterError, match="radio does not run"):
         site.radio.command(uplink="drone-1", off=True)
     site.wire()
-    site.until("drone-1", hub, answers=True)
+    site.wait_until_reachable("drone-1", hub, reachable=True)
     assert "default via" in site.run("drone-1", "ip", "route")

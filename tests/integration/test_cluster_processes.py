@@ -1,4 +1,4 @@
-"""Processes of a cluster: known again, killed for certain, restarted, and locked against each other."""
+"""Processes of the embedded cluster: records, kills, supervisor, locks and certificates."""
 
 from __future__ import annotations
 
@@ -23,23 +23,23 @@ from fractus_cluster.processes import ProcessRecord, kill, read_record, record_o
 ENVIRONMENT = {"PATH": os.environ["PATH"]}
 
 
-def until(condition: Callable[[], bool], what: str, timeout_s: float = 20.0) -> None:
-    """Wait for a condition."""
+def wait_until(condition: Callable[[], bool], description: str, timeout_s: float = 20.0) -> None:
+    """Wait for a condition. Fail with its description after the timeout."""
     deadline = time.monotonic() + timeout_s
     while not condition():
-        assert time.monotonic() < deadline, f"waited {timeout_s:.0f} s for {what}"
+        assert time.monotonic() < deadline, f"waited {timeout_s:.0f} s for {description}"
         threading.Event().wait(0.02)
 
 
 @pytest.fixture
 def sleeper(tmp_path: Path) -> Iterator[ProcessRecord]:
-    """A process of ours that does nothing."""
+    """A process that sleeps."""
     record = spawn(["sleep", "300"], log=tmp_path / "log", env=ENVIRONMENT)
     yield record
     kill(record)
 
 
-def test_record_survives_being_stored(sleeper: ProcessRecord, tmp_path: Path) -> None:
+def test_process_record_is_stored_and_read_back(sleeper: ProcessRecord, tmp_path: Path) -> None:
     write_record(tmp_path / "record.json", sleeper)
     stored = read_record(tmp_path / "record.json")
     assert stored == sleeper
@@ -47,26 +47,26 @@ def test_record_survives_being_stored(sleeper: ProcessRecord, tmp_path: Path) ->
     assert stored.alive
 
 
-def test_broken_record_is_none(tmp_path: Path) -> None:
+def test_broken_process_record_is_ignored(tmp_path: Path) -> None:
     for text in ("", "{", '{"pid": 1}', "[]"):
         (tmp_path / "record.json").write_text(text)
         assert read_record(tmp_path / "record.json") is None
 
 
-def test_kill_ends_the_process(sleeper: ProcessRecord) -> None:
+def test_process_ends_when_killed(sleeper: ProcessRecord) -> None:
     kill(sleeper)
     assert not sleeper.alive
 
 
 @pytest.mark.parametrize("change", [{"start_ticks": 1}, {"boot_id": "another"}])
-def test_another_process_with_the_same_pid_is_left_alone(sleeper: ProcessRecord, change: dict[str, object]) -> None:
-    stranger = replace(sleeper, **change)  # type: ignore[arg-type]
-    assert not stranger.alive
-    kill(stranger)
+def test_process_with_reused_pid_is_not_killed(sleeper: ProcessRecord, change: dict[str, object]) -> None:
+    ended = replace(sleeper, **change)  # type: ignore[arg-type]
+    assert not ended.alive
+    kill(ended)
     assert sleeper.alive
 
 
-def test_process_is_in_a_session_of_its_own(sleeper: ProcessRecord) -> None:
+def test_process_has_separate_session(sleeper: ProcessRecord) -> None:
     assert os.getsid(sleeper.pid) == sleeper.pid
     assert os.getsid(sleeper.pid) != os.getsid(0)
 
@@ -99,7 +99,7 @@ def supervisor(tmp_path: Path) -> Iterator[Callable[..., subprocess.Popen[bytes]
         process.wait(timeout=10)
 
 
-def test_supervisor_restarts_what_ends_ever_more_slowly(
+def test_supervisor_restarts_crashing_unit_with_growing_delay(
     supervisor: Callable[..., subprocess.Popen[bytes]], tmp_path: Path
 ) -> None:
     supervisor(crashing="date +%s%N", steady="echo up; exec sleep 300")
@@ -108,45 +108,55 @@ def test_supervisor_restarts_what_ends_ever_more_slowly(
         log = tmp_path / "crashing.log"
         return [int(line) for line in log.read_text().split()] if log.exists() else []
 
-    until(lambda: len(starts()) >= 4, "four starts")
+    wait_until(lambda: len(starts()) >= 4, "four starts")
     gaps_ns = [after - before for before, after in zip(starts(), starts()[1:4], strict=False)]
     assert all(gap_ns > least_s * 1e9 for gap_ns, least_s in zip(gaps_ns, (0.19, 0.39, 0.79), strict=True)), gaps_ns
     assert (tmp_path / "steady.log").read_text() == "up\n"
 
 
-def test_a_unit_waits_for_the_file_that_it_needs(
+def test_supervisor_starts_unit_when_its_required_file_exists(
     supervisor: Callable[..., subprocess.Popen[bytes]], tmp_path: Path
 ) -> None:
     supervisor(patient="echo up; exec sleep 300", other="echo up; exec sleep 300")
-    until(lambda: (tmp_path / "other.log").exists() and (tmp_path / "other.log").read_text() == "up\n", "the other")
+    wait_until(
+        lambda: (tmp_path / "other.log").exists() and (tmp_path / "other.log").read_text() == "up\n",
+        "the unit without a required file",
+    )
     assert not (tmp_path / "patient.log").exists()
     (tmp_path / "permission").touch()
-    until(lambda: (tmp_path / "patient.log").exists() and (tmp_path / "patient.log").read_text() == "up\n", "it")
+    wait_until(
+        lambda: (tmp_path / "patient.log").exists() and (tmp_path / "patient.log").read_text() == "up\n",
+        "the unit with a required file",
+    )
 
 
-def test_units_die_with_their_supervisor(supervisor: Callable[..., subprocess.Popen[bytes]], tmp_path: Path) -> None:
+def test_units_end_when_supervisor_is_killed(
+    supervisor: Callable[..., subprocess.Popen[bytes]], tmp_path: Path
+) -> None:
     process = supervisor(unit="echo $$; exec sleep 300")
     log = tmp_path / "unit.log"
-    until(lambda: log.exists() and log.read_text().strip().isdigit(), "the unit's start")
+    wait_until(lambda: log.exists() and log.read_text().strip().isdigit(), "the unit's start")
     record = record_of(int(log.read_text()))
     assert record is not None
     process.kill()
-    until(lambda: not record.alive, "the unit's end")
+    wait_until(lambda: not record.alive, "the unit's end")
 
 
-def test_supervisor_ends_on_request(supervisor: Callable[..., subprocess.Popen[bytes]], tmp_path: Path) -> None:
+def test_supervisor_exits_with_0_on_sigterm(supervisor: Callable[..., subprocess.Popen[bytes]], tmp_path: Path) -> None:
     process = supervisor(unit="echo up; exec sleep 300")
-    until(lambda: (tmp_path / "unit.log").exists() and (tmp_path / "unit.log").stat().st_size > 0, "the unit's start")
+    wait_until(
+        lambda: (tmp_path / "unit.log").exists() and (tmp_path / "unit.log").stat().st_size > 0, "the unit's start"
+    )
     process.send_signal(signal.SIGTERM)
     assert process.wait(timeout=10) == 0
 
 
-def test_supervisor_goes_on_when_a_program_is_missing(
+def test_supervisor_starts_other_units_if_a_program_is_missing(
     supervisor: Callable[..., subprocess.Popen[bytes]], tmp_path: Path
 ) -> None:
     units = [
-        {"name": "gone", "argv": ["/nonexistent"], "log": str(tmp_path / "gone.log"), "env": {}},
-        {"name": "here", "argv": ["/bin/echo", "up"], "log": str(tmp_path / "here.log"), "env": {}},
+        {"name": "missing", "argv": ["/nonexistent"], "log": str(tmp_path / "missing.log"), "env": {}},
+        {"name": "present", "argv": ["/bin/echo", "up"], "log": str(tmp_path / "present.log"), "env": {}},
     ]
     process = supervisor()
     process.kill()
@@ -155,12 +165,13 @@ def test_supervisor_goes_on_when_a_program_is_missing(
     argv = [sys.executable, "-m", "fractus_cluster.supervisor", str(tmp_path / "units.json")]
     with subprocess.Popen(argv, stdout=subprocess.DEVNULL) as second:
         try:
-            until(lambda: (tmp_path / "here.log").exists() and "up" in (tmp_path / "here.log").read_text(), "here")
+            log = tmp_path / "present.log"
+            wait_until(lambda: log.exists() and "up" in log.read_text(), "the unit whose program exists")
         finally:
             second.kill()
 
 
-def test_lock_is_held_by_one_and_freed_by_death(tmp_path: Path) -> None:
+def test_lock_is_exclusive_and_released_when_holder_is_killed(tmp_path: Path) -> None:
     script = (
         "import sys, time; from pathlib import Path; from fractus_cluster.locking import locked\n"
         "with locked(Path(sys.argv[1]), timeout_s=5, what='x'):\n    print('held', flush=True); time.sleep(300)"
@@ -170,13 +181,13 @@ def test_lock_is_held_by_one_and_freed_by_death(tmp_path: Path) -> None:
     with subprocess.Popen(argv, stdout=subprocess.PIPE, text=True) as holder:
         assert holder.stdout is not None
         assert holder.stdout.readline() == "held\n"
-        said: list[str] = []
+        reports: list[str] = []
         with (
             pytest.raises(ClusterError, match="someone builds"),
-            locked(path, timeout_s=0.3, what="someone builds", report=said.append),
+            locked(path, timeout_s=0.3, what="someone builds", report=reports.append),
         ):
-            pytest.fail("two hold the lock")
-        assert said == ["waiting: someone builds"]
+            pytest.fail("two processes hold the lock")
+        assert reports == ["waiting: someone builds"]
         holder.kill()
         holder.wait(timeout=10)
     with locked(path, timeout_s=5, what="no one", remove=True):
@@ -184,7 +195,7 @@ def test_lock_is_held_by_one_and_freed_by_death(tmp_path: Path) -> None:
     assert not path.exists()
 
 
-def test_certificates_are_made_once_and_again_for_other_names(tmp_path: Path) -> None:
+def test_certificate_is_reused_for_same_names_and_reissued_for_other_names(tmp_path: Path) -> None:
     authority = Authority(tmp_path)
     first = authority.issue("server", common_name="s", alternative_names=("a.example",)).certificate.read_bytes()
     again = Authority(tmp_path).issue("server", common_name="s", alternative_names=("a.example",))

@@ -1,4 +1,4 @@
-"""The registry of one push, against buildah itself."""
+"""Temporary registry that receives one push of buildah."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ from fractus_cluster.images.receiver import receiving
 @pytest.fixture
 def layout(tmp_path: Path) -> Layout:
     """An empty layout."""
-    made = Layout(tmp_path / "layout")
-    made.create()
-    return made
+    layout = Layout(tmp_path / "layout")
+    layout.create()
+    return layout
 
 
 def buildah(*arguments: str) -> str:
-    """Run buildah. Tests use images of their own names only."""
-    done = subprocess.run(["buildah", *arguments], capture_output=True, text=True, timeout=60, check=True)
-    return done.stdout.strip()
+    """Run buildah. Each test uses separate image names, because the storage is shared."""
+    result = subprocess.run(["buildah", *arguments], capture_output=True, text=True, timeout=60, check=True)
+    return result.stdout.strip()
 
 
 @pytest.fixture
 def image(tmp_path: Path) -> Iterator[str]:
-    """A small image in buildah's storage, which other tests use at the same time."""
+    """A small image in buildah's storage."""
     name = f"localhost/fractus-test/receiver:{uuid.uuid4().hex}"
     container = buildah("from", "scratch")
     try:
@@ -46,7 +46,7 @@ def image(tmp_path: Path) -> Iterator[str]:
 
 
 @pytest.mark.root
-def test_takes_an_image_of_buildah_uncompressed(layout: Layout, image: str) -> None:
+def test_receiver_stores_image_of_buildah_uncompressed(layout: Layout, image: str) -> None:
     with receiving(layout) as address:
         buildah("push", "--quiet", "--tls-verify=false", image, f"docker://{address}/{image}")
     received = layout.image(image)
@@ -59,7 +59,7 @@ def test_takes_an_image_of_buildah_uncompressed(layout: Layout, image: str) -> N
 
 
 @pytest.mark.root
-def test_second_push_sends_no_layer(layout: Layout, image: str) -> None:
+def test_receiver_gets_no_layer_again_in_second_push(layout: Layout, image: str) -> None:
     with receiving(layout) as address:
         buildah("push", "--quiet", "--tls-verify=false", image, f"docker://{address}/{image}")
     written = {path.name: path.stat().st_mtime_ns for path in (layout.path / "blobs" / "sha256").iterdir()}
@@ -70,21 +70,21 @@ def test_second_push_sends_no_layer(layout: Layout, image: str) -> None:
 
 
 def upload(address: str, content: bytes, digest: str) -> int:
-    """Upload a blob the way a client does, and return the last status."""
+    """Upload a blob like a registry client, and return the last status."""
     connection = http.client.HTTPConnection(address, timeout=10)
     connection.request("POST", "/v2/a/b/blobs/uploads/")
     begun = connection.getresponse()
     begun.read()
-    place = begun.headers["Location"]
-    connection.request("PATCH", place, body=content)
+    location = begun.headers["Location"]
+    connection.request("PATCH", location, body=content)
     connection.getresponse().read()
-    connection.request("PUT", f"{place}?digest={digest}")
+    connection.request("PUT", f"{location}?digest={digest}")
     status = connection.getresponse().status
     connection.close()
     return status
 
 
-def test_refuses_what_is_not_what_it_claims(layout: Layout) -> None:
+def test_receiver_refuses_blob_with_wrong_digest(layout: Layout) -> None:
     with receiving(layout) as address:
         assert upload(address, b"content", "sha256:" + "0" * 64) == 400
         digest = "sha256:" + hashlib.sha256(b"content").hexdigest()
@@ -92,7 +92,7 @@ def test_refuses_what_is_not_what_it_claims(layout: Layout) -> None:
         assert layout.blob(digest).read_bytes() == b"content"
 
 
-def test_knows_compressed_layers_by_their_content(layout: Layout) -> None:
+def test_receiver_finds_compressed_layer_by_digest_of_its_content(layout: Layout) -> None:
     packed = gzip.compress(b"layer" * 1000)
     plain = "sha256:" + hashlib.sha256(b"layer" * 1000).hexdigest()
     with receiving(layout) as address:

@@ -8,7 +8,7 @@ import shlex
 from pathlib import Path
 
 import pytest
-from browser import serving, told_to_pages
+from browser import serving, wait_for_events
 from control_plane import wait_for
 from docs_pages import ROOT, shell_lines
 from docs_shell import Shell
@@ -124,4 +124,4 @@ def test_view_shows_the_cluster_of_kubeconfig(world: World, monkeypatch: pytest.
     line, *_ = (line for line in shell_lines("docs/view.md") if line.startswith("fractus view"))
     monkeypatch.setenv("KUBECONFIG", str(world.plane.kubeconfig))
     with serving(*shlex.split(line, comments=True)[2:]) as address:
-        told_to_pages(address, '"drone-1"', '"edge-3"', '"base"')
+        wait_for_events(address, '"drone-1"', '"edge-3"', '"base"')

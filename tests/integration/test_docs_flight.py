@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 import yaml
-from browser import serving, told_to_pages
+from browser import serving, wait_for_events
 from docs_pages import ROOT, shell_lines, shown_file
 from docs_shell import Shell
 from fractus_cli.standalone import StandalonePki
@@ -158,4 +158,4 @@ def test_view_shows_the_recordings(flown: Flown, line: str, monkeypatch: pytest.
         found.touch()
     words = [word.replace("/var/lib/fractus/recordings", str(folder)) for word in shlex.split(line, comments=True)]
     with serving(*words[2:]) as address:
-        told_to_pages(address, '"drone-1"', '"verdict"', "InsideExclusionZone", '"picture"')
+        wait_for_events(address, '"drone-1"', '"verdict"', "InsideExclusionZone", '"picture"')

@@ -22,7 +22,7 @@ SPEEDUP = "2"
 
 
 @pytest.mark.timeout(320)
-def test_violating_program_is_corrected_refused_and_flown_home(tmp_path: Path):
+def test_scenario_field_violating_program_is_corrected_refused_and_flown_home(tmp_path: Path):
     link = f"tcp:127.0.0.1:{free_port()}"
     parameters = [part for setting in SLOW for part in ("--param", setting)]
     options = (
@@ -59,7 +59,7 @@ def test_violating_program_is_corrected_refused_and_flown_home(tmp_path: Path):
         assert (out / name).stat().st_size > 1000
 
 
-def test_missing_autopilot_is_reported_in_one_line(tmp_path: Path):
+def test_scenario_field_missing_autopilot_is_reported_in_one_line(tmp_path: Path):
     link = f"tcp:127.0.0.1:{free_port()}"
     process = subprocess.run(
         [sys.executable, "-m", "fractus_sim.scenarios.field", "--out", str(tmp_path), "--autopilot", link],

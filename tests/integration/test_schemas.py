@@ -1,5 +1,7 @@
-"""What the charts and the operator make, against the schemas of each version of Kubernetes: of a field that it does not know, an
-API server says nothing and drops it."""
+"""Objects of the charts and the operator match the schemas of each supported version of Kubernetes.
+
+An API server drops unknown fields without a message, so only a strict schema check finds them.
+"""
 
 from __future__ import annotations
 
@@ -18,44 +20,44 @@ from kubernetes_validate.utils import SchemaNotFoundError, ValidationError
 Body = dict[str, Any]
 
 VERSIONS = ("1.32", *KUBERNETES_VERSIONS)
-"""The oldest that docs/clusters.md promises, and those that clusters are built of."""
+"""The oldest supported version (docs/clusters.md), and the versions of embedded clusters."""
 
-ELSEWHERE = {"fractus.dev", "monitoring.coreos.com"}
-"""Groups of kinds that are not of Kubernetes: ours are the examples', which API servers take in other tests."""
+OTHER_GROUPS = {"fractus.dev", "monitoring.coreos.com"}
+"""API groups that Kubernetes has no schemas for. Other tests apply objects of `fractus.dev` to an API server."""
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "operator" / "expected"
 
 
 @cache
-def made(what: str) -> tuple[Body, ...]:
-    """Objects that a version is asked about."""
-    match what:
+def rendered(source: str) -> tuple[Body, ...]:
+    """Return the objects of a chart or of the operator's golden files."""
+    match source:
         case "fractus with everything":
             return tuple(render(f"--values={EVERYTHING['fractus']}", "--is-upgrade"))
         case "fractus-demo":
-            return tuple(render(f"--values={EVERYTHING[what]}", chart=what))
+            return tuple(render(f"--values={EVERYTHING[source]}", chart=source))
         case "operator":
             return tuple(yaml.safe_load(path.read_text()) for path in sorted(GOLDEN.glob("*.yaml")))
         case _:
-            return tuple(render(chart=what))
+            return tuple(render(chart=source))
 
 
 @pytest.mark.parametrize("version", VERSIONS)
-@pytest.mark.parametrize("what", ["fractus", "fractus with everything", "fractus-crds", "fractus-demo", "operator"])
-def test_rendered_objects_match_kubernetes_schemas(what: str, version: str) -> None:
-    wrong = []
-    asked = 0
-    for body in made(what):
+@pytest.mark.parametrize("source", ["fractus", "fractus with everything", "fractus-crds", "fractus-demo", "operator"])
+def test_rendered_objects_match_kubernetes_schemas(source: str, version: str) -> None:
+    errors = []
+    validated = 0
+    for body in rendered(source):
         name = f"{body['kind']} {body['metadata']['name']}"
         try:
             assert validate(body, version, strict=True) == version
-            asked += 1
+            validated += 1
         except SchemaNotFoundError:
-            assert body["apiVersion"].split("/")[0] in ELSEWHERE, f"Kubernetes {version} has no {name}"
+            assert body["apiVersion"].split("/")[0] in OTHER_GROUPS, f"Kubernetes {version} has no {name}"
         except ValidationError as error:
-            wrong.append(f"{name}: {error.json_path}: {error.message}")
-    assert not wrong, "\n".join(wrong)
-    assert asked
+            errors.append(f"{name}: {error.json_path}: {error.message}")
+    assert not errors, "\n".join(errors)
+    assert validated
 
 
 def test_schema_tests_include_every_chart() -> None:
@@ -64,7 +66,7 @@ def test_schema_tests_include_every_chart() -> None:
 
 @pytest.mark.parametrize("version", VERSIONS)
 def test_schema_validation_detects_unknown_field_and_wrong_type(version: str) -> None:
-    deployment = next(body for body in made("fractus") if body["kind"] == "Deployment")
+    deployment = next(body for body in rendered("fractus") if body["kind"] == "Deployment")
     misspelled = copy.deepcopy(deployment)
     of_another_type = copy.deepcopy(deployment)
     misspelled["spec"]["template"]["spec"]["containers"][0]["readynessProbe"] = {}

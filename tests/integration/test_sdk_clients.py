@@ -25,7 +25,7 @@ WAIT_S = 15.0
 
 @dataclass
 class Stage:
-    """A running drone service and what a client needs to reach it."""
+    """Fake services of a drone on a gRPC server, and the endpoint for clients."""
 
     authority: Authority
     drone: Drone
@@ -65,7 +65,7 @@ async def test_driver_flies_and_returns_control(stage: Stage) -> None:
         assert control.mission_complete
     assert result.complete
     assert not result.corrected
-    assert result.target.alt == 20.0, "the target of the first message holds for the last one"
+    assert result.target.alt == 20.0, "the result lacks the target, which only the first message contains"
     assert steps == [2.0, 1.0, 0.0]
     assert stage.drone.calls == ["GetControl", "Arm", "Goto", "ReturnControl"]
     assert set(stage.drone.identities) == {NAVIGATOR}
@@ -77,7 +77,7 @@ async def test_every_unary_call_has_a_deadline(stage: Stage) -> None:
         await drone.arm(timeout_s=2.0)
         await drone.position()
     # Arming may wait for an autopilot that is not ready yet.
-    assert [left is not None and 0 < left < most for left, most in zip(stage.drone.deadlines, (60.5, 2.5, 3.5), strict=True)] == [
+    assert [deadline_s is not None and 0 < deadline_s < limit_s for deadline_s, limit_s in zip(stage.drone.deadlines, (60.5, 2.5, 3.5), strict=True)] == [
         True, True, True,
     ]  # fmt: skip
 
@@ -108,7 +108,7 @@ async def test_refusal_contains_code_reason_and_policies(stage: Stage) -> None:
     async with stage.client() as drone, drone.control():
         with pytest.raises(fractus.PolicyDenied) as refusal:
             await drone.goto(40.02, 22.0, 20.0)
-        assert (await drone.goto(40.0, 22.0, 20.0)).complete, "the flight goes on"
+        assert (await drone.goto(40.0, 22.0, 20.0)).complete, "the flight does not continue after a refusal"
     assert refusal.value.code == "InsideExclusionZone"
     assert refusal.value.policies == ("no-fly-hospital",)
     assert "exclusion zone hospital (by no-fly-hospital)" in str(refusal.value)
@@ -164,7 +164,7 @@ async def test_control_loss_interrupts_other_work_in_the_block(stage: Stage) -> 
 
 async def test_control_loss_can_be_caught_in_the_block(stage: Stage) -> None:
     stage.drone.release = asyncio.Event()
-    seen: list[str] = []
+    reasons: list[str] = []
     async with stage.client() as drone:
         with pytest.raises(fractus.ControlLost):
             async with drone.control():
@@ -175,14 +175,14 @@ async def test_control_loss_can_be_caught_in_the_block(stage: Stage) -> None:
                 try:
                     await drone.goto(40.0, 22.0, 20.0)
                 except fractus.ControlLost as loss:
-                    seen.append(str(loss))
-    assert seen == ["revoked"]
+                    reasons.append(str(loss))
+    assert reasons == ["revoked"]
 
 
 async def test_control_progress_reports_reason_of_wait(stage: Stage) -> None:
-    told: list[str] = []
-    async with stage.client() as drone, drone.control(progress=told.append):
-        assert told == ["the autopilot is not ready to arm: it has no home yet"]
+    reasons: list[str] = []
+    async with stage.client() as drone, drone.control(progress=reasons.append):
+        assert reasons == ["the autopilot is not ready to arm: it has no home yet"]
 
 
 async def visit(drone: Mobility, control: fractus.Control) -> None:
@@ -232,11 +232,11 @@ async def test_run_requests_lost_control_again(stage: Stage, monkeypatch: pytest
 
 async def test_mission_continues_with_interrupted_waypoint(stage: Stage) -> None:
     stage.drone.waypoints_reached = 1
-    seen: list[tuple[int, int]] = []
+    progress: list[tuple[int, int]] = []
     async with stage.client() as drone, drone.control():
-        refused = await drone.mission().fly(lambda at: seen.append((at.number, at.count)))
+        refused = await drone.mission().fly(lambda step: progress.append((step.number, step.count)))
     assert refused == {}
-    assert sorted(set(seen)) == [(2, 3), (3, 3)]
+    assert sorted(set(progress)) == [(2, 3), (3, 3)]
     assert stage.drone.waypoints_reached == 3
 
 
@@ -265,7 +265,7 @@ async def test_mission_pauses_and_resumes(stage: Stage) -> None:
         stage.drone.release.set()
         mission.resume()
         assert await flight == {}
-    assert len(stage.drone.targets) == 4, "the leg that was stopped is begun again"
+    assert len(stage.drone.targets) == 4, "the interrupted leg is not flown again"
 
 
 async def test_mission_without_control_is_refused(stage: Stage) -> None:
@@ -323,7 +323,7 @@ async def test_completed_mission_raises_mission_complete(stage: Stage) -> None:
     async with stage.client() as drone:
         with pytest.raises(fractus.MissionComplete):
             async with drone.control():
-                pytest.fail("no one drives after the mission")
+                pytest.fail("control was granted after the mission")
 
 
 async def test_flight_survives_service_restart(stage: Stage) -> None:
@@ -374,9 +374,9 @@ async def test_call_waits_for_restarting_service_up_to_its_limit(stage: Stage) -
 
 
 async def test_slow_tls_handshake_succeeds(stage: Stage) -> None:
-    """A node with a busy processor takes longer over a handshake than a call waits between two attempts."""
+    """On a busy node, a handshake takes longer than the interval between two attempts of a call."""
 
-    async def pass_on(source: asyncio.StreamReader, sink: asyncio.StreamWriter) -> None:
+    async def forward(source: asyncio.StreamReader, sink: asyncio.StreamWriter) -> None:
         with contextlib.suppress(OSError):
             while data := await source.read(65536):
                 sink.write(data)
@@ -385,8 +385,8 @@ async def test_slow_tls_handshake_succeeds(stage: Stage) -> None:
 
     async def relay(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         await asyncio.sleep(1.5)
-        there = await asyncio.open_connection("127.0.0.1", stage.server.port)
-        await asyncio.gather(pass_on(reader, there[1]), pass_on(there[0], writer))
+        server_reader, server_writer = await asyncio.open_connection("127.0.0.1", stage.server.port)
+        await asyncio.gather(forward(reader, server_writer), forward(server_reader, writer))
 
     slow = await asyncio.start_server(relay, "127.0.0.1", 0)
     port = slow.sockets[0].getsockname()[1]
@@ -458,7 +458,7 @@ async def test_server_certificate_must_match_the_node(stage: Stage) -> None:
 
 
 @pytest.mark.parametrize(
-    ("ours", "remedy"),
+    ("trusted_files", "remedy"),
     [
         (("ca.crt",), "may not trust the authority of this component's certificate: .* FRACTUS_TLS_DIR"),
         ((), "another authority signed its certificate: correct FRACTUS_TLS_DIR"),
@@ -466,10 +466,10 @@ async def test_server_certificate_must_match_the_node(stage: Stage) -> None:
     ],
 )
 async def test_client_with_foreign_certificate_fails_with_reason(
-    stage: Stage, tmp_path: Path, ours: tuple[str, ...], remedy: str
+    stage: Stage, tmp_path: Path, trusted_files: tuple[str, ...], remedy: str
 ) -> None:
     tls = Authority().issue(tmp_path / "stranger", [x509.UniformResourceIdentifier(NAVIGATOR)])
-    for name in ours:
+    for name in trusted_files:
         (tls / name).write_bytes((stage.endpoint.tls_dir / name).read_bytes())
     async with Mobility(replace(stage.endpoint, tls_dir=tls), reconnect_timeout_s=0.3) as drone:
         with pytest.raises(fractus.Unavailable, match=remedy):
@@ -480,7 +480,7 @@ async def test_client_with_foreign_certificate_fails_with_reason(
     assert stage.drone.calls == []
 
 
-async def test_missing_certificate_file_is_named(stage: Stage, tmp_path: Path) -> None:
+async def test_missing_certificate_file_is_named_in_error(stage: Stage, tmp_path: Path) -> None:
     async with Mobility(replace(stage.endpoint, tls_dir=tmp_path / "nowhere")) as drone:
         with pytest.raises(fractus.NotConfigured, match=r"nowhere/ca\.crt"):
             await drone.position()

@@ -1,4 +1,4 @@
-"""The example's Navigator, as a process, flies a simulated vehicle through the real mobility service."""
+"""The Navigator of the example, as a process, flies a simulated vehicle through the real mobility service."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from sdk_service import Authority
 ROOT = Path(__file__).parents[2]
 EXAMPLE = ROOT / "examples" / "traffic-monitoring"
 SPEEDUP = 3.0
-"""The companion's heartbeats come once a second of real time, and the autopilot's failsafe waits 5 s of its own."""
+"""Limited by heartbeats: the service sends one per real second, and the failsafe acts after 5 s of the vehicle's time."""
 pytestmark = pytest.mark.timeout(300)
 
 
@@ -40,7 +40,7 @@ def documents(name: str) -> list[dict[str, Any]]:
 
 
 def application(waypoints: int) -> Application:
-    """The example's application, with the first waypoints of its path."""
+    """Return the application of the example, with the first waypoints of its path."""
     (body,) = documents("application.yaml")
     point = body["spec"]["components"][0]["controlPoints"][0]
     point["path"] = point["path"][:waypoints]
@@ -48,7 +48,7 @@ def application(waypoints: int) -> Application:
 
 
 def navigator_grant(application: Application) -> Grant:
-    """What the operator would grant the Navigator."""
+    """Return the Grant that the operator would compile for the Navigator."""
     placed = PlannedInstance(
         component="Navigator", instance="traffic-navigator", node="drone-1", placement="drone", role="drone"
     )
@@ -68,7 +68,7 @@ def navigator_grant(application: Application) -> Grant:
 
 
 class Stage:
-    """Vehicle, mobility service and Navigator on this machine."""
+    """Vehicle, mobility service and Navigator as processes."""
 
     def __init__(self, folder: Path, waypoints: int) -> None:
         self.folder = folder
@@ -133,13 +133,13 @@ class Stage:
         lines = self.audit.read_bytes().splitlines(keepends=True) if self.audit.exists() else []
         return [json.loads(line) for line in lines if line.endswith(b"\n")]
 
-    def wait(self, what: str, condition: Callable[[], bool], timeout_s: float = 90.0) -> None:
+    def wait(self, description: str, condition: Callable[[], bool], timeout_s: float = 90.0) -> None:
         deadline = time.monotonic() + timeout_s
         probe = subprocess.Popen(["tail", "-f", "/dev/null"])
         try:
             while not condition():
                 assert time.monotonic() < deadline, (
-                    f"no {what} in {timeout_s} s\n{self.log('navigator')}\n{self.log('service')}"
+                    f"no {description} within {timeout_s} s\n{self.log('navigator')}\n{self.log('service')}"
                 )
                 try:
                     probe.wait(0.1)
@@ -149,7 +149,8 @@ class Stage:
             probe.kill()
             probe.wait(10)
 
-    def noted(self, action: str) -> bool:
+    def is_logged(self, action: str) -> bool:
+        """Return True if the audit log contains a change of control with this action."""
         return any(e["kind"] == "control" and e["action"] == action for e in self.entries())
 
     def close(self) -> None:
@@ -159,7 +160,7 @@ class Stage:
                 process.wait(10)
 
 
-def on_stage(folder: Path, waypoints: int, speedup: float = SPEEDUP) -> Iterator[Stage]:
+def running_stage(folder: Path, waypoints: int, speedup: float = SPEEDUP) -> Iterator[Stage]:
     stage = Stage(folder, waypoints)
     try:
         stage.start_vehicle(speedup)
@@ -171,32 +172,32 @@ def on_stage(folder: Path, waypoints: int, speedup: float = SPEEDUP) -> Iterator
 
 @pytest.fixture
 def stage(tmp_path: Path) -> Iterator[Stage]:
-    """The whole path."""
-    yield from on_stage(tmp_path, 5)
+    """A mission with the whole path of the example."""
+    yield from running_stage(tmp_path, 5)
 
 
 @pytest.fixture
 def short(tmp_path: Path) -> Iterator[Stage]:
-    """The way to the first two waypoints only."""
-    yield from on_stage(tmp_path, 2)
+    """A mission with the first two waypoints only."""
+    yield from running_stage(tmp_path, 2)
 
 
 @pytest.fixture
 def slow(tmp_path: Path) -> Iterator[Stage]:
-    """The same without haste: five of the vehicle's seconds without a service send it home."""
-    yield from on_stage(tmp_path, 2, 1.0)
+    """A mission with two waypoints in real time, so that a service can restart before the failsafe acts."""
+    yield from running_stage(tmp_path, 2, 1.0)
 
 
 def calls(stage: Stage) -> list[tuple[str, str, str]]:
-    """What became of each call; one that was judged again, after a stop say, counts once."""
+    """Return method, action and code of each call. A call that was judged again, for example after a stop, counts once."""
     entries = [e for e in stage.entries() if e["kind"] == "call"]
-    each = [list(again) for _, again in itertools.groupby(entries, lambda e: (e["method"], e["args"]))]
-    return [(last["method"], last["action"], last["code"]) for *_, last in each]
+    judgements = [list(group) for _, group in itertools.groupby(entries, lambda e: (e["method"], e["args"]))]
+    return [(last["method"], last["action"], last["code"]) for *_, last in judgements]
 
 
 def test_navigator_flies_path_with_corrections_and_refusals(stage: Stage) -> None:
     stage.start_navigator()
-    stage.wait("landing", lambda: stage.noted("landed"))
+    stage.wait("landing", lambda: stage.is_logged("landed"))
 
     made = [call for call in calls(stage) if call[0] in {"SetSpeed", "Goto", "Takeoff"}]
     assert made == [
@@ -215,7 +216,7 @@ def test_navigator_flies_path_with_corrections_and_refusals(stage: Stage) -> Non
     assert "flying at 10.0 m/s: speed 12.0 m/s is above the limit of policy town-speed" in log
     assert "detour refused, continuing: the target is" in log
     assert "waypoint 3/5 reached: 50.865633, 4.680631, 50.0 m (corrected: altitude 70.0 m" in log
-    stage.wait("farewell", lambda: "control returned (mission_complete=True)" in stage.log("navigator"), 10)
+    stage.wait("return of control", lambda: "control returned (mission_complete=True)" in stage.log("navigator"), 10)
     with stage.audit.open("rb") as lines:
         assert not verify(lines).problem
 
@@ -230,28 +231,28 @@ def test_killed_navigator_continues_and_stays_after_mission(short: Stage) -> Non
     assert "control granted (control_point=1 waypoints_reached=1)" in log
     assert log.count("waypoint 1/2 reached") == 1
     assert "waypoint 2/2 reached" in log
-    assert short.noted("driver lost")
+    assert short.is_logged("driver lost")
 
     short.kill("navigator")
     short.start_navigator()
-    short.wait("word of it", lambda: "run: mission complete" in short.log("navigator"), 20)
+    short.wait("report of the complete mission", lambda: "run: mission complete" in short.log("navigator"), 20)
     assert short.processes["navigator"].poll() is None
 
 
 def test_navigator_killed_at_each_stage_completes_mission(short: Stage) -> None:
-    def begun(method: str, times: int) -> bool:
+    def has_called(method: str, times: int) -> bool:
         return [entry["method"] for entry in short.entries() if entry["kind"] == "call"].count(method) >= times
 
     stages: dict[str, Callable[[], bool]] = {
         "control": lambda: "control granted" in short.log("navigator"),
         "armed": lambda: "armed; taking off" in short.log("navigator"),
         "climb": lambda: any(e["kind"] == "state" and e["alt"] > 5 for e in short.entries()),
-        "first leg": lambda: begun("Goto", 1),
+        "first leg": lambda: has_called("Goto", 1),
         "second leg": lambda: "waypoint 1/2 reached" in short.log("navigator"),
     }
-    for stage, at in stages.items():
+    for stage, reached in stages.items():
         short.start_navigator()
-        short.wait(stage, at)
+        short.wait(stage, reached)
         short.kill("navigator")
     short.start_navigator()
     short.wait("return", lambda: "run: mission complete" in short.log("navigator"))
@@ -259,7 +260,7 @@ def test_navigator_killed_at_each_stage_completes_mission(short: Stage) -> None:
     assert log.count("waypoint 1/2 reached") == 1
     assert log.count("waypoint 2/2 reached") == 1
     assert "control granted (control_point=1 waypoints_reached=1)" in log
-    short.wait("landing", lambda: short.noted("landed"))
+    short.wait("landing", lambda: short.is_logged("landed"))
 
 
 def test_navigator_reconnects_to_killed_service(slow: Stage) -> None:
@@ -270,7 +271,7 @@ def test_navigator_reconnects_to_killed_service(slow: Stage) -> None:
     slow.wait("return", lambda: "control returned" in slow.log("navigator"))
     log = slow.log("navigator")
     assert "lost the connection to the mobility service" in log
-    assert log.count("control granted") == 1, "the same process, under the same control"
+    assert log.count("control granted") == 1, "the process requested control again"
     assert "waypoint 2/2 reached" in log
 
 
@@ -280,22 +281,22 @@ def test_sigterm_stops_navigator_and_system_flies_home(short: Stage) -> None:
     short.processes["navigator"].terminate()
     assert short.processes["navigator"].wait(10) == 0
     assert "run: stopping" in short.log("navigator")
-    short.wait("landing", lambda: short.noted("landed"))
+    short.wait("landing", lambda: short.is_logged("landed"))
 
 
 def test_telemetry_command_prints_json_lines(short: Stage) -> None:
     def read() -> list[dict[str, Any]]:
-        done = subprocess.run(
+        result = subprocess.run(
             [
                 sys.executable, "-m", "fractus_cli", "telemetry", "--node", "drone-1", "--address", short.address,
                 "--tls", str(short.folder / "node-tls"), "--interval", "0.1", "--count", "3", "-o", "json",
             ],
             capture_output=True, text=True, timeout=40, check=False,
         )  # fmt: skip
-        assert done.returncode == 0, done.stderr
-        return [json.loads(line) for line in done.stdout.splitlines()]
+        assert result.returncode == 0, result.stderr
+        return [json.loads(line) for line in result.stdout.splitlines()]
 
-    # A vehicle that the service has never heard before is heard for some seconds before it is the drone's own.
+    # The service observes a new vehicle for some seconds before it identifies it as its own.
     short.wait("position", lambda: read()[-1]["position"] is not None)
     lines = read()
     assert len(lines) == 3

@@ -15,29 +15,29 @@ from test_mobility_lost import until_mode
 
 
 def opened(rig: Rig, name: str) -> set[str]:
-    """Files and sockets that a process has open."""
-    found = set()
+    """Return the open files and sockets of a process."""
+    targets = set()
     for entry in Path(f"/proc/{rig.pid(name)}/fd").iterdir():
         try:
-            found.add(str(entry.readlink()))
+            targets.add(str(entry.readlink()))
         except FileNotFoundError:
             continue
-    return found
+    return targets
 
 
-def speaks_to_autopilot(rig: Rig, name: str) -> bool:
-    """Whether a process has a connection to the vehicle."""
+def is_connected_to_autopilot(rig: Rig, name: str) -> bool:
+    """Return True if a process has a connection to the vehicle."""
     port = f":{int(rig.link.rpartition(':')[2]):04X}"
     lines = [line.split() for line in Path("/proc/net/tcp").read_text().splitlines()[1:]]
     return not opened(rig, name).isdisjoint(f"socket:[{line[9]}]" for line in lines if line[2].endswith(port))
 
 
-def sound(path: Path) -> bool:
+def has_valid_chain(path: Path) -> bool:
     with path.open("rb") as log:
         return not verify(log).problem
 
 
-async def flying(rig: Rig, speedup: float) -> None:
+async def start_flight(rig: Rig, speedup: float) -> None:
     rig.write_grant(grant())
     rig.start_service()
     rig.start_vehicle(speedup)
@@ -45,22 +45,22 @@ async def flying(rig: Rig, speedup: float) -> None:
 
 
 async def test_second_service_takes_over_drone_after_first_dies(rig: Rig) -> None:
-    await flying(rig, speedup=1.0)
-    assert speaks_to_autopilot(rig, "service")
+    await start_flight(rig, speedup=1.0)
+    assert is_connected_to_autopilot(rig, "service")
     rig.start_service("--driver-grace", "1", name="second")
     await rig.until_logged("second", f"mobility: waiting for {rig.directory / 'state' / 'mobility.lock'}, held by pid")
     assert f"held by pid {rig.pid('service')} on " in rig.log("second")
-    assert not speaks_to_autopilot(rig, "second")
+    assert not is_connected_to_autopilot(rig, "second")
     assert not any(path.startswith(str(rig.directory / "state")) for path in opened(rig, "second"))
     assert (await rig.telemetry()).in_air
     assert len(rig.entries("started")) == 1
 
     rig.kill("service")
-    await rig.until(lambda t: t.armed and t.controller == "system", 20, "takeover by the second")
-    assert speaks_to_autopilot(rig, "second")
+    await rig.until(lambda t: t.armed and t.controller == "system", 20, "takeover by the second service")
+    assert is_connected_to_autopilot(rig, "second")
     rig.kill("second", signal.SIGTERM)
     assert len(rig.entries("started")) == 2
-    assert sound(rig.audit)
+    assert has_valid_chain(rig.audit)
 
 
 async def test_second_service_exits_after_lock_timeout(rig: Rig) -> None:
@@ -80,34 +80,34 @@ async def test_second_service_exits_after_lock_timeout(rig: Rig) -> None:
     rig.start_service(name="fourth")
     await rig.until_logged("fourth", "waiting for")
     rig.kill("fourth", signal.SIGTERM)
-    assert rig.log("fourth").count("\n") == 1, "a waiting service ends at once"
+    assert rig.log("fourth").count("\n") == 1, "a waiting service does not exit immediately on SIGTERM"
     assert len(rig.entries("started")) == 1
 
 
-def _lock_file_replaced(rig: Rig) -> None:
+def _replace_lock_file(rig: Rig) -> None:
     fresh = rig.directory / "fresh.lock"
     fresh.touch()
     fresh.replace(rig.directory / "state" / "mobility.lock")
 
 
-def _state_gone(rig: Rig) -> None:
+def _move_state_directory(rig: Rig) -> None:
     (rig.directory / "state").rename(rig.directory / "another-mount")
 
 
-@pytest.mark.parametrize("lose", [_lock_file_replaced, _state_gone])
+@pytest.mark.parametrize("lose", [_replace_lock_file, _move_state_directory])
 async def test_service_stops_sending_when_lock_is_lost(rig: Rig, lose: Callable[[Rig], None]) -> None:
-    await flying(rig, speedup=2.0)
+    await start_flight(rig, speedup=2.0)
     entries = len(rig.entries())
     lose(rig)
     assert await rig.ended("service", 3) == 1
     assert "mobility: lock lost" in rig.log("service")
     written = [entry["kind"] for entry in rig.entries()[entries:]]
-    assert set(written) <= {"state"}, "nothing more than the flight recorder's entries until then"
+    assert set(written) <= {"state"}, "the service wrote other entries than positions after it lost the lock"
     await until_mode(rig.link, ARDUCOPTER.return_retracing)
     rig.start_service()
-    await rig.until(lambda t: t.autopilot_connected, 20, "a later service")
+    await rig.until(lambda t: t.autopilot_connected, 20, "the connection of a restarted service")
     rig.kill("service", signal.SIGTERM)
-    assert sound(rig.audit)
+    assert has_valid_chain(rig.audit)
 
 
 async def test_second_camera_service_waits_for_first(rig: Rig) -> None:
@@ -120,7 +120,7 @@ async def test_second_camera_service_waits_for_first(rig: Rig) -> None:
     taken = await capture(stub(rig, second), width=64, height=64)
     assert taken.image.name
     rig.kill("second", signal.SIGTERM)
-    assert sound(rig.directory / "camera.jsonl")
+    assert has_valid_chain(rig.directory / "camera.jsonl")
     third = rig.start_camera(description=EDGE, name="third")
     await capture(stub(rig, third), width=64, height=64)
     (rig.directory / "pictures" / "camera.lock").unlink()

@@ -60,9 +60,9 @@ def test_doctor_warns_about_pods_that_admission_would_reject_on_recreation(
     control_plane: ControlPlane, world: World, namespace: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Example: a network plugin that was installed before Fractus."""
-    bare: dict[str, object] = {"nodeName": "drone-1", "hostNetwork": True, "tolerations": [{"operator": "Exists"}]}
-    bare |= {"containers": [{"name": "cni", "image": "registry.test/cni:1"}]}
-    plugin = {"apiVersion": "v1", "kind": "Pod", "metadata": {"name": "cni", "namespace": namespace}, "spec": bare}
+    pod_spec: dict[str, object] = {"nodeName": "drone-1", "hostNetwork": True, "tolerations": [{"operator": "Exists"}]}
+    pod_spec |= {"containers": [{"name": "cni", "image": "registry.test/cni:1"}]}
+    plugin = {"apiVersion": "v1", "kind": "Pod", "metadata": {"name": "cni", "namespace": namespace}, "spec": pod_spec}
     (guard,) = (
         body
         for body in render()
@@ -85,10 +85,10 @@ def test_doctor_warns_about_pods_that_admission_would_reject_on_recreation(
     finally:
         world.api.delete(path_of(guard))
         world.api.delete(f"/api/v1/namespaces/{namespace}/pods/cni", grace_s=0)
-    found = [f for f in json.loads(capsys.readouterr().out) if f["message"].startswith(f"{namespace}: ")]
-    assert [f["level"] for f in found] == ["warning"]
-    assert "cni on drone-1" in found[0]["message"]
-    assert f"admission.exemptNamespaces={{kube-system,{namespace}}}" in found[0]["remedy"]
+    findings = [f for f in json.loads(capsys.readouterr().out) if f["message"].startswith(f"{namespace}: ")]
+    assert [f["level"] for f in findings] == ["warning"]
+    assert "cni on drone-1" in findings[0]["message"]
+    assert f"admission.exemptNamespaces={{kube-system,{namespace}}}" in findings[0]["remedy"]
 
 
 def test_helm_test_account_has_exactly_the_permissions_of_doctor(

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import fractus.tracing
 import grpc
 import pytest
-from collector import Collector, Seen, collecting
+from collector import Collector, ReceivedSpan, collecting
 from fractus.drone import Mobility
 from fractus.environment import Endpoint
 from fractus.errors import InvalidRequest, PolicyDenied
@@ -44,7 +44,7 @@ spec:
 
 @pytest.fixture
 def sdk(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Let the SDK read the environment of this test, and close its exporter with the test."""
+    """The SDK's tracing, reset so that it reads the environment of this test. Its exporters are closed after the test."""
     closers: list[Callable[[], None]] = []
     monkeypatch.setattr(fractus.tracing, "atexit", SimpleNamespace(register=closers.append))
     fractus.tracing._exporting.cache_clear()
@@ -71,27 +71,27 @@ def endpoint(rig: Rig, address: str = "") -> Endpoint:
     return Endpoint(address or rig.address, node_server_name(NODE), folder)
 
 
-def parts(collector: Collector, whole: Seen, *names: str) -> dict[str, list[Seen]]:
+def parts(collector: Collector, call: ReceivedSpan, *names: str) -> dict[str, list[ReceivedSpan]]:
     """Wait for child spans with these names, and return the child spans of a call by name."""
 
-    def found(spans: list[Seen]) -> dict[str, list[Seen]]:
-        by_name: dict[str, list[Seen]] = {}
-        for one in spans:
-            if one.span.parent_span_id == whole.span.span_id:
-                by_name.setdefault(one.name, []).append(one)
+    def children_by_name(spans: list[ReceivedSpan]) -> dict[str, list[ReceivedSpan]]:
+        by_name: dict[str, list[ReceivedSpan]] = {}
+        for span in spans:
+            if span.span.parent_span_id == call.span.span_id:
+                by_name.setdefault(span.name, []).append(span)
         return by_name if set(names) <= set(by_name) else {}
 
-    return dict(collector.wait(found))
+    return dict(collector.wait(children_by_name))
 
 
-def served(collector: Collector, count: int) -> list[Seen]:
+def served(collector: Collector, count: int) -> list[ReceivedSpan]:
     """Wait for this number of server spans, and return them."""
 
-    def found(spans: list[Seen]) -> list[Seen]:
-        calls = [one for one in spans if one.span.kind == SERVER]
+    def server_spans(spans: list[ReceivedSpan]) -> list[ReceivedSpan]:
+        calls = [span for span in spans if span.span.kind == SERVER]
         return calls if len(calls) == count else []
 
-    return list(collector.wait(found))
+    return list(collector.wait(server_spans))
 
 
 async def test_corrected_goto_is_one_trace_from_the_sdk_to_the_autopilot(rig: Rig, collector: Collector) -> None:
@@ -107,41 +107,41 @@ async def test_corrected_goto_is_one_trace_from_the_sdk_to_the_autopilot(rig: Ri
             await drone.goto(*FRAME.latlon(-50, 0), 7)
         await drone.set_velocity(0.5, 0.0, 0.0)
 
-    call = collector.one(f"{MOBILITY}/Goto", SERVER, fractus__verdict__action="correct")
+    call = collector.find(f"{MOBILITY}/Goto", SERVER, fractus__verdict__action="correct")
     client = collector.wait(lambda spans: [s for s in spans if s.span.span_id == call.span.parent_span_id])[0]
     assert (client.name, client.span.kind, client.span.parent_span_id) == (call.name, CLIENT, b"")
     method = {"rpc.system": "grpc", "rpc.service": MOBILITY, "rpc.method": "Goto"}
     cancelled = {"rpc.grpc.status_code": 1}  # the SDK cancels the stream of a completed motion
-    assert client.told == method | cancelled
+    assert client.attributes == method | cancelled
     assert client.span.status.code == Status.STATUS_CODE_UNSET
     code = goto.decision.code
     policies = list(goto.decision.policies)
-    assert call.told | cancelled == client.told | {
+    assert call.attributes | cancelled == client.attributes | {
         "fractus.caller": DRIVER, "fractus.verdict.action": "correct", "fractus.verdict.code": code,
         "fractus.verdict.policies": policies,
     }  # fmt: skip
     assert (call.service, call.node) == ("fractus-mobility", NODE)
-    found = parts(collector, call, "policy.judge", "autopilot.DO_REPOSITION")
-    judged = found["policy.judge"][0]
-    flown = found["autopilot.DO_REPOSITION"][0]
+    children = parts(collector, call, "policy.judge", "autopilot.DO_REPOSITION")
+    judged = children["policy.judge"][0]
+    flown = children["autopilot.DO_REPOSITION"][0]
     assert {s.span.trace_id for s in (client, call, judged, flown)} == {client.span.trace_id}
-    assert judged.told["fractus.verdict.code"] == code
+    assert judged.attributes["fractus.verdict.code"] == code
     assert judged.span.end_time_unix_nano <= flown.span.start_time_unix_nano
     assert flown.span.end_time_unix_nano <= call.span.end_time_unix_nano
 
-    refused = collector.one(f"{MOBILITY}/Goto", SERVER, fractus__verdict__action="deny")
-    assert refused.told["fractus.verdict.code"] == "InsideExclusionZone"
-    assert refused.told["fractus.verdict.policies"] == ["no-fly"]
-    assert refused.told["rpc.grpc.status_code"] == 7
+    refused = collector.find(f"{MOBILITY}/Goto", SERVER, fractus__verdict__action="deny")
+    assert refused.attributes["fractus.verdict.code"] == "InsideExclusionZone"
+    assert refused.attributes["fractus.verdict.policies"] == ["no-fly"]
+    assert refused.attributes["rpc.grpc.status_code"] == 7
     assert refused.span.status.code == Status.STATUS_CODE_UNSET, "a refusal is not an error of the server"
-    failed = collector.one(f"{MOBILITY}/Goto", CLIENT, rpc__grpc__status_code=7)
+    failed = collector.find(f"{MOBILITY}/Goto", CLIENT, rpc__grpc__status_code=7)
     assert failed.span.status.code == Status.STATUS_CODE_ERROR
 
-    steered = collector.one(f"{MOBILITY}/SetVelocity", SERVER)
+    steered = collector.find(f"{MOBILITY}/SetVelocity", SERVER)
     assert parts(collector, steered, "autopilot.SET_POSITION_TARGET_LOCAL_NED")
-    kept = collector.one(f"{MOBILITY}/GetControl", SERVER)
-    assert kept.told["rpc.grpc.status_code"] in {0, 1}
-    armed = collector.one(f"{MOBILITY}/Arm", SERVER)
+    control_stream = collector.find(f"{MOBILITY}/GetControl", SERVER)
+    assert control_stream.attributes["rpc.grpc.status_code"] in {0, 1}
+    armed = collector.find(f"{MOBILITY}/Arm", SERVER)
     assert parts(collector, armed, "autopilot.COMPONENT_ARM_DISARM")
     lat, lon = (f"{value:.3f}" for value in FRAME.latlon(0, 8))
     content = "".join(str(s.span) for s in collector.spans)
@@ -158,12 +158,12 @@ async def test_image_capture_is_traced_with_its_filters(rig: Rig, collector: Col
     async with Camera(endpoint(rig, address)) as camera:
         taken = await camera.capture()
         await camera.retrieve(taken.name)
-    call = collector.one(f"{CAMERA}/CaptureImage", SERVER)
-    assert (call.service, call.told["fractus.verdict.policies"]) == ("fractus-camera", ["privacy"])
-    found = parts(collector, call, "policy.judge", "camera.capture", "camera.filters")
-    assert found["camera.filters"][0].told["fractus.filters"] == ["blurMedian"]
-    retrieved = collector.one(f"{CAMERA}/RetrieveImage", SERVER)
-    client = collector.one(f"{CAMERA}/RetrieveImage", CLIENT)
+    call = collector.find(f"{CAMERA}/CaptureImage", SERVER)
+    assert (call.service, call.attributes["fractus.verdict.policies"]) == ("fractus-camera", ["privacy"])
+    children = parts(collector, call, "policy.judge", "camera.capture", "camera.filters")
+    assert children["camera.filters"][0].attributes["fractus.filters"] == ["blurMedian"]
+    retrieved = collector.find(f"{CAMERA}/RetrieveImage", SERVER)
+    client = collector.find(f"{CAMERA}/RetrieveImage", CLIENT)
     assert retrieved.span.parent_span_id == client.span.span_id
 
 
@@ -184,11 +184,11 @@ async def test_malformed_and_unknown_headers_are_ignored(rig: Rig, collector: Co
     for headers in HOSTILE:
         with pytest.raises(grpc.aio.AioRpcError, match="position is not known yet"):
             await stub.GetPosition(pb.GetPositionRequest(), timeout=60, wait_for_ready=True, metadata=headers)
-    for one in served(collector, len(HOSTILE)):
-        assert (one.span.parent_span_id, one.span.trace_state) == (b"", "")
-        assert one.told["rpc.grpc.status_code"] == 14
-        assert one.span.status.code == Status.STATUS_CODE_ERROR
-        assert "secret" not in str(one.span)
+    for call in served(collector, len(HOSTILE)):
+        assert (call.span.parent_span_id, call.span.trace_state) == (b"", "")
+        assert call.attributes["rpc.grpc.status_code"] == 14
+        assert call.span.status.code == Status.STATUS_CODE_ERROR
+        assert "secret" not in str(call.span)
 
 
 async def test_traceparent_continues_the_trace_of_the_caller(rig: Rig, collector: Collector) -> None:

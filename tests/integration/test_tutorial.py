@@ -25,8 +25,8 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
 def commands(ports: dict[str, str]) -> list[list[str]]:
     """Return the arguments of the page's `fractus` commands, in order, with ports replaced."""
     lines = [line.removeprefix("fractus ") for line in shell_lines(PAGE_NAME) if line.startswith("fractus ")]
-    for known, own in ports.items():
-        lines = [line.replace(known, own) for line in lines]
+    for documented, port in ports.items():
+        lines = [line.replace(documented, port) for line in lines]
     return [shlex.split(line) for line in lines]
 
 
@@ -60,12 +60,12 @@ def test_program_of_the_tutorial_flies_its_mission(tmp_path: Path) -> None:
         running(tmp_path, *vehicle, "--listen", f"tcp:127.0.0.1:{vehicle_port}"),
         running(tmp_path, *mobility, *listen, "--description", "none.yaml"),
     ):
-        done = subprocess.run(
+        result = subprocess.run(
             [sys.executable, "patrol.py"], cwd=tmp_path, env={**os.environ, **exported}, capture_output=True, text=True,
             timeout=FLIGHT_TIMEOUT_S, check=False,
         )  # fmt: skip
-    output = done.stdout + done.stderr
-    assert done.returncode == 0, output + (tmp_path / "mobility.log").read_text()
+    output = result.stdout + result.stderr
+    assert result.returncode == 0, output + (tmp_path / "mobility.log").read_text()
     expected = re.search(r"\$ python patrol.py\n(.*?)```", PAGE, re.DOTALL)
     assert expected is not None
     for line in filter(lambda line: "waiting" not in line, expected[1].splitlines()):

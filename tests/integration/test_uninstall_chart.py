@@ -1,4 +1,4 @@
-"""Hooks of helm uninstall: conditions for wiping nodes, and removed objects on a real API server with their account."""
+"""Hooks of helm uninstall: conditions for wiping nodes, and removed objects on a real API server."""
 
 from __future__ import annotations
 
@@ -22,33 +22,35 @@ from operator_world import SYSTEM, World
 pytestmark = pytest.mark.slow
 
 Body = dict[str, Any]
-WIPES = "--set=uninstall.wipeNodes=true"
-WIPE = (WIPES, "--is-upgrade")
+WIPE_NODES = "--set=uninstall.wipeNodes=true"
+WIPE = (WIPE_NODES, "--is-upgrade")
 CORE = f"/api/v1/namespaces/{SYSTEM}"
 LEASES = f"/apis/coordination.k8s.io/v1/namespaces/{SYSTEM}/leases"
 REQUESTS = "/apis/certificates.k8s.io/v1/certificatesigningrequests"
 
 
 def is_hook(body: Body) -> bool:
-    """Whether it is made after the rest was deleted."""
+    """Return True if helm creates the object after it has deleted the release."""
     return (body["metadata"].get("annotations") or {}).get("helm.sh/hook") == "post-delete"
 
 
 def hooks(*arguments: str) -> list[Body]:
-    """What is made after the rest was deleted, in the order in which helm makes it."""
-    found = [body for body in render(*arguments) if is_hook(body)]
-    return sorted(found, key=lambda body: int(body["metadata"]["annotations"]["helm.sh/hook-weight"]))
+    """Return the objects that helm creates after it has deleted the release, in order of creation."""
+    return sorted(
+        filter(is_hook, render(*arguments)),
+        key=lambda body: int(body["metadata"]["annotations"]["helm.sh/hook-weight"]),
+    )
 
 
 def test_uninstall_wipes_nodes_only_if_enabled() -> None:
-    plain = render()
-    asked = render(*WIPE)
-    made = hooks(*WIPE)
-    assert not [body for body in plain if "wipe" in str(body)]
-    same = [body for body in plain if not is_hook(body)]
-    assert [body for body in asked if not is_hook(body)] == same, "the value must not change running workloads"
-    assert [body["kind"] for body in made][-2:] == ["DaemonSet", "Job"]
-    for body in made:
+    disabled = render()
+    enabled = render(*WIPE)
+    created = hooks(*WIPE)
+    assert not [body for body in disabled if "wipe" in str(body)]
+    release = [body for body in disabled if not is_hook(body)]
+    assert [body for body in enabled if not is_hook(body)] == release, "the value changes running workloads"
+    assert [body["kind"] for body in created][-2:] == ["DaemonSet", "Job"]
+    for body in created:
         assert body["metadata"]["annotations"]["helm.sh/hook-delete-policy"] == "before-hook-creation,hook-succeeded"
 
 
@@ -56,15 +58,15 @@ def test_wipe_pod_has_access_only_to_state_of_node() -> None:
     (body,) = (body for body in hooks(*WIPE, "--set=host.state=/data/fractus") if body["kind"] == "DaemonSet")
     pod = body["spec"]["template"]["spec"]
     sets = {b["metadata"]["name"]: b["spec"]["template"] for b in render() if b["kind"] == "DaemonSet"}
-    theirs = sets["fractus-agent"]["spec"]
-    assert pod["affinity"]["nodeAffinity"] == theirs["affinity"]["nodeAffinity"]
-    assert pod["tolerations"] == theirs["tolerations"]
+    agent = sets["fractus-agent"]["spec"]
+    assert pod["affinity"]["nodeAffinity"] == agent["affinity"]["nodeAffinity"]
+    assert pod["tolerations"] == agent["tolerations"]
     assert pod["volumes"] == [{"name": "state", "hostPath": {"path": "/data/fractus", "type": "DirectoryOrCreate"}}]
     (apart,) = pod["affinity"]["podAntiAffinity"]["requiredDuringSchedulingIgnoredDuringExecution"]
     services = {template["metadata"]["labels"]["app.kubernetes.io/component"] for template in sets.values()}
     assert set(apart["labelSelector"]["matchExpressions"][1]["values"]) == services
     for key in ("hostNetwork", "hostPID", "hostIPC", "priorityClassName"):
-        assert key not in pod  # the PriorityClass is gone by then
+        assert key not in pod  # the PriorityClass is already deleted
     assert not pod["automountServiceAccountToken"]
     for container in pod["initContainers"] + pod["containers"]:
         assert not container["securityContext"]["allowPrivilegeEscalation"]
@@ -109,52 +111,55 @@ def test_wipe_is_refused_if_directory_contains_node_descriptions(state: str, con
 
 def test_wipe_is_not_rendered_without_cluster() -> None:
     """Argo CD renders everything as an installation. A remaining wipe value must not refuse other changes."""
-    assert render(WIPES) == render()
+    assert render(WIPE_NODES) == render()
 
 
 def test_wipe_is_refused_at_installation(world: World) -> None:
     """A failed `helm install --atomic` uninstalls, possibly on nodes with existing data."""
     with pytest.raises(subprocess.CalledProcessError) as refused:
-        render(*on(world, WIPES))
+        render(*with_lookups(world, WIPE_NODES))
     assert "set it with an upgrade just before uninstalling" in refused.value.stderr
 
 
-def on(world: World, *arguments: str) -> tuple[str, ...]:
-    """To render with what the API server has."""
+def with_lookups(world: World, *arguments: str) -> tuple[str, ...]:
+    """Return arguments with which helm looks up objects of the API server while it renders."""
     return (*arguments, "--dry-run=server", f"--kubeconfig={world.plane.kubeconfig}")
 
 
-@pytest.mark.parametrize("how", [(), ("--is-upgrade",)])
-def test_chart_is_refused_while_wipe_daemon_set_remains(world: World, how: tuple[str, ...]) -> None:
-    """A remaining wipe DaemonSet keeps agents off its nodes, or wipes a node in use."""
-    assert render(*on(world, *how))
+@pytest.mark.parametrize("arguments", [(), ("--is-upgrade",)])
+def test_chart_is_refused_while_wipe_daemon_set_remains(world: World, arguments: tuple[str, ...]) -> None:
+    """A remaining wipe DaemonSet would prevent agents from running on its nodes, or wipe a node in use."""
+    assert render(*with_lookups(world, *arguments))
     (body,) = (body for body in hooks(*WIPE) if body["kind"] == "DaemonSet")
     world.api.apply(path_of(body), body)
     try:
         with pytest.raises(subprocess.CalledProcessError) as refused:
-            render(*on(world, *how))
+            render(*with_lookups(world, *arguments))
     finally:
         world.api.delete(path_of(body))
     assert f"kubectl -n {SYSTEM} delete daemonset fractus-wipe" in refused.value.stderr
 
 
-def test_failed_installation_keeps_existing_authority(world: World, left: list[str], tmp_path: Path) -> None:
-    """The authority was restored from a backup. A failed installation that is rolled back has not created it."""
-    upgraded = hooks(*on(world, "--is-upgrade"))
-    made = hooks(*on(world))
+def test_failed_installation_keeps_existing_authority(world: World, remaining: list[str], tmp_path: Path) -> None:
+    """A failed installation that is rolled back does not delete an authority that was restored from a backup."""
+    upgraded = hooks(*with_lookups(world, "--is-upgrade"))
+    installed = hooks(*with_lookups(world))
     assert "keep" not in str(upgraded)
-    for body in made:
+    for body in installed:
         if body["kind"] == "Role":
             assert not [rule for rule in body["rules"] if "secrets" in rule["resources"]]
             world.api.apply(path_of(body), body)
-    done = remove(world, tmp_path, made)
-    assert done.returncode == 0, done.stderr
-    assert [path for path in left if world.api.get(path)] == [f"{CORE}/secrets/fractus-ca"]
+    result = run_removal(world, tmp_path, installed)
+    assert result.returncode == 0, result.stderr
+    assert [path for path in remaining if world.api.get(path)] == [f"{CORE}/secrets/fractus-ca"]
 
 
 @pytest.fixture
-def left(world: World) -> Iterator[list[str]]:
-    """What the operator and an agent leave, by path; and beside it what is others'."""
+def remaining(world: World) -> Iterator[list[str]]:
+    """Paths of objects that operator and agents leave after the release was deleted.
+
+    Similar objects of other owners also exist.
+    """
     for body in hooks():
         if body["kind"] != "Job":
             world.api.apply(path_of(body), body)
@@ -167,7 +172,7 @@ def left(world: World) -> Iterator[list[str]]:
     world.api.apply(f"{LEASES}/fractus-operator", lease)
     labels = {f"fractus.dev/{n}": "true" for n in ("depot", "geohash", "guarded", "interface-wifi")}
     world.api.merge("/api/v1/nodes/drone-1", {"metadata": {"labels": labels | {"example.com/mine": "yes"}}})
-    for name, signer in (("ours", "fractus.dev/node"), ("theirs", "example.com/other")):
+    for name, signer in (("fractus-node", "fractus.dev/node"), ("foreign", "example.com/other")):
         spec = {
             "request": base64.b64encode(signing_request()).decode(),
             "signerName": signer,
@@ -176,23 +181,23 @@ def left(world: World) -> Iterator[list[str]]:
         head = {"apiVersion": "certificates.k8s.io/v1", "kind": "CertificateSigningRequest", "metadata": {"name": name}}
         if not world.api.get(f"{REQUESTS}/{name}"):
             world.api.call("POST", REQUESTS, head | {"spec": spec})
-    made = [f"{CORE}/secrets/fractus-ca", f"{CORE}/configmaps/fractus-ca", f"{LEASES}/fractus-operator"]
-    yield [*made, f"{REQUESTS}/ours"]
-    for path in (f"{CORE}/secrets/other", f"{REQUESTS}/theirs", *made, *map(path_of, hooks())):
+    created = [f"{CORE}/secrets/fractus-ca", f"{CORE}/configmaps/fractus-ca", f"{LEASES}/fractus-operator"]
+    yield [*created, f"{REQUESTS}/fractus-node"]
+    for path in (f"{CORE}/secrets/other", f"{REQUESTS}/foreign", *created, *map(path_of, hooks())):
         if world.api.get(path):
             world.api.delete(path)
 
 
 def signing_request() -> bytes:
-    """A request in PEM."""
+    """Return a certificate signing request in PEM."""
     key = ec.generate_private_key(ec.SECP256R1())
     name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "drone-1")])
     signed = x509.CertificateSigningRequestBuilder().subject_name(name).sign(key, hashes.SHA256())
     return signed.public_bytes(serialization.Encoding.PEM)
 
 
-def remove(world: World, tmp_path: Path, made: list[Body] | None = None) -> subprocess.CompletedProcess[str]:
-    """Run the Job's program with its own account."""
+def run_removal(world: World, tmp_path: Path, objects: list[Body] | None = None) -> subprocess.CompletedProcess[str]:
+    """Run the program of the Job fractus-removal with the Job's account."""
     request = {"apiVersion": "authentication.k8s.io/v1", "kind": "TokenRequest", "spec": {"expirationSeconds": 600}}
     token = world.api.call("POST", f"{CORE}/serviceaccounts/fractus-removal/token", request)["status"]["token"]
     config = {
@@ -207,7 +212,7 @@ def remove(world: World, tmp_path: Path, made: list[Body] | None = None) -> subp
     }
     kubeconfig = tmp_path / "kubeconfig"
     kubeconfig.write_text(yaml.safe_dump(config))
-    (job,) = (body for body in made or hooks() if body["kind"] == "Job")
+    (job,) = (body for body in objects or hooks() if body["kind"] == "Job")
     (container,) = job["spec"]["template"]["spec"]["containers"]
     command = [sys.executable, *container["command"][1:], *container["args"]]
     return subprocess.run(
@@ -215,40 +220,40 @@ def remove(world: World, tmp_path: Path, made: list[Body] | None = None) -> subp
     )  # fmt: skip
 
 
-def test_uninstall_removes_only_objects_of_operator(world: World, left: list[str], tmp_path: Path) -> None:
-    for again in (False, True):
-        done = remove(world, tmp_path)
-        assert done.returncode == 0, (again, done.stderr)
-        assert not [path for path in left if world.api.get(path)]
+def test_uninstall_removes_only_objects_of_operator(world: World, remaining: list[str], tmp_path: Path) -> None:
+    for attempt in ("first", "repeated"):
+        result = run_removal(world, tmp_path)
+        assert result.returncode == 0, (attempt, result.stderr)
+        assert not [path for path in remaining if world.api.get(path)]
     node = world.api.get("/api/v1/nodes/drone-1") or {}
-    ours = {label: value for label, value in node["metadata"]["labels"].items() if "fractus.dev" in label}
-    assert ours == {"fractus.dev/class": "drone"}
+    labels = {label: value for label, value in node["metadata"]["labels"].items() if "fractus.dev" in label}
+    assert labels == {"fractus.dev/class": "drone"}
     assert node["metadata"]["labels"]["example.com/mine"] == "yes"
     assert world.api.get(f"{CORE}/secrets/other")
-    assert world.api.get(f"{REQUESTS}/theirs")
+    assert world.api.get(f"{REQUESTS}/foreign")
 
 
-def test_uninstall_reports_refused_deletions(world: World, left: list[str], tmp_path: Path) -> None:
+def test_uninstall_reports_refused_deletions(world: World, remaining: list[str], tmp_path: Path) -> None:
     role = next(path_of(body) for body in hooks() if body["kind"] == "Role")
     world.api.delete(role)
-    done = remove(world, tmp_path)
-    assert done.returncode == 1
-    assert "some objects of Fractus were not removed" in done.stderr
-    assert f"Secret {SYSTEM}/fractus-ca" in done.stderr
-    assert [path for path in left if world.api.get(path)] == [path for path in left if SYSTEM in path]
+    result = run_removal(world, tmp_path)
+    assert result.returncode == 1
+    assert "some objects of Fractus were not removed" in result.stderr
+    assert f"Secret {SYSTEM}/fractus-ca" in result.stderr
+    assert [path for path in remaining if world.api.get(path)] == [path for path in remaining if SYSTEM in path]
 
 
 def test_uninstall_job_removes_nothing_while_operator_is_installed(
-    world: World, left: list[str], tmp_path: Path
+    world: World, remaining: list[str], tmp_path: Path
 ) -> None:
     """Tools without hook support create the Job together with the objects that it would remove."""
     (operator,) = (body for body in render() if body["kind"] == "Deployment" and "operator" in body["metadata"]["name"])
     world.api.apply(path_of(operator), operator)
     try:
-        done = remove(world, tmp_path)
+        result = run_removal(world, tmp_path)
     finally:
         world.api.delete(path_of(operator))
-    assert done.returncode == 1
-    assert f"nothing was removed: Fractus is installed in {SYSTEM}" in done.stderr
-    assert [path for path in left if world.api.get(path)] == left
-    assert remove(world, tmp_path).returncode == 0
+    assert result.returncode == 1
+    assert f"nothing was removed: Fractus is installed in {SYSTEM}" in result.stderr
+    assert [path for path in remaining if world.api.get(path)] == remaining
+    assert run_removal(world, tmp_path).returncode == 0

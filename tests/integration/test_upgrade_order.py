@@ -1,4 +1,4 @@
-"""The chart fractus was upgraded before fractus-crds: a kind that the release needs is missing."""
+"""Upgrade of the chart fractus before fractus-crds: a kind that the new release needs is missing."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from fractus_core.api import NodeGrants
 from fractus_core.api.crd import crd
 from fractus_runtime.kubernetes import KubeError
 from operator_world import FRACTUS, NODES, SYSTEM, OperatorProcess, World
-from test_uninstall_chart import on
+from test_uninstall_chart import with_lookups
 
 pytestmark = pytest.mark.slow
 
@@ -39,18 +39,18 @@ def is_stored(world: World) -> bool:
 @contextmanager
 def without_kind(world: World) -> Iterator[None]:
     world.api.delete(KIND)
-    wait_for(lambda: world.api.get(KIND) is None and not is_served(world), "the kind to be gone")
+    wait_for(lambda: world.api.get(KIND) is None and not is_served(world), "the kind to be deleted")
     try:
         yield
     finally:
         world.api.apply(KIND, crd(NodeGrants))
-        wait_for(lambda: is_served(world) and is_stored(world), "the kind to be back")
+        wait_for(lambda: is_served(world) and is_stored(world), "the kind to be served again")
 
 
 def test_operator_with_missing_kind_leaves_lease_to_previous_release(
     control_plane: ControlPlane, world: World, tmp_path: Path
 ) -> None:
-    """The operator cannot work without the kind, and must not replace the operator that can."""
+    """An operator that cannot work without the kind must not replace the operator of the previous release."""
     process = OperatorProcess(control_plane.kubeconfig, tmp_path / "operator.log")
 
     def healthy() -> bool:
@@ -73,9 +73,9 @@ def test_operator_with_missing_kind_leaves_lease_to_previous_release(
             process.stop()
 
 
-@pytest.mark.parametrize("how", [(), ("--is-upgrade",)])
-def test_chart_is_refused_when_kind_is_missing(world: World, how: tuple[str, ...]) -> None:
-    assert render(*on(world, *how))
+@pytest.mark.parametrize("arguments", [(), ("--is-upgrade",)])
+def test_chart_is_refused_when_kind_is_missing(world: World, arguments: tuple[str, ...]) -> None:
+    assert render(*with_lookups(world, *arguments))
     with without_kind(world), pytest.raises(subprocess.CalledProcessError) as refused:
-        render(*on(world, *how))
+        render(*with_lookups(world, *arguments))
     assert "install or upgrade the chart fractus-crds first" in refused.value.stderr

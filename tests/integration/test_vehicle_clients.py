@@ -1,4 +1,4 @@
-"""Third-party clients fly the vehicle: MAVProxy, DroneKit, MAVSDK, and plans of QGroundControl.
+"""Third-party clients fly the simulated vehicle: MAVProxy, DroneKit, MAVSDK, and plans of QGroundControl.
 
 The clients are development dependencies. FRACTUS_CLIENTS_PYTHON selects another interpreter with them.
 """
@@ -25,7 +25,7 @@ PYTHON = os.environ.get("FRACTUS_CLIENTS_PYTHON", sys.executable)
 def _fly(script: str, address: str, tmp_path: Path, *arguments: str) -> str:
     port = free_port()
     with running_vehicle("--ready-after", "4", "--speedup", "5", *arguments, links=(f"tcp:127.0.0.1:{port}",)):
-        done = subprocess.run(
+        result = subprocess.run(
             [PYTHON, str(SESSIONS / script), address.format(port=port), str(tmp_path)],
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
@@ -34,8 +34,8 @@ def _fly(script: str, address: str, tmp_path: Path, *arguments: str) -> str:
             timeout=170,
             check=False,
         )
-    assert "DONE" in done.stdout, done.stdout[-4000:]
-    return done.stdout
+    assert "DONE" in result.stdout, result.stdout[-4000:]
+    return result.stdout
 
 
 @pytest.mark.timeout(200)
@@ -96,7 +96,10 @@ PLAN: dict[str, Any] = {
 
 
 def _lists(plan: dict[str, Any]) -> dict[int, list[tuple[int, int, list[float], float, float, float]]]:
-    """Return the three item lists that QGroundControl makes of a plan: (command, frame, params, lat, lon, alt)."""
+    """Convert a plan to item lists like QGroundControl: mission (0), fence (1) and rally points (2).
+
+    Each item is (command, frame, params, lat, lon, alt).
+    """
     home = plan["mission"]["plannedHomePosition"]
     mission = [(16, 0, [0.0] * 4, *home)]
     for item in plan["mission"]["items"]:

@@ -1,4 +1,4 @@
-"""The vehicle process behind TCP, UDP and a pseudo terminal, with well-behaved and misbehaving clients."""
+"""The simulated vehicle as a process with TCP, UDP and pseudo-terminal links, and clients that send invalid data."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def test_vehicle_sends_only_heartbeats_until_streams_are_requested():
         while time.monotonic() < end:
             message = client.link.recv_match(blocking=True, timeout=0.1)
             names |= {message.get_type()} if message is not None else set()
-        assert names <= {"HEARTBEAT", "STATUSTEXT", "HOME_POSITION", "PARAM_VALUE"}, "the last: pressure on the ground"
+        assert names <= {"HEARTBEAT", "STATUSTEXT", "HOME_POSITION", "PARAM_VALUE"}  # PARAM_VALUE: ground pressure
         rates = {"ATTITUDE": (30, 50), "LOCAL_POSITION_NED": (32, 10), "GLOBAL_POSITION_INT": (33, 1)}
         for number, rate_hz in rates.values():
             client.interval(number, rate_hz)
@@ -100,16 +100,16 @@ def test_parameters_can_be_listed_read_and_set(fast: str):
     client.wait_for("HEARTBEAT")
     client.link.mav.param_request_list_send(1, 1)
     first = client.wait(lambda m: m.get_type() == "PARAM_VALUE" and m.param_index != UNKNOWN_INDEX)
-    seen = {first.param_id: first.param_value}
+    values = {first.param_id: first.param_value}
     indices = {first.param_index}
     while len(indices) < first.param_count:
         value = client.wait(lambda m: m.get_type() == "PARAM_VALUE" and m.param_index != UNKNOWN_INDEX)
-        seen[value.param_id] = value.param_value
+        values[value.param_id] = value.param_value
         indices.add(value.param_index)
     assert indices == set(range(first.param_count))
-    assert seen["WPNAV_SPEED"] == 1000
+    assert values["WPNAV_SPEED"] == 1000
     for name in ("FS_GCS_ENABLE", "FS_GCS_TIMEOUT", "FENCE_ENABLE", "RTL_ALT", "LAND_SPEED", "SYSID_MYGCS"):
-        assert name in seen
+        assert name in values
     client.link.mav.param_set_send(1, 1, b"FS_GCS_TIMEOUT", 7.5, 9)
     assert client.wait(lambda m: m.get_type() == "PARAM_VALUE" and m.param_id == "FS_GCS_TIMEOUT").param_value == 7.5
     client.link.mav.param_request_read_send(1, 1, b"FS_GCS_TIMEOUT", -1)
@@ -127,17 +127,17 @@ def test_gcs_failsafe_returns_home_when_heartbeats_stop(fast: str):
     client.wait(lambda m: m.get_type() == "HEARTBEAT" and not m.base_mode & 128, 30.0)
 
 
-def test_vehicle_serves_clients_despite_garbage_and_a_client_that_never_reads():
+def test_vehicle_serves_client_despite_invalid_data_and_client_that_never_reads():
     port = free_port()
     with running_vehicle("--ready-after", "0.5", links=(f"tcp:127.0.0.1:{port}",)) as process:
         good = Client(f"tcp:127.0.0.1:{port}")
-        deaf = socket.create_connection(("127.0.0.1", port))
-        deaf.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-        speaker = dialect.MAVLink(None, srcSystem=99, srcComponent=1)
+        never_reads = socket.create_connection(("127.0.0.1", port))
+        never_reads.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        encoder = dialect.MAVLink(None, srcSystem=99, srcComponent=1)
         for group in (0, 1, 2, 3, 6, 10, 11, 12):
-            deaf.sendall(dialect.MAVLink_request_data_stream_message(1, 1, group, 100, 1).pack(speaker))
+            never_reads.sendall(dialect.MAVLink_request_data_stream_message(1, 1, group, 100, 1).pack(encoder))
         for _ in range(40):
-            deaf.sendall(dialect.MAVLink_param_request_list_message(1, 1).pack(speaker))
+            never_reads.sendall(dialect.MAVLink_param_request_list_message(1, 1).pack(encoder))
         noisy = socket.create_connection(("127.0.0.1", port))
         good.wait_for("HEARTBEAT")
         good.interval(30, 50)
@@ -165,7 +165,7 @@ def test_vehicle_serves_clients_despite_garbage_and_a_client_that_never_reads():
 
 
 def _noise(count: int) -> list[bytes]:
-    """Random bytes, truncated frames, and valid frames with random contents."""
+    """Return random bytes, truncated frames, and valid frames with random contents."""
     rng = random.Random(11)
     writer = dialect.MAVLink(None, srcSystem=77, srcComponent=1)
     classes = [dialect.mavlink_map[number] for number in sorted(dialect.mavlink_map) if number >= 0]
@@ -203,20 +203,20 @@ def test_udp_links_work_in_both_modes():
         client.interval(30, 10)
         client.wait_for("ATTITUDE")
         names = {server.wait(lambda _: True).get_type() for _ in range(20)}
-        assert "ATTITUDE" not in names, "each link has streams of its own"
+        assert "ATTITUDE" not in names, "a stream that one link requested is sent on another link"
         assert server.command(520, 1) == 0
 
 
 def test_messages_for_another_system_are_forwarded(fast: str):
-    one = Client(fast, sysid=255)
-    two = Client(fast, sysid=42)
-    one.wait_for("HEARTBEAT")
-    two.wait_for("HEARTBEAT")
-    two.beat()
-    one.wait(lambda m: m.get_type() == "HEARTBEAT" and m.get_srcSystem() == 42)
-    two.wait(lambda m: m.get_type() == "HEARTBEAT" and m.get_srcSystem() == 255)
-    one.link.mav.command_long_send(42, 190, 511, 0, 30, 1000, 0, 0, 0, 0, 0)
-    assert two.wait_for("COMMAND_LONG").command == 511
+    first = Client(fast, sysid=255)
+    second = Client(fast, sysid=42)
+    first.wait_for("HEARTBEAT")
+    second.wait_for("HEARTBEAT")
+    second.beat()
+    first.wait(lambda m: m.get_type() == "HEARTBEAT" and m.get_srcSystem() == 42)
+    second.wait(lambda m: m.get_type() == "HEARTBEAT" and m.get_srcSystem() == 255)
+    first.link.mav.command_long_send(42, 190, 511, 0, 30, 1000, 0, 0, 0, 0, 0)
+    assert second.wait_for("COMMAND_LONG").command == 511
 
 
 def test_serial_link_works_over_pseudo_terminal(tmp_path: Path):
@@ -254,7 +254,7 @@ def _send_serial(path: Path, frames: list[bytes]) -> None:
 
 
 @pytest.mark.parametrize("kind", ["udp", "serial"])
-def test_bad_frames_on_other_links_do_not_disturb_client(kind: str, tmp_path: Path):
+def test_invalid_frames_on_other_links_do_not_affect_client(kind: str, tmp_path: Path):
     port = free_port()
     datagrams = free_port()
     path = tmp_path / "tty"
@@ -292,15 +292,15 @@ def _fly_in_lockstep(tmp_path: Path, name: str, seed: int) -> bytes:
     clock_port = free_port()
     log = tmp_path / name
     options = ("--lockstep", f"127.0.0.1:{clock_port}", "--seed", str(seed), "--wind", "4,200,2", "--tlog", str(log))
-    speaker = dialect.MAVLink(None, srcSystem=255, srcComponent=190)
+    encoder = dialect.MAVLink(None, srcSystem=255, srcComponent=190)
     with running_vehicle("--ready-after", "2", *options, links=(f"tcp:127.0.0.1:{port}",)):
         link = socket.create_connection(("127.0.0.1", port), timeout=10.0)
         clock = socket.create_connection(("127.0.0.1", clock_port), timeout=10.0)
-        answers = clock.makefile("r")
+        responses = clock.makefile("r")
 
         def advance(steps: int) -> int:
             clock.sendall(f"{steps}\n".encode())
-            total = int(answers.readline())
+            total = int(responses.readline())
             link.setblocking(False)
             try:
                 while link.recv(65536):
@@ -317,7 +317,7 @@ def _fly_in_lockstep(tmp_path: Path, name: str, seed: int) -> bytes:
             (dialect.MAVLink_command_long_message(1, 1, 22, 0, 0, 0, 0, 0, 0, 0, 10), 1500),
             (dialect.MAVLink_set_position_target_local_ned_message(0, 1, 1, 1, 0xDF8, 9, 9, -9, *[0] * 8), 900),
         ):
-            link.sendall(message.pack(speaker))
+            link.sendall(message.pack(encoder))
             total = advance(steps)
         assert total == 1 + 300 + 10 + 10 + 1500 + 900
         link.close()
@@ -336,7 +336,7 @@ def test_same_seed_produces_identical_logs_in_lockstep(tmp_path: Path):
     assert highest == pytest.approx(10.0, abs=1.0)
 
 
-def test_invalid_arguments_are_explained(tmp_path: Path):
+def test_vehicle_command_rejects_invalid_arguments_with_reason(tmp_path: Path):
     import subprocess
     import sys
 
@@ -347,13 +347,13 @@ def test_invalid_arguments_are_explained(tmp_path: Path):
         (["--param", "NO_SUCH=1"], "unknown parameter NO_SUCH"),
         (["--listen", f"serial:{tmp_path / 'none'}"], "No such file"),
     ):
-        done = subprocess.run(
+        result = subprocess.run(
             [sys.executable, "-m", "fractus_vehicle", *arguments],
             capture_output=True,
             text=True,
             timeout=20,
             check=False,
         )
-        assert done.returncode != 0
-        assert text in done.stderr
-        assert "Traceback" not in done.stderr
+        assert result.returncode != 0
+        assert text in result.stderr
+        assert "Traceback" not in result.stderr

@@ -1,4 +1,4 @@
-"""The view as a workload of the chart: what it may do, and what of it is there unless asked for."""
+"""Live view as a workload of the chart: objects and permissions."""
 
 from __future__ import annotations
 
@@ -14,22 +14,23 @@ from operator_world import FRACTUS, SYSTEM, World
 Body = dict[str, Any]
 
 
-def of_view(*arguments: str) -> dict[str, Body]:
+def view_objects(*arguments: str) -> dict[str, Body]:
+    """Return the objects of the live view that the chart renders, by kind."""
     bodies = fractus_chart.render(*arguments)
     label = "app.kubernetes.io/component"
     return {body["kind"]: body for body in bodies if body["metadata"].get("labels", {}).get(label) == "view"}
 
 
-def test_it_is_only_there_when_asked_for_and_may_write_nothing() -> None:
-    assert of_view() == {}
-    found = of_view("--set", "view.enabled=true", "--set", "view.hostnames={view.example.org}")
-    assert set(found) == {
+def test_view_is_rendered_only_if_enabled_and_without_write_permissions() -> None:
+    assert view_objects() == {}
+    objects = view_objects("--set", "view.enabled=true", "--set", "view.hostnames={view.example.org}")
+    assert set(objects) == {
         "ServiceAccount", "ClusterRole", "ClusterRoleBinding", "Deployment", "Service", "NetworkPolicy",
     }  # fmt: skip
-    (rule,) = found["ClusterRole"]["rules"]
+    (rule,) = objects["ClusterRole"]["rules"]
     assert set(rule["resources"]) == {kind.PLURAL for kind in KINDS}
     assert set(rule["verbs"]) == {"list", "watch"}
-    pod = found["Deployment"]["spec"]["template"]["spec"]
+    pod = objects["Deployment"]["spec"]["template"]["spec"]
     (container,) = pod["containers"]
     assert pod["securityContext"]["runAsNonRoot"] is True
     assert container["securityContext"] == {
@@ -39,24 +40,24 @@ def test_it_is_only_there_when_asked_for_and_may_write_nothing() -> None:
     (volume,) = pod["volumes"]
     assert volume["secret"]["secretName"] == "fractus-view"
     assert all(container[probe]["httpGet"]["path"] == "/healthz" for probe in ("readinessProbe", "livenessProbe"))
-    open_ = found["NetworkPolicy"]["spec"]["ingress"][0]["ports"]
-    (served,) = found["Service"]["spec"]["ports"]
+    open_ = objects["NetworkPolicy"]["spec"]["ingress"][0]["ports"]
+    (served,) = objects["Service"]["spec"]["ports"]
     assert [port["port"] for port in open_] == [port["name"] for port in container["ports"]] == ["http", "metrics"]
-    assert served["targetPort"] == "http", "what needs no token is not behind the Service"
+    assert served["targetPort"] == "http", "the Service exposes the port without a token"
     assert f"--metrics=:{container['ports'][1]['containerPort']}" in container["args"]
 
 
-def test_its_metrics_are_found_as_those_of_others() -> None:
+def test_view_has_pod_monitor_if_enabled() -> None:
     monitored = ("--set", "metrics.podMonitor.enabled=true")
-    assert of_view(*monitored) == {}
-    (endpoint,) = of_view("--set", "view.enabled=true", *monitored)["PodMonitor"]["spec"]["podMetricsEndpoints"]
+    assert view_objects(*monitored) == {}
+    (endpoint,) = view_objects("--set", "view.enabled=true", *monitored)["PodMonitor"]["spec"]["podMetricsEndpoints"]
     assert endpoint["port"] == "metrics"
 
 
-def test_the_api_server_lets_it_list_and_nothing_else(control_plane: ControlPlane, world: World) -> None:
-    found = of_view("--set", "view.enabled=true")
-    made = [found[kind] for kind in ("ServiceAccount", "ClusterRole", "ClusterRoleBinding")]
-    for body in made:
+def test_view_account_may_only_list_displayed_kinds(control_plane: ControlPlane, world: World) -> None:
+    objects = view_objects("--set", "view.enabled=true")
+    access = [objects[kind] for kind in ("ServiceAccount", "ClusterRole", "ClusterRoleBinding")]
+    for body in access:
         world.api.apply(fractus_chart.path_of(body), body)
     try:
         request = {"apiVersion": "authentication.k8s.io/v1", "kind": "TokenRequest", "spec": {"expirationSeconds": 600}}
@@ -72,5 +73,5 @@ def test_the_api_server_lets_it_list_and_nothing_else(control_plane: ControlPlan
             api.merge(f"{FRACTUS}/drones/drone-1", {"spec": {"depot": "elsewhere"}})
         assert error.value.status == 403
     finally:
-        for body in made:
+        for body in access:
             world.api.delete(fractus_chart.path_of(body))

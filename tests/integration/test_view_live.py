@@ -1,4 +1,4 @@
-"""The live view of a real API server in a real Chromium, and what it shows when that is lost."""
+"""Live view of a real API server in Chromium, also while the API server is unreachable."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from playwright.sync_api import expect, sync_playwright
 pytestmark = [
     pytest.mark.slow,
     pytest.mark.skipif(
-        CHROMIUM is None, reason="there is no Chromium here: make packages installs it where apt-get is"
+        CHROMIUM is None, reason="Chromium is not installed; `make packages` installs it on machines with apt-get"
     ),
 ]
 
 
-class Way:
-    """A way to the API server, by a port of its own, that can be cut and opened again."""
+class TcpProxy:
+    """A TCP proxy to a local port that can be interrupted and opened again."""
 
     def __init__(self, port: int) -> None:
-        self._behind = port
+        self._target_port = port
         self._listener = socket.create_server(("127.0.0.1", 0))
         self.port = self._listener.getsockname()[1]
         self.open = True
@@ -42,10 +42,10 @@ class Way:
                 if not self.open:
                     near.close()
                     continue
-                far = socket.create_connection(("127.0.0.1", self._behind))
+                far = socket.create_connection(("127.0.0.1", self._target_port))
                 self._pairs.append((near, far))
                 for a, b in ((near, far), (far, near)):
-                    threading.Thread(target=_carry, args=(a, b), daemon=True).start()
+                    threading.Thread(target=_forward, args=(a, b), daemon=True).start()
 
     def cut(self) -> None:
         self.open = False
@@ -60,7 +60,7 @@ class Way:
         self._listener.close()
 
 
-def _carry(source: socket.socket, target: socket.socket) -> None:
+def _forward(source: socket.socket, target: socket.socket) -> None:
     with contextlib.suppress(OSError):
         while data := source.recv(65536):
             target.sendall(data)
@@ -70,18 +70,18 @@ def _carry(source: socket.socket, target: socket.socket) -> None:
 
 
 @pytest.fixture
-def way(control_plane: ControlPlane) -> Iterator[Way]:
-    way = Way(int(control_plane.server.rsplit(":", 1)[1]))
-    yield way
-    way.close()
+def proxy(control_plane: ControlPlane) -> Iterator[TcpProxy]:
+    proxy = TcpProxy(int(control_plane.server.rsplit(":", 1)[1]))
+    yield proxy
+    proxy.close()
 
 
-def test_a_cluster_is_shown_as_it_is_and_as_stale_once_it_is_lost(
-    control_plane: ControlPlane, world: World, namespace: str, way: Way, tmp_path: Path
+def test_view_page_shows_cluster_live_and_stale_when_api_server_is_unreachable(
+    control_plane: ControlPlane, world: World, namespace: str, proxy: TcpProxy, tmp_path: Path
 ) -> None:
     config = tmp_path / "kubeconfig"
     config.write_text(
-        control_plane.kubeconfig.read_text().replace(control_plane.server, f"https://127.0.0.1:{way.port}")
+        control_plane.kubeconfig.read_text().replace(control_plane.server, f"https://127.0.0.1:{proxy.port}")
     )
     area = {"circle": {"center": at(40, 80), "radius": 30}}
     world.put(ours("Zone", "school", {"area": area, "altitude": {"lower": 0, "upper": 30}}))
@@ -108,13 +108,13 @@ def test_a_cluster_is_shown_as_it_is_and_as_stale_once_it_is_lost(
         expect(page.locator("#drones")).to_contain_text("in the air", timeout=TIMEOUT_MS)
         expect(page.locator("#drones")).to_contain_text("altitude 15.0 m")
         page.wait_for_selector("#map[data-map=ready]")
-        found = Axe().run(page)
-        assert found.violations_count == 0, found.generate_report()
-        way.cut()
+        results = Axe().run(page)
+        assert results.violations_count == 0, results.generate_report()
+        proxy.cut()
         expect(page.locator("#mode")).to_have_text("stale", timeout=TIMEOUT_MS)
         expect(page.locator("#connection")).to_have_text(re.compile(r"^Stale since \d\d:\d\d:\d\d UTC: .*"))
         world.api.merge(drone, {"status": {"flightState": "landing"}})
-        way.open = True
+        proxy.open = True
         expect(page.locator("#mode")).to_have_text("live", timeout=TIMEOUT_MS)
         expect(page.locator("#connection")).to_be_empty()
         expect(page.locator("#drones")).to_contain_text("landing", timeout=TIMEOUT_MS)

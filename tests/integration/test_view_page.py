@@ -1,4 +1,4 @@
-"""The live view in a real Chromium, with the recording of a real flight."""
+"""Web page of `fractus view` in Chromium, with the recording of a simulated flight."""
 
 from __future__ import annotations
 
@@ -24,19 +24,19 @@ from playwright.sync_api import Browser, Page, Playwright, expect, sync_playwrig
 
 FLOWN = (11, 87, 184)
 ZONE = (194, 24, 43)
-"""Colours of the page in light."""
+"""Colours of the flown path and of zones in the light colour scheme."""
 
 pytestmark = [
     pytest.mark.slow,
     pytest.mark.skipif(
-        CHROMIUM is None, reason="there is no Chromium here: make packages installs it where apt-get is"
+        CHROMIUM is None, reason="Chromium is not installed; `make packages` installs it on machines with apt-get"
     ),
     pytest.mark.xdist_group("browser"),
 ]
 
 
 async def fly(directory: Path) -> None:
-    """A flight past a zone, with a corrected and a refused target and a picture."""
+    """Record a flight past a zone, with a corrected and a refused target and a picture."""
     rig = Rig(directory)
     try:
         school = fence("school", "exclusion", "ignore", 20, 45, 45, 70, lower=0, upper=30)
@@ -70,7 +70,7 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def playwright(recordings: Path) -> Iterator[Playwright]:
-    """After the flight, for it keeps an event loop of its own running."""
+    """Playwright, started after the recorded flight, because it keeps an event loop running in this thread."""
     with sync_playwright() as playwright:
         yield playwright
 
@@ -87,8 +87,8 @@ def address(recordings: Path) -> Iterator[str]:
         yield address
 
 
-def shows_the_end(page: Page) -> None:
-    """Move the page to the end of its recording."""
+def go_to_end(page: Page) -> None:
+    """Pause the page and move it to the end of the recording."""
     page.get_by_label("Shown time").wait_for()
     expect(page.locator("#mode")).to_have_text("replay", timeout=TIMEOUT_MS)
     page.get_by_role("button", name="Pause").or_(page.get_by_role("button", name="Play")).click()
@@ -98,18 +98,18 @@ def shows_the_end(page: Page) -> None:
 
 
 def pixels(page: Page, colour: tuple[int, int, int]) -> int:
-    """How many pixels of the map have a colour, nearly."""
+    """Return the number of pixels of the map that have nearly the given colour."""
     image = Image.open(io.BytesIO(page.locator("#map").screenshot(timeout=TIMEOUT_MS))).convert("RGB")
     return sum(
-        count for count, found in image.getcolors(1 << 24) or () if max(abs(a - b) for a, b in zip(found, colour, strict=True)) < 25  # type: ignore[arg-type, call-overload]
+        count for count, value in image.getcolors(1 << 24) or () if max(abs(a - b) for a, b in zip(value, colour, strict=True)) < 25  # type: ignore[arg-type, call-overload]
     )  # fmt: skip
 
 
-def test_a_flight_is_shown_with_its_zones_verdicts_and_pictures(browser: Browser, address: str) -> None:
+def test_view_page_shows_zones_verdicts_path_and_pictures_of_flight(browser: Browser, address: str) -> None:
     with opened(browser, address) as page:
         page.wait_for_selector("#map[data-map=ready]")
         assert "token" not in page.url
-        shows_the_end(page)
+        go_to_end(page)
         expect(page.locator("#zones")).to_contain_text("school-zone zone, 0 to 30 m above home")
         expect(page.locator("#zones")).to_contain_text("operation area of Navigator")
         verdicts = page.locator("#verdicts")
@@ -121,12 +121,12 @@ def test_a_flight_is_shown_with_its_zones_verdicts_and_pictures(browser: Browser
         page.wait_for_function("[...document.querySelectorAll('#pictures img')].some(image => image.naturalWidth > 0)")
         page.wait_for_timeout(1_000)
         assert pixels(page, ZONE) > 100
-        assert pixels(page, FLOWN) > 600, "the path, not only the drone"
+        assert pixels(page, FLOWN) > 600, "the map shows the drone, but not its path"
 
 
-def test_everything_is_done_by_the_keyboard(browser: Browser, address: str) -> None:
+def test_view_page_can_be_used_by_keyboard(browser: Browser, address: str) -> None:
     with opened(browser, address) as page:
-        shows_the_end(page)
+        go_to_end(page)
         slider = page.get_by_label("Shown time")
         end = float(slider.input_value())
         slider.press("ArrowLeft")
@@ -152,10 +152,10 @@ def test_everything_is_done_by_the_keyboard(browser: Browser, address: str) -> N
         expect(play).to_have_text("Play")
 
 
-def test_verdicts_are_said_as_they_happen(browser: Browser, address: str) -> None:
+def test_view_page_announces_new_verdicts_to_screen_readers(browser: Browser, address: str) -> None:
     with opened(browser, address, reduced_motion="reduce") as page:
         expect(page.locator("#mode")).to_have_text("replay", timeout=TIMEOUT_MS)
-        expect(page.locator("#play")).to_have_text("Play"), "nothing moves by itself"
+        expect(page.locator("#play")).to_have_text("Play"), "the replay starts by itself in spite of reduced motion"
         log = page.get_by_role("log", name="New verdicts")
         expect(log).to_be_empty()
         for _ in range(12):
@@ -164,31 +164,31 @@ def test_verdicts_are_said_as_they_happen(browser: Browser, address: str) -> Non
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_accessibility_has_no_violation(browser: Browser, address: str, scheme: str) -> None:
+def test_view_page_has_no_accessibility_violation(browser: Browser, address: str, scheme: str) -> None:
     with opened(browser, address, color_scheme=scheme) as page:
         page.wait_for_selector("#map[data-map=ready]")
-        shows_the_end(page)
+        go_to_end(page)
         expect(page.locator("#verdicts .deny")).to_be_visible(timeout=TIMEOUT_MS)
-        # The page's policy lets no script in but its own: the debugger's protocol does.
-        found = Axe().run(page)
-        assert found.violations_count == 0, found.generate_report()
+        # The content security policy forbids injected scripts, so Axe runs through the debugger protocol.
+        results = Axe().run(page)
+        assert results.violations_count == 0, results.generate_report()
 
 
-def test_nothing_is_loaded_from_elsewhere_or_run_inline(browser: Browser, address: str) -> None:
+def test_view_page_blocks_inline_scripts_and_other_servers(browser: Browser, address: str) -> None:
     context = browser.new_context()
     page = context.new_page()
     page.goto(address)
     blocked = page.evaluate(
         """() => new Promise(resolve => {
-            const found = [];
+            const violations = [];
             document.addEventListener('securitypolicyviolation', event => {
-                found.push(event.effectiveDirective);
-                if (found.length === 3) resolve(found.sort());
+                violations.push(event.effectiveDirective);
+                if (violations.length === 3) resolve(violations.sort());
             });
             const add = (tag, name, value) => {
-                const one = document.createElement(tag);
-                one[name] = value;
-                document.body.append(one);
+                const element = document.createElement(tag);
+                element[name] = value;
+                document.body.append(element);
             };
             add('script', 'textContent', 'window.ran = true');
             add('img', 'src', 'http://127.0.0.2:9/x.png');
@@ -200,54 +200,57 @@ def test_nothing_is_loaded_from_elsewhere_or_run_inline(browser: Browser, addres
     context.close()
 
 
-def test_a_map_without_areas_is_seen(browser: Browser, tmp_path: Path) -> None:
+def test_view_page_shows_map_without_areas(browser: Browser, tmp_path: Path) -> None:
     with serving("--recordings", tmp_path) as address, opened(browser, address) as page:
         expect(page.locator("#map .maplibregl-canvas")).to_be_visible(timeout=TIMEOUT_MS)
 
 
-def test_without_the_token_the_page_says_what_to_do(browser: Browser, address: str) -> None:
+def test_view_page_explains_missing_token(browser: Browser, address: str) -> None:
     context = browser.new_context()
     page = context.new_page()
-    answer = page.goto(address.partition("?")[0])
-    assert answer is not None
-    assert answer.status == 401
+    response = page.goto(address.partition("?")[0])
+    assert response is not None
+    assert response.status == 401
     expect(page.locator("body")).to_contain_text("open the address that `fractus view` printed")
     context.close()
 
 
-def test_without_webgl_the_lists_say_it_all(playwright: Playwright, address: str) -> None:
-    with launched(playwright, "--disable-3d-apis") as blind, opened(blind, address) as page:
+def test_view_page_shows_lists_without_webgl(playwright: Playwright, address: str) -> None:
+    with launched(playwright, "--disable-3d-apis") as browser, opened(browser, address) as page:
         expect(page.locator("#no-map")).to_have_text(re.compile("no WebGL"), timeout=TIMEOUT_MS)
-        shows_the_end(page)
+        go_to_end(page)
         expect(page.locator("#verdicts .deny")).to_be_visible(timeout=TIMEOUT_MS)
         expect(page.locator("#zones")).to_contain_text("school-zone")
 
 
-def refusal_at(data: bytes) -> int:
-    """Where the part of a recording begins that has the first refusal: how far into it depends on the machine's load."""
+def first_refusal_offset(data: bytes) -> int:
+    """Return the offset of the MCAP chunk that contains the first refusal.
+
+    The offset is not constant, because the number of recorded messages depends on the load of the machine.
+    """
     file = io.BytesIO(data)
-    begins = 0
+    offset = 0
     for record in StreamReader(file, emit_chunks=True).records:
         if isinstance(record, Chunk) and any(
-            isinstance(each, Message) and b'"deny"' in each.data for each in breakup_chunk(record)
+            isinstance(message, Message) and b'"deny"' in message.data for message in breakup_chunk(record)
         ):
-            return begins
-        begins = file.tell()
+            return offset
+        offset = file.tell()
     raise AssertionError("the recording has no refusal")
 
 
-def test_what_is_recorded_now_is_shown_live(browser: Browser, recordings: Path, tmp_path: Path) -> None:
+def test_view_page_follows_growing_recording(browser: Browser, recordings: Path, tmp_path: Path) -> None:
     (source,) = (recordings / "mobility").glob("*.mcap")
     data = source.read_bytes()
     growing = tmp_path / source.name
-    begins = refusal_at(data)
-    growing.write_bytes(data[:begins])
+    offset = first_refusal_offset(data)
+    growing.write_bytes(data[:offset])
     with serving("--recordings", tmp_path) as address, opened(browser, address) as page:
         expect(page.locator("#mode")).to_have_text("live", timeout=TIMEOUT_MS)
         expect(page.locator("#drones")).to_contain_text("in the air", timeout=TIMEOUT_MS)
         assert page.locator("#verdicts .deny").count() == 0
         with growing.open("ab") as file:
-            file.write(data[begins:])
+            file.write(data[offset:])
         expect(page.locator("#verdicts .deny")).to_be_visible(timeout=TIMEOUT_MS)
         page.get_by_role("button", name="Pause").press("Enter")
         expect(page.locator("#mode")).to_have_text("paused")

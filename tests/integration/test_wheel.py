@@ -56,7 +56,7 @@ def test_shipped_wheel_has_no_simulator(wheels: dict[str, Path]) -> None:
     assert contents(wheels["fractus_sim"]) == {f"fractus_{name}" for name in SIMULATOR}
 
 
-def test_shipped_wheel_requires_nothing_of_the_simulator(wheels: dict[str, Path]) -> None:
+def test_shipped_wheel_does_not_require_simulator_or_its_libraries(wheels: dict[str, Path]) -> None:
     with ZipFile(wheels["fractus_drones"]) as archive:
         (name,) = (name for name in archive.namelist() if name.endswith("METADATA"))
         metadata = email.message_from_bytes(archive.read(name))
@@ -67,7 +67,8 @@ def test_shipped_wheel_requires_nothing_of_the_simulator(wheels: dict[str, Path]
     }  # fmt: skip
 
 
-def checked(interpreter: Path, folder: Path, *files: Path) -> subprocess.CompletedProcess[str]:
+def mypy(interpreter: Path, folder: Path, *files: Path) -> subprocess.CompletedProcess[str]:
+    """Run mypy in strict mode on files, with the packages of an interpreter."""
     return subprocess.run(
         [
             sys.executable, "-m", "mypy", "--config-file=", "--strict", "--python-executable", interpreter,
@@ -79,8 +80,8 @@ def checked(interpreter: Path, folder: Path, *files: Path) -> subprocess.Complet
 
 @pytest.mark.parametrize("folder", EXAMPLES, ids=lambda folder: folder.name)
 def test_examples_pass_strict_type_checks_against_the_wheel(interpreter: Path, folder: Path) -> None:
-    done = checked(interpreter, folder, *folder.glob("*.py"))
-    assert done.returncode == 0, done.stdout + done.stderr
+    result = mypy(interpreter, folder, *folder.glob("*.py"))
+    assert result.returncode == 0, result.stdout + result.stderr
 
 
 def test_wheel_has_type_information(interpreter: Path, tmp_path: Path) -> None:
@@ -88,6 +89,6 @@ def test_wheel_has_type_information(interpreter: Path, tmp_path: Path) -> None:
     program.write_text(
         "import fractus\n\n\nasync def fly(drone: fractus.Mobility) -> None:\n    await drone.takeoff('high')\n"
     )
-    done = checked(interpreter, tmp_path, program)
-    assert done.returncode == 1
-    assert 'Argument 1 to "takeoff" of "Mobility" has incompatible type "str"' in done.stdout
+    result = mypy(interpreter, tmp_path, program)
+    assert result.returncode == 1
+    assert 'Argument 1 to "takeoff" of "Mobility" has incompatible type "str"' in result.stdout

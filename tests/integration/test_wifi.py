@@ -1,4 +1,4 @@
-"""WiFi interface with a real wpa_supplicant on a veth device: its wired driver needs no radio."""
+"""WiFi interface with a real wpa_supplicant on a veth device, by the wired driver, which needs no radio."""
 
 from __future__ import annotations
 
@@ -108,9 +108,9 @@ async def test_unresponsive_wpa_supplicant_is_an_interface_problem(device: str, 
 
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as silent:
         silent.bind(str(tmp_path / device))
-        with pytest.raises(InterfaceProblem, match="does not respond") as found:
+        with pytest.raises(InterfaceProblem, match="does not respond") as problem:
             await asyncio.wait_for(controller(device, tmp_path, "fleet").up(), TIMEOUT_S)
-    assert found.value.reason == "NoSupplicant"
+    assert problem.value.reason == "NoSupplicant"
 
 
 async def test_wifi_interface_gets_its_address_without_wpa_supplicant(device: str, tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Geotagged photographs: the nearest in three dimensions, daylight and thermal apart."""
+"""Geotagged photographs as the camera world: the nearest daylight or thermal photo is used."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from geotagged import save
 from PIL import Image
 
 
-def test_nearest_in_three_dimensions(tmp_path: Path) -> None:
+def test_world_photo_is_nearest_in_three_dimensions(tmp_path: Path) -> None:
     save(tmp_path / "low.jpg", 50.0, 4.0, 30.0)
     save(tmp_path / "high.jpg", 50.0, 4.0, 120.0)
     save(tmp_path / "aside.jpg", 50.001, 4.0, 30.0)
     photos = Photos.of(tmp_path)
     assert photos.nearest(50.0, 4.0, 40.0, "rgb")[0].path.name == "low.jpg"
     assert photos.nearest(50.0, 4.0, 100.0, "rgb")[0].path.name == "high.jpg"
-    found, away_m = photos.nearest(50.0009, 4.0, 30.0, "rgb")
-    assert found.path.name == "aside.jpg"
+    photo, away_m = photos.nearest(50.0009, 4.0, 30.0, "rgb")
+    assert photo.path.name == "aside.jpg"
     assert away_m == pytest.approx(11.1, abs=0.2)
 
 
-def test_against_a_search_through_all() -> None:
-    """Thousands of places, also at the poles and across the antimeridian; geodesics instead of the tree's chords."""
+def test_world_photo_index_agrees_with_linear_search() -> None:
+    """Compare the index with geodesic distances to all photos, also near a pole and across the antimeridian."""
     roll = random.Random(5)
     for lat, lon in ((50.0, 4.0), (80.0, 179.99), (-60.0, -179.99)):
         photos = [
@@ -44,13 +44,13 @@ def test_against_a_search_through_all() -> None:
         for _ in range(10):
             at = Point(lat=lat + roll.uniform(-0.01, 0.01), lon=(lon + roll.uniform(-0.02, 0.02) + 180) % 360 - 180)
             height = roll.uniform(0, 300)
-            found, away_m = index.nearest(at.lat, at.lon, height, "rgb")
+            photo, away_m = index.nearest(at.lat, at.lon, height, "rgb")
             distances = [np.hypot(geodesic_m(at, Point(lat=p.lat, lon=p.lon)), p.amsl_m - height) for p in photos]
             assert away_m == pytest.approx(min(distances), rel=2e-3)
-            assert distances[int(found.path.name)] == pytest.approx(min(distances), rel=2e-3)
+            assert distances[int(photo.path.name)] == pytest.approx(min(distances), rel=2e-3)
 
 
-def test_bands_are_told_by_folder_or_name(tmp_path: Path) -> None:
+def test_world_photo_is_thermal_by_folder_or_file_name(tmp_path: Path) -> None:
     for name in ("rgb/a.jpg", "b.jpg", "DJI_0001_V.JPG"):
         save(tmp_path / name, 50.0, 4.0, 30.0)
     for name in ("ir/c.jpg", "thermal/flight/d.jpg", "e_ir.jpg", "f-IR.jpg", "DJI_0001_T.JPG"):
@@ -60,18 +60,18 @@ def test_bands_are_told_by_folder_or_name(tmp_path: Path) -> None:
     assert photos.nearest(50.0, 4.0, 30.0, "ir")[1] > 100_000
 
 
-def test_what_has_no_position_is_left_out(tmp_path: Path) -> None:
+def test_world_photo_without_position_is_ignored(tmp_path: Path) -> None:
     save(tmp_path / "good.jpg", -33.5, -70.6, -3.0)
     Image.new("RGB", (8, 8)).save(tmp_path / "plain.jpg")
     (tmp_path / "broken.jpg").write_bytes(b"\xff\xd8\xff nonsense")
     (tmp_path / "notes.txt").write_text("x")
-    found, away_m = Photos.of(tmp_path).nearest(-33.5, -70.6, -3.0, "rgb")
-    assert found.path.name == "good.jpg"
+    photo, away_m = Photos.of(tmp_path).nearest(-33.5, -70.6, -3.0, "rgb")
+    assert photo.path.name == "good.jpg"
     assert away_m < 0.05
-    assert found.amsl_m == -3.0
+    assert photo.amsl_m == -3.0
 
 
-def test_mistakes_are_named(tmp_path: Path) -> None:
+def test_world_photo_errors_state_the_reason(tmp_path: Path) -> None:
     with pytest.raises(PhotoError, match="is no directory"):
         Photos.of(tmp_path / "nowhere")
     with pytest.raises(PhotoError, match="none of its 0 pictures"):
@@ -81,13 +81,13 @@ def test_mistakes_are_named(tmp_path: Path) -> None:
         Photos.of(tmp_path).nearest(50.0, 4.0, 0.0, "ir")
 
 
-def test_pictures_fill_the_size_that_is_wanted(tmp_path: Path) -> None:
+def test_world_photo_is_resized_to_requested_size(tmp_path: Path) -> None:
     save(tmp_path / "a.png", 50.0, 4.0, 30.0, (200, 20, 20))
     photo, _ = Photos.of(tmp_path).nearest(50.0, 4.0, 30.0, "rgb")
     for width, height in ((80, 60), (320, 180), (60, 80), (31, 17)):
         picture = resized(photo, width, height)
         assert picture.shape == (height, width, 3)
-        assert tuple(picture[height // 2, width // 2]) == (20, 20, 200), "blue, green, red"
+        assert tuple(picture[height // 2, width // 2]) == (20, 20, 200), "the order is not blue, green, red"
     (tmp_path / "a.png").unlink()
     with pytest.raises(PhotoError, match="cannot be read"):
         resized(photo, 8, 8)

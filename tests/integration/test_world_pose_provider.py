@@ -1,4 +1,4 @@
-"""The camera's pose from a vehicle's MAVLink: positions, gimbals, silence, garbage, broken links."""
+"""Camera pose from the MAVLink messages of a vehicle: positions, gimbals, silence, invalid bytes, broken links."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ TIMEOUT_S = 20.0
 
 
 class Autopilot:
-    """A TCP server that says what a test tells it to."""
+    """A TCP server that sends MAVLink messages of an autopilot."""
 
     def __init__(self) -> None:
         self._server = socket.create_server(("127.0.0.1", 0))
@@ -28,16 +28,16 @@ class Autopilot:
         self.link, _ = self._server.accept()
         self.link.settimeout(TIMEOUT_S)
 
-    def say(self, name: str, **values: object) -> None:
+    def send(self, name: str, **values: object) -> None:
         assert self.link is not None
         self.link.sendall(Endpoint(1, 1).encode(name, values))  # type: ignore[arg-type]
 
     def fly(self, yaw_deg: float = 0.0, **gpi: int) -> None:
-        """A heartbeat, a position 50 m above home on 200 m, and an attitude."""
-        self.say("HEARTBEAT", type=2, autopilot=3, mavlink_version=3)
+        """Send a heartbeat, a position 50 m above home (at 200 m above sea level), and an attitude."""
+        self.send("HEARTBEAT", type=2, autopilot=3, mavlink_version=3)
         at = {"lat": 500_000_000, "lon": 40_000_000, "alt": 250_000, "relative_alt": 50_000} | gpi
-        self.say("GLOBAL_POSITION_INT", **at)
-        self.say("ATTITUDE", roll=math.radians(5), pitch=math.radians(-3), yaw=math.radians(yaw_deg))
+        self.send("GLOBAL_POSITION_INT", **at)
+        self.send("ATTITUDE", roll=math.radians(5), pitch=math.radians(-3), yaw=math.radians(yaw_deg))
 
     def close(self) -> None:
         if self.link is not None:
@@ -61,50 +61,52 @@ def follower(autopilot: Autopilot) -> Iterator[VehiclePose]:
     vehicle.stop()
 
 
-def camera_pose(vehicle: VehiclePose, wanted: bool = True) -> CameraPose | None:
+def wait_for_pose(vehicle: VehiclePose, known: bool = True) -> CameraPose | None:
+    """Wait until the pose is known or, if `known` is False, unknown, and return it."""
     end = time.monotonic() + TIMEOUT_S
     while time.monotonic() < end:
-        found = vehicle.now()
-        if (found is not None) is wanted:
-            return found
+        camera = vehicle.now()
+        if (camera is not None) is known:
+            return camera
         time.sleep(0.02)
-    raise TimeoutError(f"wanted: {wanted}")
+    raise TimeoutError(f"the pose did not become {'known' if known else 'unknown'}")
 
 
-def known(vehicle: VehiclePose) -> CameraPose:
-    found = camera_pose(vehicle)
-    assert found is not None
-    return found
+def known_pose(vehicle: VehiclePose) -> CameraPose:
+    camera = wait_for_pose(vehicle)
+    assert camera is not None
+    return camera
 
 
-def test_pose_is_what_the_autopilot_says(autopilot: Autopilot, follower: VehiclePose) -> None:
+def test_world_pose_is_reported_pose_of_autopilot(autopilot: Autopilot, follower: VehiclePose) -> None:
     assert follower.now() is None
     autopilot.fly(yaw_deg=80.0)
-    found = known(follower)
-    assert (found.pose.lat, found.pose.lon) == pytest.approx((50.0, 4.0), abs=1e-7)
-    assert found.pose.height_m == pytest.approx(50.0)
-    assert found.ground_amsl_m == pytest.approx(200.0)
-    assert (found.pose.roll_deg, found.pose.pitch_deg, found.pose.yaw_deg) == pytest.approx((5.0, -3.0, 80.0), abs=1e-4)
-    assert found.mount is None
+    camera = known_pose(follower)
+    pose = camera.pose
+    assert (pose.lat, pose.lon) == pytest.approx((50.0, 4.0), abs=1e-7)
+    assert pose.height_m == pytest.approx(50.0)
+    assert camera.ground_amsl_m == pytest.approx(200.0)
+    assert (pose.roll_deg, pose.pitch_deg, pose.yaw_deg) == pytest.approx((5.0, -3.0, 80.0), abs=1e-4)
+    assert camera.mount is None
 
 
-def test_streams_are_asked_for_and_no_heartbeat_is_sent(autopilot: Autopilot, follower: VehiclePose) -> None:
+def test_world_pose_provider_requests_streams_without_heartbeats(autopilot: Autopilot, follower: VehiclePose) -> None:
     autopilot.fly()
     parser = Parser()
-    asked = {}
+    requested = {}
     end = time.monotonic() + TIMEOUT_S
-    while len(asked) < 3 and time.monotonic() < end:
+    while len(requested) < 3 and time.monotonic() < end:
         assert autopilot.link is not None
         for message in parser.feed(autopilot.link.recv(4096)):
-            assert message.name == "COMMAND_LONG", "a heartbeat would hold off the autopilot's failsafe"
+            assert message.name == "COMMAND_LONG", "a heartbeat would prevent the autopilot's failsafe"
             assert message.integer("command") == 511
-            asked[int(message.real("param1"))] = message.real("param2")
-    assert asked == {33: 50_000.0, 30: 50_000.0, 285: 100_000.0}
+            requested[int(message.real("param1"))] = message.real("param2")
+    assert requested == {33: 50_000.0, 30: 50_000.0, 285: 100_000.0}
 
 
-def test_position_goes_on_with_the_speed(autopilot: Autopilot, follower: VehiclePose) -> None:
+def test_world_pose_is_extrapolated_by_velocity(autopilot: Autopilot, follower: VehiclePose) -> None:
     autopilot.fly(vx=1000, vy=0, vz=0)
-    first = known(follower)
+    first = known_pose(follower)
     time.sleep(0.2)
     later = follower.now()
     assert later is not None
@@ -112,10 +114,12 @@ def test_position_goes_on_with_the_speed(autopilot: Autopilot, follower: Vehicle
 
 
 @pytest.mark.parametrize(("flags", "yaw"), [(32, 30.0), (16, -50.0), (64, -50.0), (0, 30.0)])
-def test_gimbal_overrides_the_mount(autopilot: Autopilot, follower: VehiclePose, flags: int, yaw: float) -> None:
-    """Its yaw is the airframe's, or north's: MAVLink tells by flags."""
+def test_world_pose_uses_gimbal_attitude_instead_of_mount(
+    autopilot: Autopilot, follower: VehiclePose, flags: int, yaw: float
+) -> None:
+    """Flags of the message state if the gimbal's yaw is relative to the airframe or to north."""
     autopilot.fly(yaw_deg=80.0)
-    known(follower)
+    known_pose(follower)
     half_pitch = math.radians(-40.0) / 2
     half_yaw = math.radians(30.0) / 2
     q = (
@@ -125,50 +129,54 @@ def test_gimbal_overrides_the_mount(autopilot: Autopilot, follower: VehiclePose,
         math.sin(half_yaw) * math.cos(half_pitch),
     )
     end = time.monotonic() + TIMEOUT_S
-    found = None
-    while (found is None or found.mount is None) and time.monotonic() < end:
+    camera = None
+    while (camera is None or camera.mount is None) and time.monotonic() < end:
         autopilot.fly(yaw_deg=80.0)
-        autopilot.say("GIMBAL_DEVICE_ATTITUDE_STATUS", q=q, flags=flags)
+        autopilot.send("GIMBAL_DEVICE_ATTITUDE_STATUS", q=q, flags=flags)
         time.sleep(0.05)
-        found = follower.now()
-    assert found is not None
-    assert found.mount is not None
-    assert found.mount.pitch_deg == pytest.approx(-40.0, abs=1e-3)
-    assert found.mount.yaw_deg == pytest.approx(yaw, abs=1e-3)
+        camera = follower.now()
+    assert camera is not None
+    assert camera.mount is not None
+    assert camera.mount.pitch_deg == pytest.approx(-40.0, abs=1e-3)
+    assert camera.mount.yaw_deg == pytest.approx(yaw, abs=1e-3)
 
 
-def test_silence_is_unknown(autopilot: Autopilot, follower: VehiclePose, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_world_pose_is_unknown_if_autopilot_is_silent(
+    autopilot: Autopilot, follower: VehiclePose, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(pose_provider, "STALE_S", 0.3)
     autopilot.fly()
-    known(follower)
-    assert camera_pose(follower, wanted=False) is None
+    known_pose(follower)
+    assert wait_for_pose(follower, known=False) is None
 
 
-def test_no_fix_is_unknown(autopilot: Autopilot, follower: VehiclePose) -> None:
+def test_world_pose_is_unknown_without_gps_fix(autopilot: Autopilot, follower: VehiclePose) -> None:
     autopilot.fly(lat=0, lon=0)
     autopilot.fly(lat=0, lon=0)
     time.sleep(0.2)
     assert follower.now() is None
 
 
-def test_garbage_and_a_broken_link_are_survived(autopilot: Autopilot, follower: VehiclePose) -> None:
+def test_world_pose_provider_recovers_from_invalid_bytes_and_broken_link(
+    autopilot: Autopilot, follower: VehiclePose
+) -> None:
     assert autopilot.link is not None
     autopilot.link.sendall(bytes(range(256)) * 40)
     end = time.monotonic() + TIMEOUT_S
     while follower.now() is None and time.monotonic() < end:
-        autopilot.fly()  # the garbage may begin a frame that swallows the next one
+        autopilot.fly()  # the invalid bytes may contain the beginning of a frame, which consumes the next message
         time.sleep(0.05)
-    known(follower)
+    known_pose(follower)
     autopilot.link.close()
     autopilot.accept()
     autopilot.fly(lat=510_000_000)
     end = time.monotonic() + TIMEOUT_S
-    while known(follower).pose.lat < 50.5 and time.monotonic() < end:
+    while known_pose(follower).pose.lat < 50.5 and time.monotonic() < end:
         time.sleep(0.02)
-    assert known(follower).pose.lat == pytest.approx(51.0)
+    assert known_pose(follower).pose.lat == pytest.approx(51.0)
 
 
 @pytest.mark.parametrize("text", ["udp:127.0.0.1:1", "tcp:host", "tcp::5762", "tcp:h:0", "tcp:h:99999", ""])
-def test_addresses_are_checked(text: str) -> None:
+def test_world_pose_provider_rejects_invalid_address(text: str) -> None:
     with pytest.raises(ValueError, match="tcp:HOST:PORT"):
         parse_address(text)

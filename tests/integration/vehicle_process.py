@@ -1,4 +1,4 @@
-"""Runs `fractus-vehicle` as a process behind real links, with pymavlink clients."""
+"""The simulated vehicle as a process, and a pymavlink client."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class Client:
         self.link.close()
 
     def wait(self, condition: Callable[[Any], bool], timeout_s: float = 20.0) -> Any:
-        """Return the first message for which the condition holds."""
+        """Return the first message for which the condition holds. Send heartbeats while waiting."""
         end = time.monotonic() + timeout_s
         while time.monotonic() < end:
             message = self.link.recv_match(blocking=True, timeout=0.2)

@@ -40,7 +40,7 @@ class TestAuthority:
         self.pem = self.certificate.public_bytes(serialization.Encoding.PEM)
 
     def sign(self, request_pem: bytes, begin: datetime | None = None, life: timedelta = timedelta(days=30)) -> bytes:
-        """Return a certificate for a signing request, with its names."""
+        """Return a certificate for a signing request, with the requested names."""
         request = x509.load_pem_x509_csr(request_pem)
         assert request.is_signature_valid
         names = request.extensions.get_extension_for_class(x509.SubjectAlternativeName)
@@ -62,13 +62,21 @@ class TestAuthority:
 
 
 class FakeSigner:
-    """Fake store whose operator signs, denies or ignores signing requests."""
+    """Fake store of an agent. It signs signing requests, or returns them with the given conditions.
+
+    Attributes:
+        published: Certificates of the published authority, or None.
+        request_count: Number of created signing requests.
+        conditions: Conditions of new signing requests. If there are any, requests are not signed.
+        sign_with: Additional arguments for `TestAuthority.sign`.
+        error: Exception that requests raise, or None.
+    """
 
     def __init__(self, authority: TestAuthority) -> None:
         self.ca = authority
         self.published: bytes | None = authority.pem
         self.requests: dict[str, dict[str, Any]] = {}
-        self.made = 0
+        self.request_count = 0
         self.conditions: list[dict[str, str]] = []
         self.sign_with: dict[str, Any] = {}
         self.error: Exception | None = None
@@ -81,7 +89,7 @@ class FakeSigner:
     async def request_certificate(self, name: str, request_pem: bytes, lifetime_s: int) -> None:
         if self.error:
             raise self.error
-        self.made += 1
+        self.request_count += 1
         status: dict[str, Any] = {"conditions": self.conditions}
         if not self.conditions:
             status["certificate"] = base64.b64encode(self.ca.sign(request_pem, **self.sign_with)).decode()

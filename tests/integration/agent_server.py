@@ -1,4 +1,4 @@
-"""A control plane of the agent's own: it is stopped, killed, frozen and started again under the agent's feet."""
+"""Control plane for tests of the agent. Its API server can be stopped, killed, frozen and started again."""
 
 from __future__ import annotations
 
@@ -38,17 +38,17 @@ RULES: list[dict[str, list[str]]] = [
     },
     {"apiGroups": [""], "resources": ["configmaps"], "resourceNames": ["fractus-ca"], "verbs": ["get"]},
 ]
-"""What charts/ gives the agent; tests run with no more."""
+"""Permissions of the agent in the chart."""
 RBAC = "/apis/rbac.authorization.k8s.io/v1"
 ACCOUNTS = f"/api/v1/namespaces/{NODE_GRANTS_NAMESPACE}/serviceaccounts"
 NODE_GRANTS = f"{FRACTUS}/namespaces/{NODE_GRANTS_NAMESPACE}/nodegrants"
 
 
 class ApiServer(ControlPlane):
-    """A control plane whose API server can go away and come back with its data.
+    """A control plane whose API server can be stopped and started again with its data.
 
     Attributes:
-        signer: key and certificate that grants are signed with.
+        signer: Key and certificate with which Grants are signed.
     """
 
     signer: tuple[ec.EllipticCurvePrivateKey, x509.Certificate]
@@ -60,8 +60,8 @@ class ApiServer(ControlPlane):
 
     def start_apiserver(self) -> None:
         with (self._directory / "kube-apiserver.log").open("ab") as log:
-            again = subprocess.Popen(self._arguments(), stdout=log, stderr=log, cwd=self._directory)
-        self._processes["kube-apiserver"] = again
+            process = subprocess.Popen(self._arguments(), stdout=log, stderr=log, cwd=self._directory)
+        self._processes["kube-apiserver"] = process
         wait_for(self.admin.ready, "the API server", timeout_s=60)
 
     def _arguments(self) -> list[str]:
@@ -71,7 +71,7 @@ class ApiServer(ControlPlane):
 
     @contextlib.contextmanager
     def frozen(self) -> Iterator[None]:
-        """An API server that keeps its connections and says nothing."""
+        """Stop the API server's process, so that it keeps its connections but sends nothing."""
         pid = self._processes["kube-apiserver"].pid
         os.kill(pid, signal.SIGSTOP)
         try:
@@ -80,7 +80,7 @@ class ApiServer(ControlPlane):
             os.kill(pid, signal.SIGCONT)
 
     def compact(self) -> None:
-        """Make etcd forget every version before now, so that watches from before are answered with 410."""
+        """Remove old revisions from etcd, so that the API server refuses watches from before with 410."""
         etcd = next(a for a in self._arguments() if a.startswith("--etcd-servers=")).split("=", 1)[1]
         key = base64.b64encode(b"/").decode()
         revision = _post(f"{etcd}/v3/kv/range", {"key": key})["header"]["revision"]
@@ -98,11 +98,11 @@ class ApiServer(ControlPlane):
 
     @property
     def agent_kubeconfig(self) -> Path:
-        """Credentials with the agent's rights."""
+        """Kubeconfig with the permissions of the agent."""
         return self._directory / "agent.kubeconfig"
 
     def furnish(self, ca_pem: bytes) -> None:
-        """The system's namespace with the authority, and the agent's rights."""
+        """Create the namespaces of Fractus, the published authority, and the permissions of the agent."""
         self.write_kubeconfig("agent", "agent")
         for namespace in ("fractus-system", NODE_GRANTS_NAMESPACE):
             self.post("/api/v1/namespaces", {"metadata": {"name": namespace}})
@@ -114,14 +114,14 @@ class ApiServer(ControlPlane):
         self._permit("agent", [tokens], AGENT)
 
     def publish(self, node: str) -> None:
-        """Keep what the operator keeps for a node: its Grants in one object, with an account that may read that."""
+        """Create the objects of a node like the operator: its NodeGrants, and an account that may read it."""
         if self.get(f"{ACCOUNTS}/{node}") is None:
             self.post(ACCOUNTS, {"metadata": {"name": node}})
         if self.get(f"{RBAC}/namespaces/{NODE_GRANTS_NAMESPACE}/roles/{node}") is None:
-            own = {"apiGroups": ["fractus.dev"], "resourceNames": [node]}
+            of_node = {"apiGroups": ["fractus.dev"], "resourceNames": [node]}
             rules = [
-                own | {"resources": ["nodegrants"], "verbs": ["get", "list", "watch"]},
-                own | {"resources": ["nodegrants/status"], "verbs": ["patch"]},
+                of_node | {"resources": ["nodegrants"], "verbs": ["get", "list", "watch"]},
+                of_node | {"resources": ["nodegrants/status"], "verbs": ["patch"]},
             ]
             self._permit(node, rules, {"kind": "ServiceAccount", "name": node, "namespace": NODE_GRANTS_NAMESPACE})
         grants = self.admin.list(f"{FRACTUS}/grants", fieldSelector=f"spec.node={node}")
@@ -134,17 +134,17 @@ class ApiServer(ControlPlane):
         self.admin.apply(f"{NODE_GRANTS}/{node}", body)
 
     def reported(self, node: str, grant: str) -> dict[str, Any]:
-        """What a node's agent reported of a Grant; empty while nothing."""
+        """Return the reported state of a Grant in the status of the NodeGrants, or an empty dict."""
         status = (self.get(f"{NODE_GRANTS}/{node}") or {}).get("status") or {}
-        return next((each for each in status.get("grants", ()) if each["name"] == grant), {})
+        return next((report for report in status.get("grants", ()) if report["name"] == grant), {})
 
     def _permit(self, name: str, rules: list[dict[str, Any]], subject: dict[str, str]) -> None:
-        where = f"{RBAC}/namespaces/{NODE_GRANTS_NAMESPACE}"
-        self.post(f"{where}/roles", {"metadata": {"name": name}, "rules": rules})
-        self.post(f"{where}/rolebindings", _binding(name, "Role", subject))
+        path = f"{RBAC}/namespaces/{NODE_GRANTS_NAMESPACE}"
+        self.post(f"{path}/roles", {"metadata": {"name": name}, "rules": rules})
+        self.post(f"{path}/rolebindings", _binding(name, "Role", subject))
 
     def sign_requests(self, authority: TestAuthority) -> int:
-        """Approve and sign what waits, as the operator does; how many."""
+        """Approve and sign all pending signing requests like the operator, and return their number."""
         signed = 0
         for body in self.admin.list(REQUESTS):
             status = body.get("status") or {}
@@ -170,13 +170,13 @@ def _binding(name: str, kind: str, subject: dict[str, str]) -> dict[str, Any]:
 
 def _post(url: str, body: dict[str, Any]) -> dict[str, Any]:
     request = urllib.request.Request(url, json.dumps(body).encode(), {"Content-Type": "application/json"})
-    with urllib.request.build_opener(urllib.request.ProxyHandler({})).open(request, timeout=5.0) as answer:
-        return dict(json.load(answer))
+    with urllib.request.build_opener(urllib.request.ProxyHandler({})).open(request, timeout=5.0) as response:
+        return dict(json.load(response))
 
 
 @contextlib.contextmanager
 def running(directory: Path) -> Iterator[ApiServer]:
-    """A furnished control plane for the length of a block."""
+    """Run a control plane until the block ends."""
     server = ApiServer(programs(), directory)
     try:
         server.start()

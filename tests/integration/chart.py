@@ -1,4 +1,4 @@
-"""The chart fractus on a bare control plane: what it makes, but its workloads."""
+"""Rendering of the charts, and objects of the chart fractus on a control plane without nodes."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Body = dict[str, Any]
 CHARTS = Path(__file__).parents[2] / "charts"
 _GOLDEN = Path(__file__).parents[1] / "golden" / "charts" / "values"
 EVERYTHING = {chart: _GOLDEN / f"{chart}.yaml" for chart in ("fractus", "fractus-demo")}
-"""Values with all switched on that can be, and all set that is empty by itself."""
+"""Values files that enable every option and set every value that is empty by default."""
 
 KUBERNETES = f"--kube-version={KUBERNETES_VERSIONS[chosen_kubernetes()]}"
 _PLURALS = {
@@ -26,7 +26,7 @@ _PLURALS = {
 
 
 def install(world: World) -> None:
-    """Make accounts, roles and admission policies."""
+    """Create the objects of the chart except workloads: accounts, roles and admission policies."""
     world.api.apply(
         f"/api/v1/namespaces/{SYSTEM}", {"apiVersion": "v1", "kind": "Namespace", "metadata": {"name": SYSTEM}}
     )
@@ -36,46 +36,51 @@ def install(world: World) -> None:
 
 
 def uninstall(world: World) -> None:
-    """Lift what would refuse later tests what they do as administrators, such as removing drones that fly."""
+    """Remove the admission policies, which would refuse actions of later tests, such as removing drones in flight."""
     for body in render():
         if body["kind"] == "ValidatingAdmissionPolicyBinding":
             world.api.delete(path_of(body))
 
 
 def render(*arguments: str, chart: str | Path = "fractus") -> list[Body]:
-    """The objects of a chart, one of the checkout's by its name or another by its path, rendered by helm."""
+    """Return the objects of a chart, rendered by helm.
+
+    Args:
+        arguments: Further arguments of `helm template`.
+        chart: Name of a chart of the checkout, or path of another chart.
+    """
     argv = [helm(), "template", Path(chart).stem, str(CHARTS / chart), "--namespace", SYSTEM, KUBERNETES]
-    done = subprocess.run([*argv, *arguments], capture_output=True, text=True, timeout=60, check=True)
-    return [body for body in yaml.load_all(done.stdout, Loader=yaml.CSafeLoader) if body]
+    result = subprocess.run([*argv, *arguments], capture_output=True, text=True, timeout=60, check=True)
+    return [body for body in yaml.load_all(result.stdout, Loader=yaml.CSafeLoader) if body]
 
 
 def values_of(chart: str) -> Iterator[tuple[str, Any]]:
-    """The values of a chart with their names, but for limits and labels, where one that is missing is meant to be."""
+    """Return the names and default values of a chart. Fields of resources and labels are omitted, because they are optional."""
 
-    def within(values: Body, above: str) -> Iterator[tuple[str, Any]]:
+    def within(values: Body, prefix: str) -> Iterator[tuple[str, Any]]:
         for key, value in values.items():
-            yield f"{above}{key}", value
+            yield f"{prefix}{key}", value
             if isinstance(value, dict) and key not in {"resources", "labels"}:
-                yield from within(value, f"{above}{key}.")
+                yield from within(value, f"{prefix}{key}.")
 
     return within(yaml.safe_load((CHARTS / chart / "values.yaml").read_text()), "")
 
 
 def helm() -> str:
-    """The program, as the embedded cluster has it, or from the PATH."""
+    """Return the path of helm: the program of the embedded cluster, or `helm` on the PATH."""
     caches = sorted((Path.home() / ".cache" / "fractus").glob("*/bin/helm"), reverse=True)
     return str(caches[0]) if caches else "helm"
 
 
 def operator_token(world: World) -> str:
-    """A token of the operator's account."""
+    """Return a token of the operator's account."""
     path = f"/api/v1/namespaces/{SYSTEM}/serviceaccounts/fractus-operator/token"
     request = {"apiVersion": "authentication.k8s.io/v1", "kind": "TokenRequest", "spec": {"expirationSeconds": 600}}
     return str(world.api.call("POST", path, request)["status"]["token"])
 
 
 def path_of(body: Body) -> str:
-    """Where the API server keeps an object."""
+    """Return the path of an object at the API server."""
     plural = _PLURALS.get(body["kind"], f"{body['kind'].lower()}s")
     root = "/apis/" if "/" in body["apiVersion"] else "/api/"
     namespace = body["metadata"].get("namespace")

@@ -14,7 +14,7 @@ from control_plane import ControlPlane, programs
 from mobility_rig import Rig
 from operator_world import OperatorProcess, World, fresh_namespace
 
-# Background jobs of a shell ignore SIGINT, and nohup ignores SIGHUP. The programs that tests start would inherit that.
+# Background jobs of a shell ignore SIGINT, and nohup ignores SIGHUP. Programs that tests start would inherit this.
 for number in (signal.SIGINT, signal.SIGHUP):
     if signal.getsignal(number) is signal.SIG_IGN:
         signal.signal(number, signal.default_int_handler)
@@ -30,7 +30,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.fixture
 async def rig(tmp_path: Path) -> AsyncIterator[Rig]:
-    """A drone's services and vehicle, which the test starts as processes."""
+    """Services and vehicle of a drone. The test starts them as processes."""
     rig = Rig(tmp_path)
     try:
         yield rig
@@ -52,7 +52,7 @@ def control_plane(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ControlP
 
 @pytest.fixture
 def world(control_plane: ControlPlane) -> Iterator[World]:
-    """A world with one drone, three edge nodes and a cloud node."""
+    """Objects of one drone, three edge nodes and a cloud node at the API server."""
     world = World(control_plane)
     world.furnish()
     yield world
@@ -76,7 +76,7 @@ def operator(control_plane: ControlPlane, world: World, tmp_path: Path) -> Itera
     yield process
     code = process.stop() if process.running else None
     print(process.log())
-    # SIGTERM ends the process before it has set its handlers.
+    # SIGTERM kills a process that has not set its signal handlers yet.
     assert code in (0, -signal.SIGTERM, None), f"the operator exited with code {code}"
 
 

@@ -25,15 +25,15 @@ import sys, time
 from concurrent.futures import ThreadPoolExecutor
 import grpc
 name, address, work_s = sys.argv[1], sys.argv[2], float(sys.argv[3])
-def answer(request, context):
+def respond(request, context):
     time.sleep(work_s)
     return name.encode() + b" " + request[:32]
 def send(request, context):  # the requested number of bytes, in messages of 200 kB
-    left = int(request)
-    while left:
-        size = min(left, 200_000)
+    remaining = int(request)
+    while remaining:
+        size = min(remaining, 200_000)
         yield bytes(size)
-        left -= size
+        remaining -= size
 def stream(requests, context):
     for request in requests:
         yield name.encode() + b" " + request
@@ -43,7 +43,7 @@ class Handler(grpc.GenericRpcHandler):
             return grpc.stream_stream_rpc_method_handler(stream)
         if details.method == "/test/Send":
             return grpc.unary_stream_rpc_method_handler(send)
-        return grpc.unary_unary_rpc_method_handler(answer)
+        return grpc.unary_unary_rpc_method_handler(respond)
 server = grpc.server(ThreadPoolExecutor(8))
 server.add_generic_rpc_handlers((Handler(),))
 server.add_insecure_port(address)
@@ -62,8 +62,8 @@ print("ready", flush=True)
 for number in range(calls):
     begun = time.monotonic()
     try:
-        who, got = call(f"{number:08d}".encode() + b"x" * size, timeout=5).decode().split()
-        print(number, who, f"{time.monotonic():.3f}", flush=True)
+        server, _ = call(f"{number:08d}".encode() + b"x" * size, timeout=5).decode().split()
+        print(number, server, f"{time.monotonic():.3f}", flush=True)
     except grpc.RpcError as error:
         print(number, "FAILED", error.code().name, error.details().replace(" ", "_"), flush=True)
     time.sleep(max(pause_s - (time.monotonic() - begun), 0))
@@ -76,7 +76,7 @@ def run(*words: str) -> None:
 
 
 class Rig:
-    """Namespaces of a drone with a pod, an edge node with a pod and a cloud, with their processes."""
+    """Network namespaces of a drone with a pod, an edge node with a pod, and a cloud, and processes in them."""
 
     def __init__(self) -> None:
         self.tag = f"fx{os.getpid() % 100000}"
@@ -115,14 +115,15 @@ class Rig:
             create("fxl*", PORTS, self.inside(node), clients=node == "drone")
         self.maps("edge").write([Redirect(DIRECT, POD)], [(DIRECT, 1)], 600.0, [DRONE])
 
-    def _link(self, left: str, device: str, address: str, right: str, other: str, peer: str) -> None:
+    def _link(self, node: str, device: str, address: str, peer: str, peer_device: str, peer_address: str) -> None:
+        """Connect two namespaces by a pair of devices with addresses."""
         run(
-            *self.inside(left), "ip", "link", "add", device, "type", "veth",
-            "peer", "name", other, "netns", self.name(right),
+            *self.inside(node), "ip", "link", "add", device, "type", "veth",
+            "peer", "name", peer_device, "netns", self.name(peer),
         )  # fmt: skip
-        for node, link, ip in ((left, device, address), (right, other, peer)):
-            run(*self.inside(node), "ip", "addr", "add", ip, "dev", link)
-            run(*self.inside(node), "ip", "link", "set", link, "up")
+        for end, link, ip in ((node, device, address), (peer, peer_device, peer_address)):
+            run(*self.inside(end), "ip", "addr", "add", ip, "dev", link)
+            run(*self.inside(end), "ip", "link", "set", link, "up")
 
     def pod(self, name: str, net: str, at: str = "drone") -> str:
         """Add a pod on a node, in a network such as `10.86.0`."""
@@ -135,13 +136,13 @@ class Rig:
     def reaches(self, node: str, address: str, port: int) -> bool:
         """Return True if a TCP connection can be opened from a node or pod."""
         program = f"import socket; socket.create_connection(({address!r}, {port}), 1).close()"
-        done = subprocess.run(
+        result = subprocess.run(
             [*self.inside(node), sys.executable, "-c", program], capture_output=True, timeout=30, check=False
         )
-        return done.returncode == 0
+        return result.returncode == 0
 
     def maps(self, node: str) -> NftMaps:
-        """Return the maps of a node, whose table is created again if it is missing."""
+        """Return the maps of a node. A missing table is created again."""
 
         def make_table(callers: Callers) -> None:
             create("fxl*", PORTS, self.inside(node), clients=node == "drone", callers=callers)
@@ -164,7 +165,7 @@ class Rig:
         return process
 
     def servers(self, work_s: float = 0.005) -> None:
-        """Start the base instance in the cloud and the one at the edge."""
+        """Start the base instance in the cloud and the instance on the edge node."""
         self.python("cloud", SERVER, "cloud", f"{VIP.address}:{VIP.port}", work_s)
         self.python("epod", SERVER, "edge", f"{POD.address}:{POD.port}", work_s)
 
@@ -173,7 +174,7 @@ class Rig:
         return self.python(node, CLIENT, f"{VIP.address}:{VIP.port}", calls, pause_s, size)
 
     def clear(self) -> None:
-        """End and remove everything."""
+        """End all processes and remove all namespaces."""
         for process in self.processes:
             process.kill()
             process.wait()

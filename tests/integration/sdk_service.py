@@ -1,4 +1,4 @@
-"""Stand-ins for the node services, on real gRPC with real mutual TLS, for the SDK's tests."""
+"""Fake mobility and camera services on gRPC servers with mutual TLS, for tests of the SDK."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Event = mobility_pb2.ControlEvent
 
 
 class Authority:
-    """A certificate authority with a key of its own."""
+    """A certificate authority with a new key."""
 
     def __init__(self) -> None:
         self.key = ec.generate_private_key(ec.SECP256R1())
@@ -34,7 +34,7 @@ class Authority:
         )
 
     def issue(self, folder: Path, names: list[x509.GeneralName]) -> Path:
-        """Write tls.crt, tls.key and ca.crt into a folder, each replaced as a whole."""
+        """Write tls.crt, tls.key and ca.crt to a folder. Each file is replaced atomically."""
         folder.mkdir(parents=True, exist_ok=True)
         key = ec.generate_private_key(ec.SECP256R1())
         certificate = (
@@ -71,13 +71,13 @@ class Authority:
 
 
 EXPIRED = Event()
-"""In a control stream: the certificate that it was opened with has expired."""
+"""Queued to a control stream: end the stream, because its client's certificate has expired."""
 
 
 class Drone(mobility_pb2_grpc.MobilityServiceServicer):
-    """A drone without physics: motions take `steps` messages, or wait for `release` when it is set up to block.
+    """Fake mobility service without physics. A motion is complete after three messages, or when `release` is set.
 
-    Altitudes above 60 m are corrected; north of 40.01 degrees is an exclusion zone.
+    Altitudes above 60 m are corrected. Targets north of 40.01 degrees are refused.
     """
 
     def __init__(self) -> None:
@@ -97,7 +97,7 @@ class Drone(mobility_pb2_grpc.MobilityServiceServicer):
         self.waypoints_reached = 0
         self.interruptions = 0
 
-    def _note(self, method: str, context: grpc.aio.ServicerContext) -> None:
+    def _record(self, method: str, context: grpc.aio.ServicerContext) -> None:
         self.calls.append(method)
         auth = context.auth_context()
         self.identities.append(auth["x509_subject_alternative_name"][0].decode())
@@ -105,7 +105,7 @@ class Drone(mobility_pb2_grpc.MobilityServiceServicer):
         self.deadlines.append(context.time_remaining())
 
     async def GetControl(self, request, context):  # noqa: N802
-        self._note("GetControl", context)
+        self._record("GetControl", context)
         if self.refuse_control:
             await context.abort(*self.refuse_control)
         self.stream_closed.clear()
@@ -129,39 +129,39 @@ class Drone(mobility_pb2_grpc.MobilityServiceServicer):
             self.stream_closed.set()
 
     async def SubscribeTelemetry(self, request, context):  # noqa: N802
-        self._note("SubscribeTelemetry", context)
+        self._record("SubscribeTelemetry", context)
         yield mobility_pb2.Telemetry(battery_remaining=0.5)
         await self.expired.wait()
         await _expired(context)
 
     async def ReturnControl(self, request, context):  # noqa: N802
-        self._note("ReturnControl", context)
+        self._record("ReturnControl", context)
         self.control.put_nowait(Event(state=Event.STATE_COMPLETE))
         return mobility_pb2.ReturnControlResponse(mission_complete=True)
 
     async def ReportProgress(self, request, context):  # noqa: N802
-        self._note("ReportProgress", context)
+        self._record("ReportProgress", context)
         self.waypoints_reached = request.waypoints
         return mobility_pb2.ReportProgressResponse()
 
     async def Arm(self, request, context):  # noqa: N802
-        self._note("Arm", context)
+        self._record("Arm", context)
         return mobility_pb2.ArmResponse(decision=types_pb2.Decision(action=types_pb2.Decision.ACTION_ALLOW))
 
     async def SetSpeed(self, request, context):  # noqa: N802
-        self._note("SetSpeed", context)
+        self._record("SetSpeed", context)
         speed = min(request.speed_mps, 10.0)
         return mobility_pb2.SetSpeedResponse(decision=_decision(speed != request.speed_mps), speed_mps=speed)
 
     async def GetPosition(self, request, context):  # noqa: N802
-        self._note("GetPosition", context)
+        self._record("GetPosition", context)
         return mobility_pb2.GetPositionResponse(
             position=types_pb2.Position(latitude_deg=40.0, longitude_deg=22.0, altitude_m=5.0),
             velocity=types_pb2.Velocity(north_mps=1.0),
         )
 
     async def Goto(self, request, context):  # noqa: N802
-        self._note("Goto", context)
+        self._record("Goto", context)
         if request.target.latitude_deg > 40.01:
             await _refuse(context)
         if self.interruptions:
@@ -186,16 +186,21 @@ class Drone(mobility_pb2_grpc.MobilityServiceServicer):
 
 
 class Pictures(camera_pb2_grpc.CameraServiceServicer):
-    """A camera whose one picture is 600 kB; `cut` makes its transfer end early, `kept` are those that were not deleted."""
+    """Fake camera service whose picture has 600 kB.
+
+    Attributes:
+        cut: End the transfer of a picture too early.
+        stored: Names of the pictures that were not deleted.
+    """
 
     picture = bytes(range(256)) * 2400
     cut = False
 
     def __init__(self) -> None:
-        self.kept: list[str] = []
+        self.stored: list[str] = []
 
     async def CaptureImage(self, request, context):  # noqa: N802
-        self.kept.append("1.jpg")
+        self.stored.append("1.jpg")
         info = camera_pb2.ImageInfo(name="1.jpg", width=request.width or 640, size_bytes=len(self.picture))
         return camera_pb2.CaptureImageResponse(decision=_decision(False), image=info)
 
@@ -210,12 +215,12 @@ class Pictures(camera_pb2_grpc.CameraServiceServicer):
             )
 
     async def DeleteImage(self, request, context):  # noqa: N802
-        self.kept.remove(request.name)
+        self.stored.remove(request.name)
         return camera_pb2.DeleteImageResponse(decision=_decision(False))
 
 
 class Server:
-    """A gRPC server that can be stopped and started on the same port, as a service that restarts."""
+    """A gRPC server that can be stopped and started again on the same port, like a service that restarts."""
 
     def __init__(self, drone: Drone, pictures: Pictures, tls: Path) -> None:
         self._drone = drone

@@ -74,7 +74,7 @@ async def test_restarted_agent_requests_no_certificate(bench: IdentityBench) -> 
     before = bench.files()
     again = bench.agent()
     await again.step()
-    assert bench.signer.made == 1
+    assert bench.signer.request_count == 1
     assert bench.files() == before
     assert again.ready.is_set()
 
@@ -88,7 +88,7 @@ async def test_certificate_is_renewed_at_two_thirds_with_a_new_key(bench: Identi
     bench.clock.now += timedelta(days=2)
     bench.signer.sign_with = {"begin": bench.clock.now}
     await bench.identity.step()
-    assert bench.signer.made == 2
+    assert bench.signer.request_count == 2
     assert bench.files()["tls.key"] != before["tls.key"]
     assert bench.identity.serial == 2
 
@@ -109,7 +109,7 @@ async def test_expired_certificate_is_replaced(bench: IdentityBench) -> None:
     bench.clock.now += timedelta(days=40)
     bench.signer.sign_with = {"begin": bench.clock.now}
     await bench.identity.step()
-    assert bench.signer.made == 2
+    assert bench.signer.request_count == 2
     assert bench.identity.condition.is_true
 
 
@@ -118,7 +118,7 @@ async def test_rotation_to_a_bundle_keeps_the_certificate(bench: IdentityBench) 
     before = bench.files()
     bench.signer.published = TestAuthority("next").pem + bench.signer.ca.pem
     await bench.identity.step()
-    assert bench.signer.made == 1
+    assert bench.signer.request_count == 1
     assert bench.files() == before | {"ca.crt": bench.signer.published}
 
 
@@ -127,7 +127,7 @@ async def test_rotation_to_another_authority_requests_a_certificate(bench: Ident
     bench.signer.ca = TestAuthority("next")
     bench.signer.published = bench.signer.ca.pem
     await bench.identity.step()
-    assert bench.signer.made == 2
+    assert bench.signer.request_count == 2
     assert bench.files()["ca.crt"] == bench.signer.ca.pem
     assert inspect_certificate(bench.directory, NODE)
 
@@ -206,7 +206,7 @@ async def test_denied_renewal_keeps_the_node_certified(bench: IdentityBench) -> 
         with contextlib.suppress(asyncio.CancelledError):
             await task
     assert identity.condition.is_true
-    assert bench.signer.made == 2
+    assert bench.signer.request_count == 2
 
 
 async def test_certificate_of_another_authority_is_not_installed(bench: IdentityBench) -> None:
@@ -229,7 +229,7 @@ async def test_clock_before_the_validity_requests_nothing_and_recovers(bench: Id
     bench.clock.now = datetime(1970, 1, 1, tzinfo=UTC)
     await bench.identity.step()
     assert bench.identity.condition.reason == "ClockSkew"
-    assert bench.signer.made == 1
+    assert bench.signer.request_count == 1
     bench.clock.now = now
     await bench.identity.step()
     assert bench.identity.condition.is_true
@@ -244,4 +244,4 @@ async def test_clock_after_the_validity_is_reported_and_recovers(bench: Identity
     bench.clock.now = now
     await bench.identity.step()
     assert bench.identity.condition.is_true
-    assert bench.signer.made == 1
+    assert bench.signer.request_count == 1

@@ -1,4 +1,4 @@
-"""Redirector with real namespaces, netfilter and sockets, and gRPC clients that do not repeat calls."""
+"""Redirector with real namespaces, netfilter and sockets, and with gRPC clients that do not repeat calls."""
 
 from __future__ import annotations
 
@@ -27,30 +27,31 @@ TO_CLOUD = {VIP: None}
 
 @pytest.fixture
 def world() -> Iterator[Rig]:
-    with rig() as found:
-        yield found
+    with rig() as world:
+        yield world
 
 
 @pytest.fixture
 def redirector(world: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Redirector]:
-    """Return the redirector of the drone, which sees the namespaces of the drone and its pod."""
+    """The redirector of the drone, with access to the namespaces of the drone and its pod."""
     monkeypatch.setattr(module, "LEASE_S", 60.0)  # a client may take long to start
     conntrack = Conntrack(world.netlink("drone"))
     (tmp_path / "pod").symlink_to(world.path("dpod"))
-    found = Redirector(world.maps("drone"), conntrack, PodNamespaces(tmp_path, node_namespace=world.path("drone")))
-    found.set_services([VIP])
-    yield found
-    found.close()
+    redirector = Redirector(world.maps("drone"), conntrack, PodNamespaces(tmp_path, node_namespace=world.path("drone")))
+    redirector.set_services([VIP])
+    yield redirector
+    redirector.close()
 
 
-def answers(client: subprocess.Popen[str], count: int | None = None) -> list[list[str]]:
-    """Return the next replies to a client, or all remaining ones without a count."""
+def responses(client: subprocess.Popen[str], count: int | None = None) -> list[list[str]]:
+    """Return the next responses to a client as words, or all remaining responses without a count."""
     assert client.stdout is not None
     return [line.split() for line in itertools.islice(client.stdout, count)]
 
 
 def call_once(world: Rig, node: str = "dpod") -> str:
-    return answers(world.client(1, node=node))[0][1]
+    """Return the name of the server that answers one call of a new client."""
+    return responses(world.client(1, node=node))[0][1]
 
 
 @pytest.mark.parametrize("node", ["dpod", "drone"], ids=["pod", "host network"])
@@ -68,23 +69,23 @@ async def test_planned_switches_lose_no_call_of_a_client_that_pauses_between_cal
     world: Rig, redirector: Redirector, size: int, work_s: float
 ) -> None:
     world.servers(work_s)
-    keeping = asyncio.create_task(redirector.run())
+    refresh = asyncio.create_task(redirector.run())
     client = world.client(100_000, 0.2, size)
     redirector._drain_s = 0.5
     drained = 0
     cut = 0
     for number in range(8):
         await asyncio.sleep(0.5)
-        done = await redirector.switch(TO_CLOUD if number % 2 else TO_EDGE, planned=True)
-        drained += done.drained
-        cut += done.cut
+        result = await redirector.switch(TO_CLOUD if number % 2 else TO_EDGE, planned=True)
+        drained += result.drained
+        cut += result.cut
     await asyncio.sleep(1.0)
     client.terminate()
-    found = [answer for answer in await asyncio.to_thread(answers, client) if len(answer) >= 3]
-    keeping.cancel()
-    assert [int(answer[0]) for answer in found] == list(range(len(found)))
-    assert not [answer for answer in found if answer[1] == "FAILED"]
-    switches = sum(a[1] != b[1] for a, b in itertools.pairwise(found))
+    received = [response for response in await asyncio.to_thread(responses, client) if len(response) >= 3]
+    refresh.cancel()
+    assert [int(response[0]) for response in received] == list(range(len(received)))
+    assert not [response for response in received if response[1] == "FAILED"]
+    switches = sum(a[1] != b[1] for a, b in itertools.pairwise(received))
     assert switches >= 6
     assert drained >= 6
     assert cut == 0
@@ -98,18 +99,18 @@ ask, load = channel.unary_unary("/test/Ask"), channel.unary_stream("/test/Send")
 for number in range(5):  # short replies
     ask(f"{number:08d}".encode(), timeout=5)
 print("ready", flush=True)
-came = 0
+received = 0
 try:
     for message in load(sys.argv[2].encode(), timeout=240):
-        came += len(message)
-    print("came", came, flush=True)
+        received += len(message)
+    print("received", received, flush=True)
 except grpc.RpcError as error:
-    print("FAILED", came, error.code().name, error.details().replace(" ", "_"), flush=True)
-who = ""
-while who != "edge":  # until the end of the drain
+    print("FAILED", received, error.code().name, error.details().replace(" ", "_"), flush=True)
+server = ""
+while server != "edge":  # until the end of the drain
     time.sleep(1)
-    who = ask(b"0", timeout=5).decode().split()[0]
-print("then", who, flush=True)
+    server = ask(b"0", timeout=5).decode().split()[0]
+print("then", server, flush=True)
 """
 
 
@@ -119,30 +120,30 @@ async def test_long_reply_on_a_slow_path_finishes_within_the_drain(world: Rig, r
     # 20 MB at 24 Mbit/s, with a queue so short that segments are lost and retransmitted.
     slow = ("rate", "24mbit", "burst", "6kb", "limit", "30kb")
     run(*world.inside("cloud"), "tc", "qdisc", "add", "dev", "eth0", "root", "tbf", *slow)
-    keeping = asyncio.create_task(redirector.run())
+    refresh = asyncio.create_task(redirector.run())
     loader = world.python("dpod", LOADER, f"{VIP.address}:{VIP.port}", 20_000_000)
     await asyncio.sleep(1.0)
-    done = await redirector.switch(TO_EDGE, planned=True)
-    assert await asyncio.to_thread(answers, loader) == [["came", "20000000"], ["then", "edge"]]
-    keeping.cancel()
-    assert (done.drained, done.cut) == (1, 0)
+    result = await redirector.switch(TO_EDGE, planned=True)
+    assert await asyncio.to_thread(responses, loader) == [["received", "20000000"], ["then", "edge"]]
+    refresh.cancel()
+    assert (result.drained, result.cut) == (1, 0)
 
 
 async def test_abrupt_switch_moves_traffic_to_the_cloud_path_at_once(world: Rig, redirector: Redirector) -> None:
     world.servers()
     await redirector.switch(TO_EDGE, planned=True)
     client = world.client(200)
-    await asyncio.to_thread(answers, client, 20)
+    await asyncio.to_thread(responses, client, 20)
     run(*world.inside("edge"), "ip", "link", "set", "fxl0", "down")
     lost_at = time.monotonic()
     await asyncio.sleep(0.4)  # until the loss of the link is detected
-    done = await redirector.switch(TO_CLOUD, planned=False)
-    assert done.cut == 1
-    found = await asyncio.to_thread(answers, client)
-    back = next(float(answer[2]) for answer in found if answer[1] == "cloud")
-    assert back - lost_at < 1.0
-    assert sum(answer[1] == "FAILED" for answer in found) <= 1
-    assert found[-1][1] == "cloud"
+    result = await redirector.switch(TO_CLOUD, planned=False)
+    assert result.cut == 1
+    received = await asyncio.to_thread(responses, client)
+    cloud_at = next(float(response[2]) for response in received if response[1] == "cloud")
+    assert cloud_at - lost_at < 1.0
+    assert sum(response[1] == "FAILED" for response in received) <= 1
+    assert received[-1][1] == "cloud"
 
 
 @pytest.mark.parametrize(("drain_s", "reply"), [(5.0, "cloud"), (1.0, "FAILED")])
@@ -152,15 +153,15 @@ async def test_call_is_cut_only_if_it_takes_longer_than_the_drain(
 ) -> None:
     redirector._drain_s = drain_s
     world.servers(work_s=4.0)
-    keeping = asyncio.create_task(redirector.run())
+    refresh = asyncio.create_task(redirector.run())
     client = world.client(before + 2, pause_s=7.0)
-    shown = await asyncio.to_thread(answers, client, before)
+    received = await asyncio.to_thread(responses, client, before)
     await asyncio.sleep(4.0 if before else 1.0)  # the next call is in progress, for about one second
-    done = await redirector.switch(TO_EDGE, planned=True)
-    shown += await asyncio.to_thread(answers, client)
-    keeping.cancel()
-    assert [answer[1] for answer in shown] == ["cloud"] * before + [reply, "edge"]
-    assert done.drained + done.cut == 1
+    result = await redirector.switch(TO_EDGE, planned=True)
+    received += await asyncio.to_thread(responses, client)
+    refresh.cancel()
+    assert [response[1] for response in received] == ["cloud"] * before + [reply, "edge"]
+    assert result.drained + result.cut == 1
 
 
 async def test_redirects_end_without_an_agent(
@@ -170,11 +171,11 @@ async def test_redirects_end_without_an_agent(
     monkeypatch.setattr(module, "REFRESH_S", 0.3)
     world.servers()
     await redirector.switch(TO_EDGE, planned=True)
-    keeping = asyncio.create_task(redirector.run())
+    refresh = asyncio.create_task(redirector.run())
     await asyncio.sleep(2.0)
     assert await asyncio.to_thread(call_once, world) == "edge"
-    keeping.cancel()
-    await asyncio.gather(keeping, return_exceptions=True)
+    refresh.cancel()
+    await asyncio.gather(refresh, return_exceptions=True)
     assert await asyncio.to_thread(call_once, world) == "cloud"
     # A killed agent leaves elements that time out.
     await redirector.switch(TO_EDGE, planned=True)
@@ -188,7 +189,7 @@ async def test_a_hundred_switches_end_in_the_last_state(world: Rig, redirector: 
     for number in range(100):
         await redirector.switch(TO_CLOUD if number % 2 else TO_EDGE, planned=bool(number % 3))
     assert redirector.redirects == {}
-    await asyncio.to_thread(answers, client)  # it may end before the last switch
+    await asyncio.to_thread(responses, client)  # may be complete before the last switch
     assert await asyncio.to_thread(call_once, world) == "cloud"
 
 
@@ -204,26 +205,26 @@ async def test_connection_opened_during_a_drain_survives_it(world: Rig, redirect
     redirector._drain_s = 5.0
     world.servers(work_s=3.0)
     busy = world.client(20, pause_s=0.01)
-    await asyncio.to_thread(answers, busy, 1)
+    await asyncio.to_thread(responses, busy, 1)
     switch = asyncio.create_task(redirector.switch(TO_EDGE, planned=True))
     await asyncio.sleep(0.2)
     fresh = world.client(1)  # its call is in progress when the old path is cleaned up
-    done = await switch
+    result = await switch
     busy.kill()
-    assert done.drained + done.cut >= 1
-    assert [answer[1] for answer in await asyncio.to_thread(answers, fresh)] == ["edge"]
+    assert result.drained + result.cut >= 1
+    assert [response[1] for response in await asyncio.to_thread(responses, fresh)] == ["edge"]
 
 
 async def test_cancelled_drain_cuts_the_connections_on_the_old_path(world: Rig, redirector: Redirector) -> None:
     world.servers(work_s=2.0)
     client = world.client(2, pause_s=0.01)
-    await asyncio.sleep(1.5)  # its call is in progress
+    await asyncio.sleep(1.5)  # the call of the client is in progress
     switch = asyncio.create_task(redirector.switch(TO_EDGE, planned=True))
     await asyncio.sleep(0.1)
     switch.cancel()
     await asyncio.gather(switch, return_exceptions=True)
     assert redirector.redirects == TO_EDGE
-    assert (await asyncio.to_thread(answers, client))[-1][1] == "edge"
+    assert (await asyncio.to_thread(responses, client))[-1][1] == "edge"
 
 
 async def test_abrupt_switch_does_not_wait_for_a_drain_or_cut_the_other_path(
@@ -239,8 +240,8 @@ async def test_abrupt_switch_does_not_wait_for_a_drain_or_cut_the_other_path(
     lost = await redirector.switch(TO_CLOUD, planned=False)
     assert time.monotonic() - begun < 0.5
     assert redirector.redirects == {}
-    assert lost.cut == 0, "the call is still on the cloud path, which works"
-    assert [answer[1] for answer in await asyncio.to_thread(answers, client)] == ["cloud"]
+    assert lost.cut == 0, "a connection on the working cloud path was closed"
+    assert [response[1] for response in await asyncio.to_thread(responses, client)] == ["cloud"]
     await drain
 
 
@@ -249,13 +250,13 @@ async def test_flushed_table_is_created_again(world: Rig, redirector: Redirector
     await redirector.switch(TO_EDGE, planned=True)
     run(*world.inside("drone"), "nft", "flush", "ruleset")
     assert await asyncio.to_thread(call_once, world) == "cloud"
-    keeping = asyncio.create_task(redirector.run())
+    refresh = asyncio.create_task(redirector.run())
     await asyncio.sleep(2 * module.REFRESH_S)
     assert await asyncio.to_thread(call_once, world) == "edge"
     run(*world.inside("drone"), "nft", "flush", "ruleset")
     await redirector.switch(TO_CLOUD, planned=True)
     assert await asyncio.to_thread(call_once, world) == "cloud"
-    keeping.cancel()
+    refresh.cancel()
 
 
 def test_transaction_without_permission_is_refused() -> None:
@@ -264,11 +265,11 @@ from fractus_agent.redirector.netlink import NETLINK_NETFILTER, Netlink
 from fractus_agent.redirector.nft_maps import NftMaps
 NftMaps(Netlink(NETLINK_NETFILTER), lambda _: None).write([], None, 5.0)
 """
-    done = subprocess.run(
+    result = subprocess.run(
         ["setpriv", "--inh-caps=-net_admin", "--bounding-set=-net_admin", sys.executable, "-c", program],
         capture_output=True, text=True, timeout=60, check=False,
     )  # fmt: skip
-    assert "refused a batch: Operation not permitted" in done.stderr
+    assert "refused a batch: Operation not permitted" in result.stderr
 
 
 def test_only_allowed_callers_are_redirected(world: Rig, redirector: Redirector) -> None:
@@ -284,9 +285,9 @@ def test_only_allowed_callers_are_redirected(world: Rig, redirector: Redirector)
     assert call_once(world, other) == "edge"
     assert call_once(world, "drone") == "edge"
     assert call_once(world) == "cloud"
-    # Remove the table: the new table contains the callers from the beginning.
+    # After the table was removed, the new table contains the callers from the beginning.
     run(*world.inside("drone"), "nft", "flush", "ruleset")
-    redirector.set_peers([])  # this writes everything except the callers
+    redirector.set_peers([])  # writes the whole table except the callers
     assert call_once(world) == "cloud"
     assert call_once(world, other) == "edge"
 
@@ -315,9 +316,9 @@ def test_guarded_pod_accepts_only_calls_over_links(world: Rig, redirector: Redir
     world.servers()
     for words in KUBE_PROXY[mode]:
         run(*world.inside("edge"), *words)
-    stranger = world.pod("other", "10.86.0", at="edge")
+    other_pod = world.pod("other", "10.86.0", at="edge")
 
-    def reached(address: str, node: str = stranger) -> bool:
+    def reached(address: str, node: str = other_pod) -> bool:
         return world.reaches(node, address, POD.port)
 
     assert reached(str(POD.address))
@@ -326,42 +327,42 @@ def test_guarded_pod_accepts_only_calls_over_links(world: Rig, redirector: Redir
     edge.set_services([], {POD: frozenset()})
     assert not reached(str(POD.address))
     assert not reached("10.96.0.9")
-    assert reached(str(POD.address), "edge"), "the node itself, for the probes of kubelet"
-    # A drone links: only its calls are redirected to the pod.
+    assert reached(str(POD.address), "edge"), "the node cannot reach the pod, as kubelet does for probes"
+    # While a drone is linked, only its calls are redirected to the pod.
     edge.set_services([DIRECT], {POD: frozenset()})
     edge.set_peers([DRONE])
     edge.set_targets({DIRECT: POD})
     redirector.set_targets(TO_EDGE)
     assert call_once(world) == "edge"
     assert not reached(str(POD.address))
-    # The drone leaves.
+    # After the drone has left, no call reaches the pod.
     edge.set_services([], {POD: frozenset()})
     redirector.set_services([])
     assert call_once(world) == "cloud"
     assert not reached(str(POD.address))
 
 
-@pytest.mark.parametrize("owners", ["", "to the north", "x" * 255])
-def test_device_brought_up_by_a_killed_agent_is_taken_down_by_the_next(world: Rig, owners: str) -> None:
-    def words() -> str:
-        done = subprocess.run(
+@pytest.mark.parametrize("owner_alias", ["", "to the north", "x" * 255])
+def test_device_brought_up_by_a_killed_agent_is_taken_down_by_the_next(world: Rig, owner_alias: str) -> None:
+    def link_state() -> str:
+        result = subprocess.run(
             [*world.inside("drone"), "ip", "link", "show", "dev", "fxl0"], capture_output=True, text=True, check=True
         )
-        return done.stdout
+        return result.stdout
 
     address = IPv4Address("169.254.7.7")
-    run(*world.inside("drone"), "ip", "link", "set", "fxl0", "alias", owners)
+    run(*world.inside("drone"), "ip", "link", "set", "fxl0", "alias", owner_alias)
     for was_up in (False, True):
         run(*world.inside("drone"), "ip", "link", "set", "fxl0", "up" if was_up else "down")
         for agent in range(2):  # the first agent is killed
             in_namespace(world.path("drone"), lambda: asyncio.run(DeviceAddresses("fxl0").set(address)))
-            assert "UP" in words(), agent
-            assert owners in words()
+            assert "UP" in link_state(), agent
+            assert owner_alias in link_state()
         in_namespace(world.path("drone"), lambda: asyncio.run(DeviceAddresses("fxl0").clear()))
         # If the owner's alias leaves no room for the suffix, the device stays up.
-        assert ("state UP" in words()) is (was_up or len(owners) == 255)
-        alias = words().partition("alias ")[2].strip()
-        assert alias == owners
+        assert ("state UP" in link_state()) is (was_up or len(owner_alias) == 255)
+        alias = link_state().partition("alias ")[2].strip()
+        assert alias == owner_alias
 
 
 async def test_bytes_of_a_service_on_the_link_are_counted(world: Rig, redirector: Redirector) -> None:
@@ -370,7 +371,7 @@ async def test_bytes_of_a_service_on_the_link_are_counted(world: Rig, redirector
     assert redirector.byte_counts() == {}
     await redirector.switch(TO_EDGE, planned=True)
     client = world.client(3, size=100_000)
-    await asyncio.to_thread(answers, client)
+    await asyncio.to_thread(responses, client)
     sent, received = redirector.byte_counts()[VIP]
     assert 300_000 < sent < 400_000
     assert 100 < received < 100_000

@@ -32,13 +32,13 @@ BUILT_ON = "component"
 def script(beginning: str) -> str:
     """Return the script of the workflow's step with this beginning."""
     steps = [step for job in WORKFLOW["jobs"].values() for step in job["steps"]]
-    (found,) = [step["run"] for step in steps if step.get("run", "").startswith(beginning)]
-    return str(found)
+    (text,) = [step["run"] for step in steps if step.get("run", "").startswith(beginning)]
+    return str(text)
 
 
 STUBS = {
     "make": f'shift; exec {shutil.which("make")} -C {ROOT} charts archives DIST="$PWD/dist" "$@"',
-    # An archive holds the name of its image here.
+    # The stub writes only the name of the image to the archive.
     "docker": """
 while [ $# -gt 0 ]; do
   case $1 in --tag) name=$2 ;; --output) archive=${2##*dest=} ;; esac
@@ -55,12 +55,12 @@ echo "$(cat "${1#oci-archive:}") ${2#docker://}" >> saved-and-pushed
 """,
     "cosign": 'echo "$3" >> signed',
 }
-"""Replacements for programs that would build images for half an hour, or need a registry."""
+"""Stubs for programs that would build images for half an hour, or that need a registry."""
 
 
 @pytest.fixture(scope="module")
 def published(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A directory after the workflow's commands ran with stubs for a tag: `dist`, and lists of images."""
+    """Run the commands of the workflow for a tag with stubs. The directory contains `dist` and lists of images."""
     folder = tmp_path_factory.mktemp("release")
     (folder / "programs").mkdir()
     for name, text in STUBS.items():
@@ -80,17 +80,17 @@ def rendered(folder: Path, chart: str, *values: str) -> list[Body]:
 
 def images_of(bodies: list[Body]) -> set[str]:
     """Return the images in objects and in manifests that ConfigMaps contain."""
-    kept = [text for body in bodies if body["kind"] == "ConfigMap" for text in body["data"].values()]
-    texts = [yaml.safe_dump(bodies), *kept]
+    stored_manifests = [text for body in bodies if body["kind"] == "ConfigMap" for text in body["data"].values()]
+    texts = [yaml.safe_dump(bodies), *stored_manifests]
     return {name for text in texts for name in re.findall(r"^ *(?:- )?image: (\S+)$", text, re.MULTILINE)}
 
 
 def test_charts_of_a_release_name_its_pushed_images(published: Path) -> None:
     pairs = [line.split() for line in (published / "saved-and-pushed").read_text().splitlines()]
-    assert all(saved == to for saved, to in pairs), (
-        "an archive that is loaded has the name by which its image is pulled"
+    assert all(saved == pushed for saved, pushed in pairs), (
+        "the image in an archive has another name than the pushed one"
     )
-    pushed = {to for _, to in pairs}
+    pushed = {name for _, name in pairs}
     assert f"ghcr.io/some-one/fractus/operator:{VERSION}" in pushed
     bodies = [*rendered(published, "fractus", *EVERYTHING), *rendered(published, "fractus-demo", "--set=drone=d")]
     assert images_of(bodies) | {f"ghcr.io/some-one/fractus/{BUILT_ON}:{VERSION}"} == pushed
@@ -109,7 +109,7 @@ def test_image_tag_of_the_values_is_used() -> None:
 
 
 def test_dist_refuses_a_tag_of_another_version() -> None:
-    done = subprocess.run(
+    result = subprocess.run(
         ["make", "dist", "TAG=v9.9.9", "PLATFORMS=none"],
         cwd=ROOT,
         capture_output=True,
@@ -117,34 +117,34 @@ def test_dist_refuses_a_tag_of_another_version() -> None:
         timeout=60,
         check=False,
     )
-    assert done.returncode == 2
+    assert result.returncode == 2
     assert (
         f"the tag v9.9.9 does not match version {VERSION} in pyproject.toml; run make release VERSION=9.9.9"
-        in done.stderr
+        in result.stderr
     )
 
 
 def test_audit_fails_if_advisories_are_unreachable() -> None:
     nowhere = {"HTTPS_PROXY": "http://127.0.0.1:9", "https_proxy": "http://127.0.0.1:9"}
-    done = subprocess.run(
+    result = subprocess.run(
         ["make", "--silent", "audit"], cwd=ROOT, env={**os.environ, **nowhere}, capture_output=True, text=True, timeout=120, check=False
     )  # fmt: skip
-    assert done.returncode == 2
-    assert done.stderr.startswith("audit not possible: cannot reach the advisories of PyPI (https://pypi.org/")
+    assert result.returncode == 2
+    assert result.stderr.startswith("audit not possible: cannot reach the advisories of PyPI (https://pypi.org/")
 
 
 @pytest.mark.root
 @pytest.mark.timeout(900)
 @pytest.mark.xdist_group("cluster")
-def test_archive_has_the_image_name_of_the_charts(tmp_path: Path) -> None:
+def test_release_archive_has_the_image_name_of_the_charts(tmp_path: Path) -> None:
     run(
         ["make", "archives", "RELEASED=component", "REGISTRY=registry.example/f", f"DIST={tmp_path}"],
         cwd=ROOT,
         timeout_s=600,
     )
     with tarfile.open(tmp_path / f"component-{VERSION}.image.tar") as archive:
-        described = json.loads((archive.extractfile("manifest.json") or pytest.fail("no manifest")).read())
-    (image,) = described
+        manifest = json.loads((archive.extractfile("manifest.json") or pytest.fail("no manifest")).read())
+    (image,) = manifest
     assert f"registry.example/f/component:{VERSION}" in image["RepoTags"]
 
 
@@ -162,8 +162,8 @@ def test_notes_warn_about_another_image_tag(
         "--kubeconfig",
         str(control_plane.kubeconfig),
     ]
-    done = subprocess.run(argv, capture_output=True, text=True, timeout=60, check=False)
-    assert done.returncode == 0, done.stderr
-    notes = done.stdout.partition("NOTES:")[2]
+    result = subprocess.run(argv, capture_output=True, text=True, timeout=60, check=False)
+    assert result.returncode == 0, result.stderr
+    notes = result.stdout.partition("NOTES:")[2]
     assert f"from the images ghcr.io/some-one/fractus/NAME:{tag or VERSION}." in notes
     assert (f"images with the tag {VERSION}; --set image.tag= takes them" in notes) is warned

@@ -1,4 +1,4 @@
-"""The operator while etcd is restored from an older backup: resource versions go back."""
+"""The operator when etcd is restored from an older backup, so that resource versions decrease."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from operator_world import FRACTUS, OperatorProcess, World, fresh_namespace, tra
 
 @pytest.fixture
 def plane(tmp_path: Path) -> Iterator[ControlPlane]:
-    """One of the test's own."""
+    """A separate control plane, whose storage the test replaces."""
     plane = ControlPlane(programs(), tmp_path / "plane")
     try:
         plane.start()

@@ -31,14 +31,14 @@ ALL = ("deletecollection",)
 
 @cache
 def chart_roles() -> dict[str, Body]:
-    """The roles that someone may bind, by name."""
+    """Return the roles for users by name."""
     names = {f"fractus-{kind}-{role}" for kind in KINDS for role in ("viewer", "editor", "admin")}
     return {body["metadata"]["name"]: body for body in render() if body["metadata"]["name"] in names}
 
 
 @pytest.fixture(scope="module")
 def roles(control_plane: Any) -> Iterator[World]:
-    """A control plane with the roles, aggregated."""
+    """A control plane with the roles, after the built-in roles include them."""
     world = World(control_plane)
     for body in chart_roles().values():
         world.api.apply(path_of(body), body)
@@ -53,7 +53,7 @@ def roles(control_plane: Any) -> Iterator[World]:
 
 @contextmanager
 def bound(world: World, role: str, group: str) -> Iterator[None]:
-    """A group that has a ClusterRole in the whole cluster."""
+    """Bind a ClusterRole to a group in the whole cluster."""
     body = {
         "apiVersion": "rbac.authorization.k8s.io/v1",
         "kind": "ClusterRoleBinding",
@@ -69,12 +69,12 @@ def bound(world: World, role: str, group: str) -> Iterator[None]:
 
 
 def may(world: World, group: str, verb: str, plural: str, subresource: str = "") -> bool:
-    """What the API server answers to an access review."""
-    asked = {"group": "fractus.dev", "resource": plural, "verb": verb, "subresource": subresource}
+    """Return True if the API server permits a request of the group."""
+    attributes = {"group": "fractus.dev", "resource": plural, "verb": verb, "subresource": subresource}
     review = {
         "apiVersion": "authorization.k8s.io/v1",
         "kind": "SubjectAccessReview",
-        "spec": {"user": "someone", "groups": [group], "resourceAttributes": asked},
+        "spec": {"user": "someone", "groups": [group], "resourceAttributes": attributes},
     }
     return bool(
         world.api.call("POST", "/apis/authorization.k8s.io/v1/subjectaccessreviews", review)["status"]["allowed"]
@@ -82,14 +82,14 @@ def may(world: World, group: str, verb: str, plural: str, subresource: str = "")
 
 
 def allowed(world: World, role: str) -> set[tuple[str, str]]:
-    """What a role lets do with which kind."""
+    """Return the verbs and kinds that a role permits."""
     group = f"t-{role}"
     with bound(world, role, group):
-        # The authorizer hears of bindings by a watch.
+        # The authorizer receives bindings through a watch, with a delay.
         wait_for(lambda: any(may(world, group, "get", kind) for kind in KINDS.values()), f"{role} is in force")
-        found = {(v, kind) for kind in KINDS for v in (*READ, *WRITE, *ALL) if may(world, group, v, KINDS[kind])}
+        permitted = {(v, kind) for kind in KINDS for v in (*READ, *WRITE, *ALL) if may(world, group, v, KINDS[kind])}
         assert not any(may(world, group, verb, kind, "status") for verb in WRITE for kind in KINDS.values())
-    return found
+    return permitted
 
 
 def test_every_kind_has_viewer_editor_and_admin_roles() -> None:
@@ -132,16 +132,20 @@ def test_documented_commands_permit_zones_and_policies(roles: World, tmp_path: P
     for line in lines:
         shell.type(line)
     try:
-        for asked, answer in (("create zones", "yes"), ("patch policies.fractus.dev", "yes"), ("create drones", "no")):
-            line = f"kubectl auth can-i {asked} --as=anna --as-group=aviation || true"
-            wait_for(lambda line=line, answer=answer: shell.type(line).split() == [answer], asked)
+        for request, expected in (
+            ("create zones", "yes"),
+            ("patch policies.fractus.dev", "yes"),
+            ("create drones", "no"),
+        ):
+            line = f"kubectl auth can-i {request} --as=anna --as-group=aviation || true"
+            wait_for(lambda line=line, expected=expected: shell.type(line).split() == [expected], request)
     finally:
         for line in lines:
             shell.type(f"kubectl delete clusterrolebinding {line.split()[3]}")
 
 
 def test_roles_are_not_aggregated_if_disabled() -> None:
-    found = {body["metadata"]["name"]: body for body in render("--set=rbac.aggregate=false")}
+    rendered = {body["metadata"]["name"]: body for body in render("--set=rbac.aggregate=false")}
     for name, role in chart_roles().items():
-        assert found[name]["rules"] == role["rules"]
-        assert not [label for label in found[name]["metadata"]["labels"] if "aggregate" in label]
+        assert rendered[name]["rules"] == role["rules"]
+        assert not [label for label in rendered[name]["metadata"]["labels"] if "aggregate" in label]

@@ -285,7 +285,7 @@ async def test_camera_every_takes_pictures_repeatedly(stage: Stage) -> None:
     async with Camera(stage.endpoint) as camera, contextlib.aclosing(camera.every(0.0)) as pictures:
         first = await anext(pictures)
         second = await anext(pictures)
-        assert not stage.pictures.kept
+        assert not stage.pictures.stored
     assert [(p.info.name, p.data) for p in (first, second)] == [("1.jpg", stage.pictures.picture)] * 2
 
 
@@ -294,7 +294,7 @@ async def test_picture_that_cannot_be_retrieved_is_deleted(stage: Stage) -> None
     async with Camera(stage.endpoint) as camera:
         with pytest.raises(fractus.Unavailable, match="ended after"):
             await camera.take()
-    assert not stage.pictures.kept
+    assert not stage.pictures.stored
 
 
 async def test_exception_in_block_does_not_return_control(stage: Stage) -> None:

@@ -20,7 +20,7 @@ ALTITUDE_M = 12.0
 
 
 def saved_plan(path: Path) -> Path:
-    """What QGroundControl writes for a takeoff, a speed, two waypoints and a return."""
+    """Write the plan that QGroundControl saves for a takeoff, a speed, two waypoints and a return."""
 
     def item(command: int, *params: float | None, frame: int = 3) -> dict[str, object]:
         return {"type": "SimpleItem", "command": command, "frame": frame, "params": list(params)}
@@ -33,15 +33,15 @@ def saved_plan(path: Path) -> Path:
     return path
 
 
-def distance_m(here: fractus.Position) -> float:
-    """Over ground from the middle of the orbit."""
-    north = math.radians(here.lat - MIDDLE[0]) * 6_371_008.8
-    east = math.radians(here.lon - MIDDLE[1]) * 6_371_008.8 * math.cos(math.radians(MIDDLE[0]))
+def distance_m(position: fractus.Position) -> float:
+    """Return the horizontal distance from the centre of the orbit."""
+    north = math.radians(position.lat - MIDDLE[0]) * 6_371_008.8
+    east = math.radians(position.lon - MIDDLE[1]) * 6_371_008.8 * math.cos(math.radians(MIDDLE[0]))
     return math.hypot(north, east)
 
 
 class Killed(Exception):
-    """What ends the first life of the program in flight."""
+    """Ends the first run of the program in flight."""
 
 
 async def test_plan_and_orbit_mission_survives_pause_and_restart(rig: Rig) -> None:
@@ -60,7 +60,7 @@ async def test_plan_and_orbit_mission_survives_pause_and_restart(rig: Rig) -> No
                 await drone.arm()
                 await drone.takeoff(ALTITUDE_M)
                 mission = drone.mission(waypoints)
-                flight = asyncio.ensure_future(mission.fly(lambda at: under_way[at.number].set()))
+                flight = asyncio.ensure_future(mission.fly(lambda step: under_way[step.number].set()))
                 await under_way[2].wait()
                 mission.pause()
                 await rig.until(lambda t: math.hypot(t.velocity.north_mps, t.velocity.east_mps) < 0.5, 60, "a hover")
@@ -71,24 +71,26 @@ async def test_plan_and_orbit_mission_survives_pause_and_restart(rig: Rig) -> No
                 await asyncio.gather(flight, return_exceptions=True)
                 raise Killed
 
-    seen: list[int] = []
+    flown: list[int] = []
     radii: list[float] = []
     async with fractus.mobility(endpoint(rig)) as drone, drone.control() as control:
-        assert control.waypoints_reached == 3, "one of the orbit, after both of the plan"
+        assert control.waypoints_reached == 3  # both of the plan, and one of the orbit
         await drone.arm()
         await drone.takeoff(ALTITUDE_M)
-        flight = asyncio.ensure_future(drone.mission(waypoints).fly(lambda at: seen.append(at.number)))
+        flight = asyncio.ensure_future(drone.mission(waypoints).fly(lambda step: flown.append(step.number)))
         async for state in drone.telemetry(0.2):
             if flight.done():
                 break
-            if state.position is not None and seen and seen[-1] > 4:
+            if state.position is not None and flown and flown[-1] > 4:
                 radii.append(distance_m(state.position))
         assert await flight == {}
-        assert set(seen) == set(range(4, len(waypoints) + 1)), "nothing is flown twice"
+        assert set(flown) == set(range(4, len(waypoints) + 1)), (
+            "a completed waypoint was flown again, or one was omitted"
+        )
         await drone.turn(135)
         attitude = await anext(drone.watch.attitude())
         assert abs((attitude.yaw_deg - 135 + 180) % 360 - 180) < 10
     assert control.mission_complete
-    # Between two of eight waypoints the circle is cut to 92 % of its radius.
+    # The straight line between two of eight waypoints comes within 92 % of the radius.
     assert radii and all(0.8 * RADIUS_M < radius < 1.2 * RADIUS_M for radius in radii), (min(radii), max(radii))
     await rig.until(lambda t: not t.armed, 120, "landing")

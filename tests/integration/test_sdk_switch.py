@@ -42,8 +42,8 @@ async def request():
         print("ready", flush=True)
         for number in range(count):
             begun = loop.time()
-            who = await checker.request("check", bytes(size), request_id=str(number))
-            print(json.dumps({"number": number, "who": who.decode(), "at": loop.time()}), flush=True)
+            server = await checker.request("check", bytes(size), request_id=str(number))
+            print(json.dumps({"number": number, "server": server.decode(), "at": loop.time()}), flush=True)
             await asyncio.sleep(max(pause_s - (loop.time() - begun), 0))
 asyncio.run(ask())
 """
@@ -51,18 +51,18 @@ asyncio.run(ask())
 
 @pytest.fixture
 def world() -> Iterator[Rig]:
-    with rig() as found:
-        yield found
+    with rig() as world:
+        yield world
 
 
 @pytest.fixture
 def redirector(world: Rig, tmp_path: Path) -> Iterator[Redirector]:
     (tmp_path / "pod").symlink_to(world.path("dpod"))
     conntrack = Conntrack(world.netlink("drone"))
-    found = Redirector(world.maps("drone"), conntrack, PodNamespaces(tmp_path, node_namespace=world.path("drone")))
-    found.set_services([VIP])
-    yield found
-    found.close()
+    redirector = Redirector(world.maps("drone"), conntrack, PodNamespaces(tmp_path, node_namespace=world.path("drone")))
+    redirector.set_services([VIP])
+    yield redirector
+    redirector.close()
 
 
 class SdkTraffic:
@@ -76,23 +76,23 @@ class SdkTraffic:
         }
         self.client = world.python("dpod", CLIENT, f"{VIP.address}:{VIP.port}", count, pause_s, size)
 
-    def answers(self, count: int | None = None) -> list[dict[str, object]]:
-        """Return the next replies to the client, or all remaining ones without a count."""
-        found: list[dict[str, object]] = []
+    def responses(self, count: int | None = None) -> list[dict[str, object]]:
+        """Return the next responses to the client, or all remaining responses without a count."""
+        responses: list[dict[str, object]] = []
         assert self.client.stdout is not None
-        while count is None or len(found) < count:
+        while count is None or len(responses) < count:
             line = self.client.stdout.readline()
             if not line:
                 break
-            found.append(json.loads(line))
-        return found
+            responses.append(json.loads(line))
+        return responses
 
     def executed_ids(self) -> dict[str, list[str]]:
-        """Return the ids of the requests that each instance has executed."""
-        return {name: _rest(process) for name, process in self.servers.items()}
+        """Stop the instances, and return the ids of the requests that each of them has executed."""
+        return {name: _printed_ids(process) for name, process in self.servers.items()}
 
 
-def _rest(process: subprocess.Popen[str]) -> list[str]:
+def _printed_ids(process: subprocess.Popen[str]) -> list[str]:
     process.terminate()
     assert process.stdout is not None
     return process.stdout.read().split()
@@ -102,43 +102,42 @@ def _rest(process: subprocess.Popen[str]) -> list[str]:
 async def test_planned_switches_lose_and_repeat_no_sdk_request(
     world: Rig, redirector: Redirector, pause_s: float, size: int
 ) -> None:
-    talk = SdkTraffic(world, round(6.0 / pause_s), pause_s, size)
-    keeping = asyncio.create_task(redirector.run())
+    traffic = SdkTraffic(world, round(6.0 / pause_s), pause_s, size)
+    refresh = asyncio.create_task(redirector.run())
     for number in range(6):
         await asyncio.sleep(0.5)
         await redirector.switch({VIP: None if number % 2 else DIRECT}, planned=True)
-    found = await asyncio.to_thread(talk.answers)
-    keeping.cancel()
-    assert [answer["number"] for answer in found] == list(range(talk.count))
-    assert {answer["who"] for answer in found} == {"cloud", "edge"}
-    carried = talk.executed_ids()
-    times = Counter(carried["cloud"] + carried["edge"])
-    assert set(times) == {str(number) for number in range(talk.count)}
-    # A request whose reply was cut off is repeated to the other instance with the same id.
-    assert all(count == 1 for each in carried.values() for count in Counter(each).values())
+    responses = await asyncio.to_thread(traffic.responses)
+    refresh.cancel()
+    assert [response["number"] for response in responses] == list(range(traffic.count))
+    assert {response["server"] for response in responses} == {"cloud", "edge"}
+    executed = traffic.executed_ids()
+    assert set(executed["cloud"] + executed["edge"]) == {str(number) for number in range(traffic.count)}
+    # A request whose response was lost is repeated to the other instance with the same id, so each instance is checked alone.
+    assert all(count == 1 for ids in executed.values() for count in Counter(ids).values())
 
 
 async def test_lost_direct_link_loses_no_sdk_request(world: Rig, redirector: Redirector) -> None:
     await redirector.switch({VIP: DIRECT}, planned=True)
-    talk = SdkTraffic(world, 100, 0.02, 100_000)
-    before = await asyncio.to_thread(talk.answers, 20)
+    traffic = SdkTraffic(world, 100, 0.02, 100_000)
+    before = await asyncio.to_thread(traffic.responses, 20)
     run(*world.inside("edge"), "ip", "link", "set", "fxl0", "down")
     await asyncio.sleep(0.4)  # until the loss of the link is detected
     await redirector.switch({VIP: None}, planned=False)
-    found = before + await asyncio.to_thread(talk.answers)
-    assert [answer["number"] for answer in found] == list(range(100))
-    assert found[-1]["who"] == "cloud"
-    carried = talk.executed_ids()
-    assert set(carried["cloud"]) | set(carried["edge"]) == {str(number) for number in range(100)}
-    assert all(count == 1 for each in carried.values() for count in Counter(each).values())
+    responses = before + await asyncio.to_thread(traffic.responses)
+    assert [response["number"] for response in responses] == list(range(100))
+    assert responses[-1]["server"] == "cloud"
+    executed = traffic.executed_ids()
+    assert set(executed["cloud"]) | set(executed["edge"]) == {str(number) for number in range(100)}
+    assert all(count == 1 for ids in executed.values() for count in Counter(ids).values())
 
 
 @pytest.mark.usefixtures("redirector")
 async def test_aged_sdk_connections_move_to_the_new_path_without_a_switch(world: Rig) -> None:
     """Change the map without closing the connection of a busy client."""
-    talk = SdkTraffic(world, 400, 0.01, 10, age_s=1.0)
-    await asyncio.to_thread(talk.answers, 20)
+    traffic = SdkTraffic(world, 400, 0.01, 10, age_s=1.0)
+    await asyncio.to_thread(traffic.responses, 20)
     world.maps("drone").write([Redirect(VIP, DIRECT)], None, 600.0)
-    found = await asyncio.to_thread(talk.answers)
-    assert found[-1]["who"] == "edge"
-    assert found[-1]["number"] == 399
+    responses = await asyncio.to_thread(traffic.responses)
+    assert responses[-1]["server"] == "edge"
+    assert responses[-1]["number"] == 399

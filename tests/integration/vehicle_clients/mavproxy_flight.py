@@ -47,13 +47,13 @@ class Session:
                 self._news.notify_all()
 
     def wait(self, pattern: str, timeout_s: float = 40.0) -> None:
-        """Wait for a pattern in what was printed since the last command."""
+        """Wait for a pattern in the output since the last command."""
         with self._news:
             if not self._news.wait_for(lambda: re.search(pattern, self._output) is not None, timeout_s):
                 raise SystemExit(f"timeout: {pattern}")
 
     def do(self, command: str, pattern: str, timeout_s: float = 40.0) -> None:
-        """Type a command and wait for its answer."""
+        """Type a command and wait for a pattern in its output."""
         assert self._process.stdin is not None
         with self._news:
             self._output = ""
@@ -62,7 +62,7 @@ class Session:
         self.wait(pattern, timeout_s)
 
     def repeat(self, command: str, pattern: str, timeout_s: float = 40.0) -> None:
-        """Type a command until its answer has the pattern."""
+        """Type a command repeatedly until its output contains the pattern."""
         end = time.monotonic() + timeout_s
         while True:
             try:
@@ -80,7 +80,7 @@ class Session:
 
 
 def fly(session: Session, directory: Path) -> None:
-    """The session."""
+    """Type the commands of the flight."""
     session.wait(r"Received \d+ parameters")
     session.do("param show WPNAV_SPEED", r"WPNAV_SPEED +10")
     session.do("param set WPNAV_SPEED 800", "")
@@ -105,7 +105,7 @@ def fly(session: Session, directory: Path) -> None:
 
 
 def main(address: str, directory: Path) -> None:
-    """Fly, and end MAVProxy whatever happens."""
+    """Fly with MAVProxy, and end MAVProxy."""
     session = Session(address, directory)
     try:
         fly(session, directory)

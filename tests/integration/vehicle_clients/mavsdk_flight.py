@@ -1,4 +1,4 @@
-"""MAVSDK-Python 4: action, telemetry, offboard, geofence, param and mission plugins."""
+"""A MAVSDK-Python 4 program that uses the plugins action, telemetry, offboard, geofence, param and mission."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ METRES = 111_319.0
 
 
 async def first(
-    stream: AsyncIterator[Any], condition: Callable[[Any], bool], what: str, timeout_s: float = 40.0
+    stream: AsyncIterator[Any], condition: Callable[[Any], bool], description: str, timeout_s: float = 40.0
 ) -> Any:
-    """The first value for which a condition holds."""
+    """Return the first value of a stream for which a condition holds."""
     async with asyncio.timeout(timeout_s):
         async for value in stream:
             if condition(value):
-                print("ok:", what, flush=True)
+                print("ok:", description, flush=True)
                 return value
-    raise SystemExit(f"stream ended: {what}")
+    raise SystemExit(f"stream ended: {description}")
 
 
 async def fly(url: str) -> None:
@@ -61,7 +61,7 @@ async def fly(url: str) -> None:
 
 
 async def parameters(params: param.ParamAsync) -> None:
-    """Read, write and list."""
+    """Read, write and list parameters."""
     assert await params.get_param_float("WPNAV_SPEED") == 1000.0
     await params.set_param_float("WPNAV_SPEED", 900.0)
     assert await params.get_param_float("WPNAV_SPEED") == 900.0
@@ -71,19 +71,19 @@ async def parameters(params: param.ParamAsync) -> None:
 
 
 async def steer(board: offboard.OffboardAsync, sense: telemetry.TelemetryAsync) -> None:
-    """Positions and velocities through the offboard plugin."""
+    """Fly positions and velocities with the offboard plugin."""
     await board.set_position_ned(PositionNedYaw(20.0, 0.0, -10.0, 0.0))
     await board.start()
     await board.set_position_ned(PositionNedYaw(20.0, 10.0, -12.0, 90.0))
-    there = lambda p: abs(p.position.east_m - 10.0) < 0.7 and abs(p.position.down_m + 12.0) < 0.5  # noqa: E731
-    await first(sense.subscribe_position_velocity_ned(), there, "offboard position")
+    arrived = lambda p: abs(p.position.east_m - 10.0) < 0.7 and abs(p.position.down_m + 12.0) < 0.5  # noqa: E731
+    await first(sense.subscribe_position_velocity_ned(), arrived, "offboard position")
     await board.set_velocity_ned(VelocityNedYaw(-2.0, 0.0, 0.0, 0.0))
     await first(sense.subscribe_velocity_ned(), lambda v: v.north_m_s < -1.7, "offboard velocity")
     await board.stop()
 
 
 async def fence(fences: geofence.GeofenceAsync, home: Any) -> None:
-    """Upload an inclusion polygon and a circle to keep out of."""
+    """Upload an inclusion polygon."""
     corners = [
         shapes.Point(home.latitude_deg + north / METRES, home.longitude_deg + east / 74_000)
         for north, east in ((-200, -200), (200, -200), (200, 200), (-200, 200))
@@ -94,12 +94,12 @@ async def fence(fences: geofence.GeofenceAsync, home: Any) -> None:
 
 
 async def upload(missions: mission.MissionAsync, plan: MissionPlan) -> None:
-    """Upload; MAVSDK counts itself as busy for a moment after it has told of the last transfer's end."""
-    for left in reversed(range(100)):
+    """Upload a mission. Retry because MAVSDK is still busy for a moment after it has reported the end of a transfer."""
+    for remaining in reversed(range(100)):
         try:
             await missions.upload_mission(plan)
         except MissionError as error:
-            if error.result != MissionResult.BUSY or not left:
+            if error.result != MissionResult.BUSY or not remaining:
                 raise
             await asyncio.sleep(0.1)
         else:
@@ -107,7 +107,7 @@ async def upload(missions: mission.MissionAsync, plan: MissionPlan) -> None:
 
 
 async def missions(missions: mission.MissionAsync, raw: mission_raw.MissionRawAsync, home: Any) -> None:
-    """Upload, read back and fly."""
+    """Upload a mission, read it back and fly it."""
     items = [
         MissionItem(
             latitude_deg=home.latitude_deg + north / METRES,
@@ -118,7 +118,7 @@ async def missions(missions: mission.MissionAsync, raw: mission_raw.MissionRawAs
         )
         for north, east, altitude in ((10, 0, 10.0), (10, 10, 12.0), (0, 10, 10.0))
     ]
-    # MAVSDK fills the parameters of its own return with NaN, which ArduPilot refuses; so must a client that claims to be one.
+    # MAVSDK fills the parameters of its return item with NaN. ArduPilot refuses these, so the simulated vehicle must refuse them.
     await missions.set_return_to_launch_after_mission(True)
     try:
         await missions.upload_mission(MissionPlan(items))

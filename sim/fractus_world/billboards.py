@@ -1,13 +1,14 @@
 """Billboards with photographed faces, upright beside roads or lying on the ground, for face detection.
 
-The photograph is scikit-image's packaged portrait of Eileen Collins by NASA (public domain).
+The photograph, astronaut.jpg, is NASA's portrait of Eileen Collins (public domain).
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache, lru_cache
+from pathlib import Path
 from typing import Protocol
 
 import cv2
@@ -22,6 +23,7 @@ from fractus_world.roads import Road, Roads, centre
 Picture = NDArray[np.uint8]
 
 VARIATIONS = 8
+_PHOTOGRAPH = Path(__file__).with_name("astronaut.jpg")
 _CROP = (92, 0, 362, 300)
 """Left, top, right, bottom of the head and shoulders in the photograph."""
 _FACE = (180, 72, 272, 186)
@@ -164,14 +166,22 @@ def face_box(variation: int) -> tuple[float, float, float, float]:
     return left, (_FACE[1] - _CROP[1]) / high, right, (_FACE[3] - _CROP[1]) / high
 
 
+@cache
+def photograph() -> Picture:
+    """Return the whole photograph: 512 x 512 pixels, BGR.
+
+    Raises:
+        FileNotFoundError: The installation lacks the file.
+    """
+    data = np.frombuffer(_PHOTOGRAPH.read_bytes(), np.uint8)
+    return np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR), np.uint8)
+
+
 @lru_cache(maxsize=VARIATIONS)
 def _portrait(variation: int) -> Picture:
-    """A variation of the photograph: mirrored, in another light."""
-    from skimage import data  # noqa: PLC0415 - only worlds with faces in sight pay for it
-
+    """Return a variation of the photograph: mirrored, in another light."""
     left, top, right, bottom = _CROP
-    picture = np.asarray(data.astronaut()[top:bottom, left:right, ::-1], np.float64)  # type: ignore[no-untyped-call]  # the package has no types
-    picture = picture / 255.0
+    picture = photograph()[top:bottom, left:right] / 255.0
     if variation % 2:
         picture = picture[:, ::-1]
     gain = np.array([1.0 - 0.05 * (variation // 2 % 3), 1.0, 1.0 + 0.03 * (variation // 2 % 3 - 1)])

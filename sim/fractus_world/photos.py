@@ -1,17 +1,16 @@
-"""Photographs of a place instead of a rendered world: of a directory of geotagged pictures, the one taken nearest."""
+"""Photographs of a place instead of a rendered world: the geotagged picture of a directory that was taken nearest."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+from fractus_core.local_frame import ecef
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
-from scipy.spatial import cKDTree
 
 from fractus_world.render import Band
 
@@ -24,8 +23,6 @@ _THERMAL_FOLDERS = frozenset({"ir", "thermal"})
 _THERMAL_ENDINGS = ("_ir", "-ir", "_t", "_thermal")
 _GPS_IFD = 0x8825
 _LAT_REF, _LAT, _LON_REF, _LON, _ALT_REF, _ALT = range(1, 7)
-_A = 6_378_137.0
-_E2 = (2 - 1 / 298.257223563) / 298.257223563
 
 
 class PhotoError(ValueError):
@@ -70,10 +67,7 @@ class Photos:
         self._bands: dict[Band, list[Photo]] = {}
         for photo in photos:
             self._bands.setdefault(photo.band, []).append(photo)
-        self._trees = {
-            band: cKDTree([_cartesian(photo.lat, photo.lon, photo.amsl_m) for photo in found])
-            for band, found in self._bands.items()
-        }
+        self._points = {band: _points(of_band) for band, of_band in self._bands.items()}
 
     @classmethod
     def of(cls, directory: Path) -> Photos:
@@ -87,31 +81,31 @@ class Photos:
         paths = sorted(path for path in directory.rglob("*") if path.suffix.lower() in _SUFFIXES and path.is_file())
         if len(paths) > MAX_FILES:
             raise PhotoError(f"{directory}: has {len(paths):,} pictures; at most {MAX_FILES:,} are indexed")
-        found = [photo for photo in (_read(path, directory) for path in paths) if photo is not None]
-        if not found:
+        photos = [photo for photo in (_read(path, directory) for path in paths) if photo is not None]
+        if not photos:
             raise PhotoError(f"{directory}: none of its {len(paths)} pictures has a GPS position in its EXIF data")
-        return cls(found)
+        return cls(photos)
 
     def nearest(self, lat: float, lon: float, amsl_m: float, band: Band) -> tuple[Photo, float]:
-        """Return the picture of a band that is closest to a place in three dimensions, and its distance in metres.
+        """Return the picture of a band that was taken nearest to a position, and its distance in three dimensions in metres.
 
         Raises:
             PhotoError: There is no picture of the band.
         """
-        tree = self._trees.get(band)
-        if tree is None:
+        points = self._points.get(band)
+        if points is None:
             raise PhotoError(f"band: no {band} picture available")
-        away, index = tree.query(_cartesian(lat, lon, amsl_m))
-        return self._bands[band][int(index)], float(away)
+        chords_m = np.linalg.norm(points[:, :3] - ecef(lat, lon), axis=1)
+        distances_m = np.hypot(chords_m, points[:, 3] - amsl_m)
+        index = int(np.argmin(distances_m))
+        return self._bands[band][index], float(distances_m[index])
 
 
-def _cartesian(lat: float, lon: float, amsl_m: float) -> tuple[float, float, float]:
-    """Earth-centred coordinates, so that distances are metres wherever the pictures are."""
-    phi = math.radians(lat)
-    lam = math.radians(lon)
-    n = _A / math.sqrt(1 - _E2 * math.sin(phi) ** 2)
-    flat = (n + amsl_m) * math.cos(phi)
-    return flat * math.cos(lam), flat * math.sin(lam), (n * (1 - _E2) + amsl_m) * math.sin(phi)
+def _points(photos: list[Photo]) -> NDArray[np.float64]:
+    """Return Earth-centred coordinates of the ground below each photograph, and its altitude: shape (n, 4), metres."""
+    lats = np.array([photo.lat for photo in photos])
+    lons = np.array([photo.lon for photo in photos])
+    return np.column_stack((*ecef(lats, lons, np), [photo.amsl_m for photo in photos]))
 
 
 def _read(path: Path, directory: Path) -> Photo | None:
@@ -119,7 +113,7 @@ def _read(path: Path, directory: Path) -> Photo | None:
         with Image.open(path) as image:
             gps = image.getexif().get_ifd(_GPS_IFD)
     except (OSError, UnidentifiedImageError, SyntaxError, ValueError, Image.DecompressionBombError):
-        return None  # not a picture: the directory may hold anything
+        return None  # not a picture
     try:
         lat = _angle(gps[_LAT], gps[_LAT_REF], "S")
         lon = _angle(gps[_LON], gps[_LON_REF], "W")
@@ -135,6 +129,7 @@ def _read(path: Path, directory: Path) -> Photo | None:
 
 
 def _angle(parts: Any, reference: Any, negative: str) -> float:
+    """Return an EXIF angle (degrees, minutes, seconds) in degrees, with the sign of its reference letter."""
     degrees, minutes, seconds = (float(part) for part in parts)
     sign = -1.0 if str(reference).upper().startswith(negative) else 1.0
     return sign * (degrees + minutes / 60.0 + seconds / 3600.0)
@@ -144,7 +139,7 @@ def resized(photo: Photo, width: int, height: int) -> Picture:
     """Return a photograph in a size, shape (height, width, 3), cropped to the aspect ratio.
 
     Raises:
-        PhotoError: The file cannot be read any longer.
+        PhotoError: The file cannot be read, or is too large.
     """
     try:
         with Image.open(photo.path) as image:
@@ -160,5 +155,5 @@ def resized(photo: Photo, width: int, height: int) -> Picture:
     x = (pixels.shape[1] - w) // 2
     y = (pixels.shape[0] - h) // 2
     part = np.ascontiguousarray(pixels[y : y + h, x : x + w])
-    way = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
-    return np.asarray(cv2.resize(part, (width, height), interpolation=way), np.uint8)
+    interpolation = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
+    return np.asarray(cv2.resize(part, (width, height), interpolation=interpolation), np.uint8)

@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import skimage.data
 from camera_world import MAX_PER_OWNER, Scene, World, active_grant, grain, private, refusal
 from fractus_core.api.model import API_VERSION
 from fractus_core.api.nodes import Drone
@@ -25,6 +24,7 @@ from fractus_services.camera.image_store import owner_of
 from fractus_services.camera.shutter import Shutter
 from fractus_services.errors import PolicyDenied, Refused
 from fractus_services.grant_files import ActiveGrant
+from fractus_world.billboards import photograph
 from policy_world import FRAME, NOW, at, box, policy, zone
 
 
@@ -311,7 +311,7 @@ async def test_faces_cut_by_cropping_are_blurred(
     scene = np.full((1600, 1600, 3), 90, np.uint8)
     left = 776 - 225
     top = 776 - 114
-    scene[top : top + 512, left : left + 512] = skimage.data.astronaut()[..., ::-1]
+    scene[top : top + 512, left : left + 512] = photograph()
     face = np.s_[776 - 38 : 776 + 38, 776 - 38 : 776 + 38]
     shown = np.s_[(1600 - height) // 2 : (1600 + height) // 2, (1600 - width) // 2 : (1600 + width) // 2]
     monkeypatch.setattr(world.scene, "capture", lambda _request: scene)

@@ -14,7 +14,6 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-import skimage.data
 from depth import examples
 from fractus_core.policy.decision_types import Attitude, Filter, Home, Lens
 from fractus_services.camera.drivers.connection import create_driver
@@ -34,6 +33,7 @@ from fractus_services.camera.image_store import ImageRecord
 from fractus_services.camera.motion_detection import detect_motion
 from fractus_services.camera.pixels import InvalidImage, Pixels, crop_and_resize, decode_image, encode_jpeg, source_size
 from fractus_services.camera.pose import Pose, is_upright
+from fractus_world.billboards import photograph
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
@@ -44,7 +44,7 @@ FACE = (177, 66, 97, 97)
 
 @pytest.fixture(scope="module")
 def photo() -> Pixels:
-    return np.asarray(cv2.cvtColor(skimage.data.astronaut(), cv2.COLOR_RGB2BGR), np.uint8)
+    return photograph()
 
 
 @pytest.fixture(scope="module")

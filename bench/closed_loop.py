@@ -1,14 +1,13 @@
-"""The whole mobility service on the simulated vehicle, in virtual time: random flights on bad links, watched by an oracle.
+"""The whole mobility service on the simulated vehicle in virtual time: random flights on bad links, checked by an oracle.
 
-Each seed is a flight (tests/component/closed_loop.py): zones and limits, some of which appear at any moment of the driver's flight
-and of the way home, another owner's vehicle, wind, up to 0.25 s of delay each way with jitter, up to 10 % of lost frames, a
-link that is cut. The oracle knows the vehicle's true position. What it reports is a breach outside of the documented guarantee.
+Each seed is one flight (tests/component/closed_loop.py) with zones and limits, another owner's vehicle, wind, a delay of up
+to 0.25 s each way with jitter, up to 10 % lost frames, and an interrupted link. Some zones and limits appear during the
+driver's flight or the flight home. The oracle knows the true position of the vehicle. It reports every breach that the
+documented guarantee excludes.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import logging
 import os
 import sys
@@ -20,25 +19,25 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "component"))
 
 from closed_loop import Account, flight, parameters_of, weather_of
+from harness import Progress, Report, parser
 
 
 def fly(seed: int) -> Account:
-    """One flight, in a directory of its own."""
+    """Fly the flight of a seed, with its files in a temporary directory."""
     logging.disable(logging.CRITICAL)
     with tempfile.TemporaryDirectory() as directory:
         return flight(seed, Path(directory))
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--flights", type=int, default=500)
-    parser.add_argument("--seed", type=int, default=1, help="of the first flight; each has the next one")
-    parser.add_argument("--quick", action="store_true", help="20 flights")
-    parser.add_argument("--tell", action="store_true", help="print what happened in each flight with a breach")
-    parser.add_argument("--json", type=Path, help="write the claims to a file")
-    options = parser.parse_args()
+    arguments = parser(__doc__, quick="20 flights")
+    arguments.add_argument("--flights", type=int, default=500, help="number of flights")
+    arguments.add_argument("--seed", type=int, default=1, help="seed of the first flight; others follow")
+    arguments.add_argument("--events", action="store_true", help="print the events of each flight with a breach")
+    options = arguments.parse_args()
     seeds = range(options.seed, options.seed + (20 if options.quick else options.flights))
-    wrong = 0
+    progress = Progress(len(seeds))
+    breached = 0
     flew = 0
     deepest_m = 0.0
     with ProcessPoolExecutor(max_workers=os.cpu_count()) as pool:
@@ -46,20 +45,15 @@ def main() -> int:
             flew += account.flew
             deepest_m = max(deepest_m, account.depth_m)
             if account.wrong:
-                wrong += 1
+                breached += 1
                 seed = account.seed
                 print(f"\nWRONG seed {seed}: {'; '.join(account.wrong)}\n   {weather_of(seed)} {parameters_of(seed)}")
-                if options.tell:
+                if options.events:
                     print("\n".join(account.events))
-            print(f"\r{done} of {len(seeds)} flights, {flew} in the air, {wrong} wrong ", end="", flush=True)
-    print()
-    if options.json:
-        claim = {
-            "name": f"flights with a breach, of {len(seeds)} in closed loop", "ours": wrong, "theirs": None, "unit": "flights",
-            "ratio": None, "target": 0, "holds": not wrong and flew > len(seeds) // 2, "flew": flew, "deepest_m": deepest_m,
-        }  # fmt: skip
-        options.json.write_text(json.dumps({"claims": [claim]}, indent=1))
-    return 1 if wrong else 0
+            progress.show(done, f"{flew} in the air, {breached} with a breach")
+    report = Report("closed_loop", options)
+    report.add("breached", breached, valid=flew > len(seeds) // 2, flights=len(seeds), flew=flew, deepest_m=deepest_m)
+    return report.finish()
 
 
 if __name__ == "__main__":

@@ -1,27 +1,25 @@
 """The policy engine against an independent oracle that flies every permitted random request.
 
-Policies, vehicles, states and requests are random. The oracle (tests/component/policy_flights.py) integrates
-jerk-limited motion in steps of 50 ms, with wind, latency and position errors inside the bounds given to the engine. It
-reports drones where a policy forbids them, and corrections that are not allowed unchanged or lie inside a margin.
-Vehicles differ in acceleration and return altitude, and other stations change these in flight. Afterwards the system
-flies some drones home, as the service decides it, and the autopilots of others return without the system
-(tests/component/homeward_flights.py). The motion monitor checks one flight in twelve, which it must not stop.
+Policies, vehicles, states and requests are random. The oracle (tests/component/policy_flights.py) integrates jerk-limited
+motion in steps of 50 ms, with wind, latency and position errors inside the bounds given to the engine. It reports drones
+in forbidden places, and corrected targets that the engine would not allow unchanged or that lie inside a margin. Vehicles
+differ in acceleration and return altitude, and other ground stations change these in flight. Afterwards the system flies
+some drones home like the mobility service, and the autopilots of others return without the system
+(tests/component/homeward_flights.py). The motion monitor watches one flight in twelve and must not stop it.
 
-A case is one request of one drone under one set of policies. Each drone makes three requests, the later ones in flight.
-In addition, vehicles with lost, absent and odd parameters are armed (tests/component/parameter_faults.py).
+A case is one request of one drone under one set of policies. Each drone makes three requests, two of them in flight. In
+addition, vehicles with missing, absent and unusual parameters are armed (tests/component/parameter_faults.py).
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import sys
-import time
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "component"))
 
+from harness import Progress, Report, parser
 from homeward_flights import WaysHome
 from parameter_faults import parameter_faults
 from policy_flights import Tally, flights
@@ -35,56 +33,40 @@ VEHICLES = 100
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--cases", type=int, default=1_000_000, help="requests to judge and fly")
-    parser.add_argument("--seed", type=int, default=1, help="seed of the first batch; each batch has the next one")
-    parser.add_argument("--quick", action="store_true", help="3000 cases")
-    parser.add_argument("--json", type=Path, help="write the claims to a file, after every batch")
-    options = parser.parse_args()
+    arguments = parser(__doc__, quick="3,000 cases")
+    arguments.add_argument("--cases", type=int, default=1_000_000, help="number of requests to judge and fly")
+    arguments.add_argument("--seed", type=int, default=1, help="seed of the first batch of drones; others follow")
+    options = arguments.parse_args()
     cases = 3000 if options.quick else options.cases
-    whole = Tally()
+    progress = Progress(cases)
+    total = Tally()
     vehicles = 0
     seed = options.seed
-    begun = time.monotonic()
-    while whole.asked < cases:
+    while total.asked < cases:
         ways_home = WaysHome(seed, HOME_EVERY)
-        found = flights(seed, DRONES, requests=REQUESTS, watch_every=WATCH_EVERY, watched=WATCHED, returns=ways_home)
-        found.wrong += parameter_faults(seed, VEHICLES)
+        batch = flights(seed, DRONES, requests=REQUESTS, watch_every=WATCH_EVERY, watched=WATCHED, returns=ways_home)
+        batch.wrong += parameter_faults(seed, VEHICLES)
         vehicles += VEHICLES
-        whole.add(found)
-        for line in found.wrong:
+        total.add(batch)
+        for line in batch.wrong:
             print(f"\nWRONG {line}", flush=True)
-        for line in found.stopped:
+        for line in batch.stopped:
             print(f"\nSTOPPED seed {seed}, {line}", flush=True)
-        left_s = (time.monotonic() - begun) / whole.asked * max(cases - whole.asked, 0)
-        figures = (
-            f"{whole.asked:,} cases, {whole.permitted:,} permitted ({whole.corrected:,} corrected, {whole.braked:,} after a"
-            f" stop), {whole.taken:,} takeovers, {whole.homeward:,} ways home ({whole.straight:,} alone), {vehicles:,}"
-            f" arming requests, {len(whole.wrong)} wrong, {len(whole.stopped)} stopped"
+        progress.show(
+            total.asked,
+            f"{total.permitted:,} permitted ({total.corrected:,} corrected, {total.braked:,} after a stop), {total.taken:,} takeovers,"
+            f" {total.homeward:,} flights home ({total.straight:,} by the autopilot), {vehicles:,} arming requests,"
+            f" {len(total.wrong)} wrong, {len(total.stopped)} stopped (seed {seed})",
         )
-        print(f"\rseed {seed}: {figures}; {left_s / 60:.0f} min left ", end="", flush=True)
         seed += 1
-        if options.json:
-            options.json.write_text(json.dumps(claims(whole, vehicles), indent=1))
-    print()
-    return 1 if whole.wrong or whole.stopped else 0
-
-
-def claims(tally: Tally, vehicles: int) -> dict[str, object]:
-    """Return the results in the format of the other benchmarks."""
-    claim = {
-        "name": f"violations and invalid corrections in {tally.asked} random cases",
-        "ours": len(tally.wrong), "theirs": None, "unit": "cases", "ratio": None, "target": 0,
-        "holds": not tally.wrong, "permitted": tally.permitted, "corrected": tally.corrected, "braked": tally.braked,
-        "takeovers": tally.taken, "changed": tally.changed, "homeward": tally.homeward, "alone": tally.straight,
-        "vehicles": vehicles,
-    }  # fmt: skip
-    stopped = {
-        "name": f"permitted flights that the monitor stopped, {tally.shortened} of them legs that were shortened",
-        "ours": len(tally.stopped), "theirs": None, "unit": "flights", "ratio": None, "target": 0,
-        "holds": not tally.stopped,
-    }  # fmt: skip
-    return {"claims": [claim, stopped]}
+    report = Report("oracle", options)
+    report.add(
+        "wrong", len(total.wrong), cases=total.asked, permitted=total.permitted, corrected=total.corrected,
+        braked=total.braked, takeovers=total.taken, changed=total.changed, homeward=total.homeward,
+        alone=total.straight, vehicles=vehicles,
+    )  # fmt: skip
+    report.add("stopped", len(total.stopped), shortened=total.shortened)
+    return report.finish()
 
 
 if __name__ == "__main__":

@@ -1,19 +1,16 @@
-"""Planning at 100 to 100,000 edge nodes, against the thesis' linear method written straightforwardly (Fig. 8.14).
+"""Planning at 100 to 100,000 edge nodes, against the linear method of the thesis (Fig. 8.14).
 
-The traffic-monitoring application of thesis 8.2 with a path of 20 waypoints; one drone for five edge nodes. In one
-series a fixed number of nodes are candidates, in the other 15 % are. Both planners get the same inventory and must
-make the same plan. Where the thesis' Algorithm 8 looks around every candidate of a static component, the linear method
-here looks around the chosen ones only: that flatters it, and lets it finish.
+The application is the traffic monitoring of thesis 8.2, with a path of 20 waypoints. There is one drone for five edge nodes.
+In one series a fixed number of nodes are candidates, in the other 15 %. Both planners get the same inventory and must make
+the same plan. Algorithm 8 of the thesis searches around every candidate of a static component. The linear method here
+searches around the selected nodes only, which makes it faster, so that it finishes.
 
-Times are those of the CPU, of the whole process: by the clock on a quiet core, and the same on a busy one.
+Durations are processor time of the whole process, so that other programs do not count.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import math
-import pathlib
 import random
 import statistics
 import sys
@@ -32,51 +29,66 @@ from fractus_core.planning import Host, Inventory, NodeLocations, Settings, oper
 from fractus_core.planning.candidates import direct_reach_m, requests
 from fractus_core.planning.coverage import Samples
 from fractus_core.planning.planner import plan_in_steps
+from harness import Report, parser, print_table, quantile
 
 FRAME = LocalFrame(39.3606, 22.9307)
 BLOCK_M = (600.0, 540.0)
+"""Width and height of the block of streets."""
+
 CLEAR_M = 3_000.0
+"""Distance from the depot within which only candidates are."""
+
 FIXED = 40
 SHARE = 0.15
 PER_DEPOT = 50
+LARGEST = 100_000
 SEED = 814
+PHASES = {
+    "area": ("area",),
+    "drone search": ("drone.candidates",),
+    "static search": ("static.candidates",),
+    "hybrid search": ("hybrid-edge", "hybrid-drone.candidates"),
+    "selection": ("drone.host", "static.host", "hybrid-drone.host", "cloud.host", "report"),
+}
+"""Phases of the thesis, with the steps of a planner that they contain."""
 
-Phases = dict[str, float]
+WIFI = {"technology": "WiFi", "device": "wlan0", "range": 80, "pairing": {"networkId": "fractus"}}
+CAMERA = {"methods": ["CaptureImage", "RetrieveImage"]}
+MOBILITY_METHODS = ["Arm", "Takeoff", "Goto", "SetSpeed", "Land"]
+
 Decision = tuple[str | None, tuple[tuple[str, str | None, str, float | None], ...]]
 
 
-# -- the scene --
-
-
-def at(x: float, y: float, alt: float | None = None) -> dict[str, float]:
-    """A position some metres east and north of the depot."""
+def position(x: float, y: float, alt: float | None = None) -> dict[str, float]:
+    """Return a position some metres east and north of the depot."""
     lat, lon = FRAME.latlon(x, y)
     return {"lat": lat, "lon": lon} | ({"alt": alt} if alt is not None else {})
 
 
 def manifest(kind: str, name: str, spec: dict[str, object], **more: object) -> dict[str, object]:
-    """An object as it is applied."""
+    """Return the manifest of an object."""
     return {"apiVersion": "fractus.dev/v1alpha1", "kind": kind, "metadata": {"name": name}, "spec": spec, **more}
 
 
+def component(name: str, placement: str, **more: object) -> dict[str, object]:
+    """Return a component of the application."""
+    container = {"image": name.lower(), "ports": [{"port": 8080}], "resources": {"requests": {"cpu": "100m"}}}
+    return {"name": name, "placement": placement, "container": container, **more}
+
+
 def traffic_monitoring() -> Application:
-    """Thesis Listing 12 over a block of streets: ten rows, twenty waypoints."""
+    """Return Listing 12 of the thesis over a block of streets: ten rows, twenty waypoints."""
     width, height = BLOCK_M
     rows = 10
     path = []
     for row in range(rows):
         y = height * row / (rows - 1)
-        ends = [at(0, y, 20), at(width, y, 20)]
+        ends = [position(0, y, 20), position(width, y, 20)]
         path += ends if row % 2 == 0 else ends[::-1]
-    middle = at(width / 2, height / 2)
-    camera = [{"service": "camera", "methods": ["CaptureImage", "RetrieveImage"]}]
-
-    def component(name: str, placement: str, **more: object) -> dict[str, object]:
-        container = {"image": name.lower(), "ports": [{"port": 8080}], "resources": {"requests": {"cpu": "100m"}}}
-        return {"name": name, "placement": placement, "container": container, **more}
-
+    middle = position(width / 2, height / 2)
+    camera = [{"service": "camera", **CAMERA}]
     control = {"point": {"depot": "base"}, "navigation": "pathBased", "path": path}
-    mobility = [{"service": "mobility", "methods": ["Arm", "Takeoff", "Goto", "SetSpeed", "Land"]}]
+    mobility = [{"service": "mobility", "methods": MOBILITY_METHODS}]
     locations = [{"center": middle, "radius": 300, "instances": 1}, {"center": middle, "radius": 330, "instances": 10}]
     components = [
         component("Navigator", "drone", **{"class": "driver"}, services=mobility, controlPoints=[control]),
@@ -89,47 +101,35 @@ def traffic_monitoring() -> Application:
 
 
 def inventory(nodes: int, candidates: int) -> Inventory:
-    """A count of edge nodes, candidates of them among the streets and the others elsewhere, and a drone for five."""
+    """Return edge nodes of which some are among the streets and the others elsewhere, and one drone for five of them."""
     rng = random.Random(SEED)
-    wifi = {"technology": "WiFi", "device": "wlan0", "range": 80, "pairing": {"networkId": "fractus"}}
-    camera = {"methods": ["CaptureImage", "RetrieveImage"]}
-    edge = EdgeNode.from_body(
-        manifest("EdgeNode", "edge", {"location": at(0, 0), "interfaces": [wifi], "services": {"camera": camera}})
-    )
-    mobility = {
-        "maxAltitude": 80,
-        "maxFlightTime": 60,
-        "maxSpeed": 15,
-        "methods": ["Arm", "Takeoff", "Goto", "SetSpeed", "Land"],
-    }
+    services = {"camera": CAMERA}
+    edge_spec = {"location": position(0, 0), "interfaces": [WIFI], "services": services}
+    edge = EdgeNode.from_body(manifest("EdgeNode", "edge", edge_spec))
+    mobility = {"maxAltitude": 80, "maxFlightTime": 60, "maxSpeed": 15, "methods": MOBILITY_METHODS}
+    drone_spec = {"depot": "base", "interfaces": [WIFI], "services": {"mobility": mobility, **services}}
     ready = {"type": "Ready", "status": "True", "reason": "Ready", "lastTransitionTime": "2026-01-01T00:00:00Z"}
-    drone = Drone.from_body(
-        manifest(
-            "Drone",
-            "drone",
-            {"depot": "base", "interfaces": [wifi], "services": {"mobility": mobility, "camera": camera}},
-            status={"battery": {"remaining": 1.0}, "conditions": [ready]},
-        )
-    )
+    status = {"battery": {"remaining": 1.0}, "conditions": [ready]}
+    drone = Drone.from_body(manifest("Drone", "drone", drone_spec, status=status))
     edges = {}
     for i in range(nodes):
-        inside = i < candidates
-        x, y = (
-            (rng.uniform(-60, BLOCK_M[0] + 60), rng.uniform(-60, BLOCK_M[1] + 60)) if inside else _outside(rng, nodes)
-        )
+        if i < candidates:
+            x = rng.uniform(-60, BLOCK_M[0] + 60)
+            y = rng.uniform(-60, BLOCK_M[1] + 60)
+        else:
+            x, y = _outside(rng, nodes)
         lat, lon = FRAME.latlon(x, y)
-        edges[f"edge-{i:06d}"] = _renamed(edge, f"edge-{i:06d}", location=Position(lat=lat, lon=lon))
-    depots = {"base": Depot.from_body(manifest("Depot", "base", {"location": at(0, 0), "radius": 30}))}
+        edges[f"edge-{i:06d}"] = _copy(edge, f"edge-{i:06d}", location=Position(lat=lat, lon=lon))
+    depots = {"base": Depot.from_body(manifest("Depot", "base", {"location": position(0, 0), "radius": 30}))}
     drones = {}
     at_base = max(1, candidates // 5)
     for i in range(max(1, nodes // 5)):
         depot = "base" if i < at_base else f"depot-{(i - at_base) // PER_DEPOT}"
         if depot not in depots:
-            depots[depot] = Depot.from_body(manifest("Depot", depot, {"location": at(*_outside(rng, nodes))}))
+            depots[depot] = Depot.from_body(manifest("Depot", depot, {"location": position(*_outside(rng, nodes))}))
         place = depots[depot].spec.location
-        drones[f"drone-{i:06d}"] = _renamed(
-            drone, f"drone-{i:06d}", depot=depot, home=Position(lat=place.lat, lon=place.lon)
-        )
+        home = Position(lat=place.lat, lon=place.lon)
+        drones[f"drone-{i:06d}"] = _copy(drone, f"drone-{i:06d}", depot=depot, home=home)
     amounts = {"cpu": 4.0}
     hosts = {n: Host(n, {"fractus.dev/class": "edge"}, amounts) for n in edges}
     hosts |= {n: Host(n, {"fractus.dev/class": "drone"}, amounts) for n in drones}
@@ -138,23 +138,20 @@ def inventory(nodes: int, candidates: int) -> Inventory:
 
 
 def _outside(rng: random.Random, nodes: int) -> tuple[float, float]:
-    """Somewhere in a land that grows with the number of nodes, but not near the streets."""
+    """Return a point in a land that grows with the number of nodes, but not near the streets."""
     bearing = rng.uniform(0, 2 * math.pi)
     reach = 50.0 * math.sqrt(nodes)
     distance = math.sqrt(rng.uniform(CLEAR_M**2, (CLEAR_M + reach) ** 2))
     return distance * math.cos(bearing), distance * math.sin(bearing)
 
 
-def _renamed(model, name: str, **spec: object):
+def _copy(model, name: str, **spec: object):
     metadata = model.metadata.model_copy(update={"name": name})
     return model.model_copy(update={"metadata": metadata, "spec": model.spec.model_copy(update=spec)})
 
 
-# -- the thesis' method --
-
-
 class Linear:
-    """Algorithms 5 to 10 as they stand (with the errata): every search looks at every node."""
+    """Algorithms 5 to 10 of the thesis with their errata: every search examines every node."""
 
     def __init__(self, application: Application, stock: Inventory, settings: Settings) -> None:
         self.spec = application.spec
@@ -165,7 +162,7 @@ class Linear:
         self.drone: str | None = None
 
     def steps(self) -> Generator[str, None, Decision]:
-        """Plan, naming each phase when it is done."""
+        """Plan, and yield the name of each completed step."""
         area = operation_area(self.spec, self.stock.depots, self.settings.safety_radius_m)
         assert area is not None
         yield "area"
@@ -200,10 +197,9 @@ class Linear:
     def _drones_at(self, depot: str) -> list[Drone]:
         place = self.stock.depots[depot].spec
         return [
-            d
-            for d in self.stock.drones.values()
+            d for d in self.stock.drones.values()
             if d.spec.depot == depot or (d.spec.home and distance_m(d.spec.home, place.location) <= place.radius)
-        ]
+        ]  # fmt: skip
 
     def _choose(self, fleet: Iterable[Drone]) -> None:
         ranked = sorted((-(d.status.battery.remaining), d.name) for d in fleet)  # type: ignore[union-attr]
@@ -212,12 +208,12 @@ class Linear:
             self._take(component, self.drone, "drone")
 
     def _within(self, centre: Position, radius_m: float) -> list[str]:
-        found = []
+        near = []
         for node in self.stock.edge_nodes.values():
             distance = distance_m(centre, node.spec.location)
             if distance <= radius_m:
-                found.append((round(distance * 1000), node.name))
-        return [name for _, name in sorted(found)]
+                near.append((round(distance * 1000), node.name))
+        return [name for _, name in sorted(near)]
 
     def _place_static(self, component: Component, near: list[list[str]]) -> None:
         taken: set[str] = set()
@@ -228,14 +224,14 @@ class Linear:
                 self._take(component, name, "static")
 
     def _place_beside(self, component: Component, host: str, hosts: set[str]) -> None:
-        here = self.stock.edge_nodes[host]
-        found = [(-1, host)]
+        origin = self.stock.edge_nodes[host].spec
+        in_range = [(-1, host)]
         for node in self.stock.edge_nodes.values():
-            reach = direct_reach_m(here.spec.interfaces, node.spec.interfaces)
-            distance = distance_m(here.spec.location, node.spec.location)
+            reach = direct_reach_m(origin.interfaces, node.spec.interfaces)
+            distance = distance_m(origin.location, node.spec.location)
             if reach is not None and distance <= reach:
-                found.append((round(distance * 1000), node.name))
-        for _, name in sorted(found):
+                in_range.append((round(distance * 1000), node.name))
+        for _, name in sorted(in_range):
             if name in hosts:
                 return
             if self._fits(component, name):
@@ -245,10 +241,10 @@ class Linear:
 
     def _footprints(self, frame: LocalFrame, shape: shapely.Geometry, samples: Samples) -> dict[str, np.ndarray]:
         points = samples.xy()
-        ours = self.stock.drones[self.drone or ""].spec.interfaces
+        interfaces = self.stock.drones[self.drone or ""].spec.interfaces
         reached = {}
         for node in self.stock.edge_nodes.values():
-            reach = direct_reach_m(ours, node.spec.interfaces)
+            reach = direct_reach_m(interfaces, node.spec.interfaces)
             x, y = frame.xy(node.spec.location.lat, node.spec.location.lon)
             if reach is None or shape.distance(shapely.Point(x, y)) > reach:
                 continue
@@ -287,194 +283,114 @@ class Linear:
         self.placed.append((component.name, name, role, share))
 
 
-# -- measuring --
-
-
 @dataclass(frozen=True)
-class Measured:
-    """Times of one planner at one size."""
+class Measurement:
+    """Durations of both planners at one size.
+
+    Attributes:
+        nodes: Number of edge nodes.
+        candidates: Number of them among the streets.
+        ours_s: Median duration of the planner, in seconds.
+        theirs_s: Duration of the linear method, in seconds.
+        phases_ms: Duration of each phase, of the planner and of the linear method, in milliseconds.
+        same: True if both made the same plan.
+    """
 
     nodes: int
     candidates: int
-    total_s: float
-    phases_s: Phases
+    ours_s: float
+    theirs_s: float
+    phases_ms: tuple[list[float], list[float]]
+    same: bool
 
 
 def decision_of(plan: DeploymentPlanSpec) -> Decision:
-    """What two planners must agree on."""
+    """Return the parts of a plan that both planners must agree on."""
     placed = tuple((p.component, p.node, p.role, p.coverage) for p in plan.placements)
     return plan.drone.node if plan.drone is not None else None, placed
 
 
-def timed(steps: Generator[str, None, object]) -> tuple[object, Phases]:
-    """Run a planner to its end; its result and the seconds of each phase."""
-    phases: Phases = {}
+def timed(steps: Generator[str, None, object]) -> tuple[object, dict[str, float]]:
+    """Run a planner to its end, and return its result and the seconds of each step."""
+    durations_s: dict[str, float] = {}
     while True:
         started = time.process_time()
         try:
             name = next(steps)
         except StopIteration as done:
-            return done.value, phases
-        phases[name] = phases.get(name, 0.0) + time.process_time() - started
+            return done.value, durations_s
+        durations_s[name] = durations_s.get(name, 0.0) + time.process_time() - started
 
 
-def repeated(make: Callable[[], Generator[str, None, object]], times: int) -> tuple[object, float, Phases]:
-    """The result, the median of the whole and of each phase."""
+def repeated(make: Callable[[], Generator[str, None, object]], times: int) -> tuple[object, float, list[float]]:
+    """Return the result, the median duration in seconds, and the median of each phase in milliseconds."""
     runs = [timed(make()) for _ in range(times)]
-    phases = {name: statistics.median(run[1].get(name, 0.0) for run in runs) for name in runs[0][1]}
-    return runs[0][0], statistics.median(sum(run[1].values()) for run in runs), phases
+    phases_ms = [
+        1e3 * statistics.median(sum(durations.get(step, 0.0) for step in steps) for _, durations in runs)
+        for steps in PHASES.values()
+    ]
+    return runs[0][0], statistics.median(sum(durations.values()) for _, durations in runs), phases_ms
 
 
-def measure(nodes: int, candidates: int, times: int, application: Application) -> tuple[Measured, Measured, bool]:
-    """Ours, the linear method, and whether they made the same plan."""
+def measure(nodes: int, candidates: int, times: int, application: Application) -> Measurement:
+    """Measure both planners on one inventory."""
     stock = inventory(nodes, candidates)
     settings = Settings()
     stock.located()
-    plan, total, phases = repeated(lambda: plan_in_steps(application, stock, settings), times)
-    ours = Measured(nodes, candidates, total, phases)
-    decided, total, phases = repeated(lambda: Linear(application, stock, settings).steps(), 1)
-    theirs = Measured(nodes, candidates, total, phases)
+    plan, ours_s, ours_phases = repeated(lambda: plan_in_steps(application, stock, settings), times)
+    decision, theirs_s, their_phases = repeated(lambda: Linear(application, stock, settings).steps(), 1)
     assert isinstance(plan, DeploymentPlanSpec)
-    return ours, theirs, decision_of(plan) == decided
+    same = decision_of(plan) == decision
+    return Measurement(nodes, candidates, ours_s, theirs_s, (ours_phases, their_phases), same)
 
 
-def index_updates(nodes: int, moves: int = 1000) -> tuple[float, float]:
-    """Seconds to note one moved node (99th percentile), and to build the index again."""
+def index_update_ms(nodes: int, moves: int = 1000) -> tuple[float, float]:
+    """Return the duration of the update for one moved node (99th percentile), and of building the index."""
     stock = inventory(nodes, FIXED)
     started = time.process_time()
-    where = NodeLocations.of(edge_nodes=stock.edge_nodes, drones=stock.drones, depots=stock.depots, cloud=())
-    built = time.process_time() - started
+    index = NodeLocations.of(edge_nodes=stock.edge_nodes, drones=stock.drones, depots=stock.depots, cloud=())
+    built_s = time.process_time() - started
     rng = random.Random(SEED)
-    names = rng.choices(sorted(stock.edge_nodes), k=moves)
-    taken = []
-    for name in names:
+    taken_s = []
+    for name in rng.choices(sorted(stock.edge_nodes), k=moves):
         lat, lon = FRAME.latlon(*_outside(rng, nodes))
-        moved = _renamed(stock.edge_nodes[name], name, location=Position(lat=lat, lon=lon))
+        moved = _copy(stock.edge_nodes[name], name, location=Position(lat=lat, lon=lon))
         started = time.process_time()
-        where.upsert_edge_node(moved)
-        taken.append(time.process_time() - started)
-    return sorted(taken)[int(0.99 * moves)], built
+        index.upsert_edge_node(moved)
+        taken_s.append(time.process_time() - started)
+    return 1e3 * quantile(taken_s, 0.99), 1e3 * built_s
 
 
-def claim(name: str, ours: float, theirs: float | None, *, unit: str, target: str, holds: bool) -> dict[str, object]:
-    """One line of the report."""
-    ratio = theirs / ours if theirs is not None and ours else None
-    return {
-        "name": name,
-        "ours": ours,
-        "theirs": theirs,
-        "unit": unit,
-        "ratio": ratio,
-        "target": target,
-        "holds": holds,
-    }
-
-
-# -- reporting --
-
-GROUPS = {
-    "T_area": ("area",),
-    "T_loc drone": ("drone.candidates",),
-    "T_loc static": ("static.candidates",),
-    "T_loc hybrid": ("hybrid-edge", "hybrid-drone.candidates"),
-    "T_host": ("drone.host", "static.host", "hybrid-drone.host", "cloud.host", "report"),
-}
-
-
-def grouped(measured: Measured) -> dict[str, float]:
-    """The thesis' phases in milliseconds."""
-    return {g: 1e3 * sum(measured.phases_s.get(n, 0.0) for n in names) for g, names in GROUPS.items()}
-
-
-def table(series: str, rows: Iterable[tuple[Measured, Measured, bool]]) -> Iterator[str]:
-    """The figures as text."""
-    yield f"\n{series}"
-    yield f"{'nodes':>8} {'cand.':>7} {'method':>7} {'total ms':>10} " + " ".join(f"{g:>13}" for g in GROUPS)
-    for ours, theirs, same in rows:
-        for method, m in (("ours", ours), ("linear", theirs)):
-            phases = " ".join(f"{v:13.2f}" for v in grouped(m).values())
-            yield f"{m.nodes:8d} {m.candidates:7d} {method:>7} {1e3 * m.total_s:10.2f} {phases}"
-        yield f"{'':8} {'':7} {'ratio':>7} {theirs.total_s / ours.total_s:10.0f}   {'same plan' if same else 'PLANS DIFFER'}"
-
-
-def draw(series: dict[str, list[tuple[Measured, Measured, bool]]], file: pathlib.Path) -> None:
-    """Each phase over the number of nodes, both methods, as in thesis Fig. 8.14."""
-    import matplotlib as mpl  # noqa: PLC0415  (slow to import, and only needed here)
-
-    mpl.use("Agg")
-    from matplotlib import pyplot  # noqa: PLC0415
-
-    figure, axes = pyplot.subplots(1, len(series), figsize=(6.5 * len(series), 5), sharey=True, squeeze=False)
-    for axis, (title, rows) in zip(axes[0], series.items(), strict=True):
-        sizes = [ours.nodes for ours, _, _ in rows]
-        for i, group in enumerate(GROUPS):
-            for which, style in ((0, "-o"), (1, ":s")):
-                values = [max(grouped(row[which])[group], 1e-3) for row in rows]
-                label = f"{group}, {'ours' if which == 0 else 'linear'}"
-                axis.loglog(sizes, values, style, color=f"C{i}", markersize=4, label=label)
-        axis.set_title(title)
-        axis.set_xlabel("edge nodes (one drone for five)")
-        axis.grid(visible=True, which="both", alpha=0.2)
-    axes[0][0].set_ylabel("milliseconds (median)")
-    axes[0][-1].legend(fontsize=7, ncols=2)
-    figure.tight_layout()
-    file.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(file, dpi=130)
-
-
-def claims(
-    series: dict[str, list[tuple[Measured, Measured, bool]]], update_s: float, build_s: float
-) -> list[dict[str, object]]:
-    """What must hold, and whether it does."""
-    fixed, share = series.values()
-    by_size = {ours.nodes: (ours, theirs) for ours, theirs, _ in fixed}
-    ours, theirs = by_size[100_000]
-    growth = ours.total_s / by_size[1_000][0].total_s
-    linear_growth = theirs.total_s / by_size[1_000][1].total_s
-    wide, wide_linear, _ = share[-1]
-    same = all(same for rows in series.values() for _, _, same in rows)
-    slower = theirs.total_s / ours.total_s
-    return [
-        claim("plan at 10^5 edge nodes, fixed candidates", 1e3 * ours.total_s, 1e3 * theirs.total_s, unit="ms", target="< 50 ms", holds=ours.total_s < 0.05),
-        claim("plan at 10^5 over plan at 10^3, fixed candidates", growth, linear_growth, unit="times", target="<= 3", holds=growth <= 3),
-        claim("linear method over ours at 10^5", slower, None, unit="times", target=">= 50", holds=slower >= 50),
-        claim("plan at 10^5 with 15 % candidates", 1e3 * wide.total_s, 1e3 * wide_linear.total_s, unit="ms", target="< 1000 ms", holds=wide.total_s < 1),
-        claim("index update of one moved node at 10^5 (p99; theirs: build again)", 1e3 * update_s, 1e3 * build_s, unit="ms", target="< 1 ms", holds=update_s < 1e-3),
-        claim("same plan as the linear method, all sizes", float(same), 1.0, unit="yes", target="1", holds=same),
-    ]  # fmt: skip
+def rows_of(measurements: Iterable[Measurement]) -> Iterator[tuple[object, ...]]:
+    """Return the rows of the table: two for each size."""
+    for m in measurements:
+        methods = (("planner", m.ours_s, m.phases_ms[0]), ("linear", m.theirs_s, m.phases_ms[1]))
+        for method, total_s, phases_ms in methods:
+            yield m.nodes, m.candidates, method, 1e3 * total_s, *phases_ms
 
 
 def main() -> int:
-    """Run, print, draw; 1 if a claim does not hold."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="two sizes and few repetitions")
-    parser.add_argument("--json", type=pathlib.Path, help="write the claims to this file")
-    parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("out/bench"), help="where the plot goes")
-    arguments = parser.parse_args()
-    sizes = (1_000, 100_000) if arguments.quick else (100, 1_000, 10_000, 100_000)
-    times = 7 if arguments.quick else 15
+    options = parser(__doc__, quick="two sizes and fewer repetitions").parse_args()
+    sizes = (1_000, LARGEST) if options.quick else (100, 1_000, 10_000, LARGEST)
+    times = 7 if options.quick else 15
     application = traffic_monitoring()
-    measure(1_000, FIXED, 3, application)  # warm up
-    series = {
-        f"{FIXED} candidates": [measure(n, FIXED, times, application) for n in sizes],
-        f"{SHARE:.0%} candidates": [measure(n, max(20, round(SHARE * n)), min(times, 5), application) for n in sizes],
-    }
-    for title, rows in series.items():
-        print("\n".join(table(title, rows)))
-    found = claims(series, *index_updates(sizes[-1]))
-    print()
-    for c in found:
-        ratio = f"{c['ratio']:.1f}x" if c["ratio"] is not None else ""
-        print(
-            f"{'holds ' if c['holds'] else 'FAILS '} {c['name']}: {c['ours']:.4g} {c['unit']} ({c['target']}) {ratio}"
-        )
-    plot = arguments.out / "planning.png"
-    draw(series, plot)
-    print(f"\nplot: {plot}")
-    if arguments.json:
-        arguments.json.parent.mkdir(parents=True, exist_ok=True)
-        arguments.json.write_text(json.dumps({"claims": found}, indent=2) + "\n")
-    return 0 if all(c["holds"] for c in found) else 1
+    measure(1_000, FIXED, 3, application)  # warm-up
+    fixed = {n: measure(n, FIXED, times, application) for n in sizes}
+    share = {n: measure(n, max(20, round(SHARE * n)), min(times, 5), application) for n in sizes}
+    print_table(
+        ("nodes", "candidates", "method", "total ms", *(f"{name} ms" for name in PHASES)),
+        list(rows_of([*fixed.values(), *share.values()])),
+    )
+    report = Report("planning", options)
+    large = fixed[LARGEST]
+    small = fixed[1_000]
+    report.add("fixed", 1e3 * large.ours_s, 1e3 * large.theirs_s)
+    report.add("growth", large.ours_s / small.ours_s, large.theirs_s / small.theirs_s)
+    report.add("speed", large.theirs_s / large.ours_s)
+    report.add("share", 1e3 * share[LARGEST].ours_s, 1e3 * share[LARGEST].theirs_s)
+    report.add("index", *index_update_ms(LARGEST))
+    report.add("same", sum(not m.same for m in (*fixed.values(), *share.values())))
+    return report.finish()
 
 
 if __name__ == "__main__":

@@ -1,43 +1,35 @@
-"""What recording takes of the mobility service: the work of its thread for some minutes of a flight, counted by the kernel.
+"""Cost of recording for the mobility service: the work of its thread for a flight, by the rates of a real flight.
 
-The rates are those that the service asks for in flight. The figures are the thread's own: the service's, without a recording, are
-in `service.py`.
+Only the thread's work is measured. `service.py` measures the service without a recording.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
-import re
 import sys
 import tempfile
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from fractus_runtime.mavlink_codec import Endpoint
-    from fractus_services.recording.recorder import FlightWriter
+from fractus_runtime.mavlink_codec import Endpoint
+from fractus_services.mobility.rpc import server as _server  # noqa: F401  (the service has loaded it already)
+from fractus_services.recording.segment_directory import SegmentDirectory
+from harness import Report, memory_mb, parser
 
-MAX_CPU = 2.0
-MAX_MB = 16.0
-"""Percent of a core and megabytes that recording may add."""
+BEFORE_MB = memory_mb()["resident"]
+"""Memory of this process before it imports the recorder, which only a recording service needs."""
 
-RATES = {
+from fractus_services.recording.mavlink_messages import MavlinkDecoder  # noqa: E402
+from fractus_services.recording.recorder import FlightWriter  # noqa: E402
+
+RECEIVED_HZ = {
     "GLOBAL_POSITION_INT": 20, "ATTITUDE": 10, "EXTENDED_SYS_STATE": 5, "SYS_STATUS": 1, "EKF_STATUS_REPORT": 1,
     "GPS_RAW_INT": 2, "HEARTBEAT": 1, "WIND": 1, "TIMESYNC": 10,
 }  # fmt: skip
-SENT = {"HEARTBEAT": 1, "TIMESYNC": 10, "SET_POSITION_TARGET_LOCAL_NED": 10}
-STATES = 2
-"""Entries of the flight recorder; the others are messages a second."""
+SENT_HZ = {"HEARTBEAT": 1, "TIMESYNC": 10, "SET_POSITION_TARGET_LOCAL_NED": 10}
+STATES_HZ = 2
+"""Rate of the flight recorder's entries."""
 
-
-def resident_mb() -> float:
-    found = re.search(r"VmRSS:\s+(\d+) kB", Path("/proc/self/status").read_text())
-    return int(found[1]) / 1e3 if found else 0.0
-
-
-GIVEN = {
+FIELDS = {
     "HEARTBEAT": {"autopilot": 3, "base_mode": 128},
     "GLOBAL_POSITION_INT": {"lat": 393600000, "lon": 229500000},
 }
@@ -46,17 +38,19 @@ STATE = {
 }  # fmt: skip
 
 
-def record(writer: FlightWriter, seconds: int, vehicle: Endpoint, companion: Endpoint) -> None:
-    """Give the writer what the service would in a flight."""
+def record(writer: FlightWriter, seconds: int) -> None:
+    """Record a flight of some seconds."""
+    vehicle = Endpoint(1, 1)
+    companion = Endpoint(244, 191)
     for second in range(seconds):
         now_ns = (1_780_000_000 + second) * 1_000_000_000
-        for name, rate in RATES.items():
+        for name, rate in RECEIVED_HZ.items():
             for _ in range(rate):
-                writer.received(now_ns, vehicle.encode(name, GIVEN.get(name, {})))
-        for name, rate in SENT.items():
+                writer.received(now_ns, vehicle.encode(name, FIELDS.get(name, {})))
+        for name, rate in SENT_HZ.items():
             for _ in range(rate):
                 writer.sent(now_ns, companion.encode(name, {}))
-        for _ in range(STATES):
+        for _ in range(STATES_HZ):
             writer.entry(now_ns, STATE)
         if second % 3 == 0:
             writer.flush()
@@ -64,47 +58,24 @@ def record(writer: FlightWriter, seconds: int, vehicle: Endpoint, companion: End
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="a flight of 20 s")
-    parser.add_argument("--seconds", type=int, default=120, help="how long the flight is")
-    parser.add_argument("--json", type=Path, help="write the claims to a file")
-    options = parser.parse_args()
+    arguments = parser(__doc__, quick="a flight of 20 s")
+    arguments.add_argument("--seconds", type=int, default=120, help="duration of the flight")
+    options = arguments.parse_args()
     seconds = 20 if options.quick else options.seconds
-    # What the service has loaded without a recording, so that memory is only what recording adds.
-    from fractus_runtime.mavlink_codec import Endpoint  # noqa: PLC0415
-    from fractus_services.mobility.rpc import server as _server  # noqa: F401, PLC0415
-    from fractus_services.recording.segment_directory import SegmentDirectory  # noqa: PLC0415
-
-    vehicle = Endpoint(1, 1)
-    companion = Endpoint(244, 191)
-    before_mb = resident_mb()
-    from fractus_services.recording.mavlink_messages import MavlinkDecoder  # noqa: PLC0415
-    from fractus_services.recording.recorder import FlightWriter  # noqa: PLC0415
-
     with tempfile.TemporaryDirectory() as directory:
         segments = SegmentDirectory(Path(directory), 500_000_000, reserve_bytes=0)
         writer = FlightWriter(segments, "drone-1", MavlinkDecoder("drone-1"))
         writer.begin()
         begun_s = time.process_time()
-        record(writer, seconds, vehicle, companion)
+        record(writer, seconds)
         writer.close()
         cpu = (time.process_time() - begun_s) / seconds * 100
-        rate_kb = sum(path.stat().st_size for path in Path(directory).iterdir()) / seconds / 1e3
-    more_mb = resident_mb() - before_mb
-    print(f"recording adds {cpu:.2f} % of a core and {more_mb:.1f} MB; it writes {rate_kb:.2f} kB/s")
-    claims = [
-        {
-            "name": "CPU that recording adds in flight", "ours": cpu, "theirs": 0.0, "unit": "% of a core",
-            "ratio": cpu, "target": MAX_CPU, "holds": cpu <= MAX_CPU,
-        },
-        {
-            "name": "memory that recording adds", "ours": before_mb + more_mb, "theirs": before_mb, "unit": "MB",
-            "ratio": more_mb, "target": MAX_MB, "holds": more_mb <= MAX_MB,
-        },
-    ]  # fmt: skip
-    if options.json:
-        options.json.write_text(json.dumps({"claims": claims}, indent=1))
-    return 0 if all(claim["holds"] for claim in claims) else 1
+        rate_kb_s = sum(path.stat().st_size for path in Path(directory).iterdir()) / seconds / 1e3
+    report = Report("recordings", options)
+    report.add("cpu", cpu)
+    report.add("memory", memory_mb()["resident"] - BEFORE_MB)
+    report.add("rate", rate_kb_s)
+    return report.finish()
 
 
 if __name__ == "__main__":

@@ -1,19 +1,18 @@
-"""Switching N services to another target, on both sides, against the method of the thesis (ch. 8.9.1).
+"""Duration of a switch of N services to other targets, on both sides, against the method of the thesis (ch. 8.9.1).
 
-The thesis sets one rule a service and side, 55 ms each on a Raspberry Pi; the stand-in does so with the iptables command.
-Ours swaps the elements of a map by one netlink transaction a side. Both run in network namespaces of this program's own, in
-one run; then again with the rules that kube-proxy makes for 2,000 services in the same kernel tables.
+The thesis sets one rule per service and side, which takes 55 ms on a Raspberry Pi. The comparator does this with the
+iptables command. Fractus replaces the elements of a map in one netlink transaction per side. Both are measured in network
+namespaces of this program, and again beside the rules that kube-proxy creates for 2,000 services.
 
-Needs root and nftables; iptables for the comparator.
+Needs root, nftables and iptables.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import os
 import statistics
 import subprocess
+import sys
 import time
 from ipaddress import IPv4Address
 from pathlib import Path
@@ -21,15 +20,18 @@ from pathlib import Path
 from fractus_agent.redirector.netlink import NETLINK_NETFILTER, Netlink, in_namespace
 from fractus_agent.redirector.nft_maps import Endpoint, NftMaps, Redirect
 from fractus_agent.redirector.ruleset import Ports, create
+from harness import Report, parser, quantile
 
 SIZES = (1, 4, 16, 64)
-FOREIGN = 2000
+FOREIGN_SERVICES = 2000
+SWITCHES = 1000
 LEASE_S = 60.0
 PORTS = Ports(udp=46810, tcp=46811)
+CLAIMS = {64: "largest", 16: "thesis"}
 
 
 class Side:
-    """A node: a network namespace with our table in it."""
+    """A node: a network namespace with the redirector's table."""
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -40,14 +42,16 @@ class Side:
         self.maps = NftMaps(self.netlink, lambda _: create("fxl*", PORTS, self.inside, clients=True))
 
     def run(self, *words: str) -> None:
+        """Run a command in the namespace."""
         subprocess.run([*self.inside, *words], check=True, capture_output=True)
 
-    def crowd(self) -> None:
-        """What kube-proxy in nftables mode makes for 2,000 services: a map of verdicts, and a chain each."""
+    def add_foreign_services(self) -> None:
+        """Add the rules of kube-proxy in nftables mode: a verdict map, and one chain per service."""
         chains = "\n".join(
-            f"chain s{i} {{ meta l4proto tcp dnat to 10.200.{i >> 8}.{i & 255}:8080; }}" for i in range(FOREIGN)
+            f"chain s{i} {{ meta l4proto tcp dnat to 10.200.{i >> 8}.{i & 255}:8080; }}"
+            for i in range(FOREIGN_SERVICES)
         )
-        elements = ", ".join(f"10.97.{i >> 8}.{i & 255} . tcp . 80 : goto s{i}" for i in range(FOREIGN))
+        elements = ", ".join(f"10.97.{i >> 8}.{i & 255} . tcp . 80 : goto s{i}" for i in range(FOREIGN_SERVICES))
         text = f"""table ip kube-proxy {{
             {chains}
             map services {{ type ipv4_addr . inet_proto . inet_service : verdict; elements = {{ {elements} }} }}
@@ -56,99 +60,83 @@ class Side:
         subprocess.run([*self.inside, "nft", "-f", "-"], input=text, text=True, check=True)
 
     def close(self) -> None:
+        """Remove the namespace."""
         self.netlink.close()
         subprocess.run(["ip", "netns", "del", self.name], check=True)
 
 
 def redirects(count: int, target: str) -> list[Redirect]:
+    """Return redirects of consecutive services to consecutive ports of a target."""
     base = IPv4Address("10.96.0.1")
     return [Redirect(Endpoint(base + i, 8080), Endpoint(IPv4Address(target), 9000 + i)) for i in range(count)]
 
 
-def ours_ms(sides: list[Side], count: int, switches: int) -> list[float]:
+def fractus_ms(sides: list[Side], count: int) -> list[float]:
+    """Return durations of switches by a map transaction, in milliseconds."""
     targets = [redirects(count, "10.77.0.2"), redirects(count, "10.77.0.6")]
-    found = []
-    for number in range(switches):
-        begun = time.perf_counter()
+    taken = []
+    for number in range(SWITCHES):
+        begun_s = time.perf_counter()
         for side in sides:
-            # As a switch does it: with new marks for the services that it moves.
+            # The redirector also gives each moved service a new mark.
             marks = [(r.virtual, 1 + place + count * (number % 2)) for place, r in enumerate(targets[0])]
             side.maps.write(targets[number % 2], marks, LEASE_S)
-        found.append((time.perf_counter() - begun) * 1e3)
-    return found
+        taken.append((time.perf_counter() - begun_s) * 1e3)
+    return taken
 
 
-def theirs_ms(sides: list[Side], count: int, switches: int) -> list[float]:
-    """One iptables command a service and side, which replaces the rule of that service."""
-    found = []
+def set_rule(side: Side, verb: list[str], redirect: Redirect) -> None:
+    """Run the iptables command that adds or replaces the rule of one service."""
+    target = f"{redirect.target.address}:{redirect.target.port}"
+    match = ["-d", str(redirect.virtual.address), "-p", "tcp", "--dport", str(redirect.virtual.port)]
+    side.run("iptables", "-t", "nat", *verb, *match, "-j", "DNAT", "--to-destination", target)
 
-    def rule(side: Side, verb: list[str], redirect: Redirect) -> None:
-        to = f"{redirect.target.address}:{redirect.target.port}"
-        match = ["-d", str(redirect.virtual.address), "-p", "tcp", "--dport", str(redirect.virtual.port)]
-        side.run("iptables", "-t", "nat", *verb, *match, "-j", "DNAT", "--to-destination", to)
 
+def thesis_ms(sides: list[Side], count: int, switches: int) -> list[float]:
+    """Return durations of switches by one iptables command per service and side, in milliseconds."""
     for side in sides:
         for redirect in redirects(count, "10.77.0.2"):
-            rule(side, ["-A", "PREROUTING"], redirect)
+            set_rule(side, ["-A", "PREROUTING"], redirect)
+    taken = []
     for number in range(switches):
-        begun = time.perf_counter()
+        begun_s = time.perf_counter()
         for side in sides:
             for place, redirect in enumerate(redirects(count, "10.77.0.2" if number % 2 else "10.77.0.6"), 1):
-                rule(side, ["-R", "PREROUTING", str(place)], redirect)
-        found.append((time.perf_counter() - begun) * 1e3)
+                set_rule(side, ["-R", "PREROUTING", str(place)], redirect)
+        taken.append((time.perf_counter() - begun_s) * 1e3)
     for side in sides:
         side.run("iptables", "-t", "nat", "-F", "PREROUTING")
-    return found
+    return taken
 
 
-def p99(values: list[float], batches: int = 5) -> float:
-    """The median of the batches' 99th percentiles: one pause of a shared machine is not the switch's tail."""
+def tail_ms(values: list[float], batches: int = 5) -> float:
+    """Return the median of the 99th percentiles of batches, so that one pause of a shared machine does not decide."""
     size = len(values) // batches
-    tails = [sorted(values[i * size : (i + 1) * size])[min(round(0.99 * size), size - 1)] for i in range(batches)]
-    return statistics.median(tails)
+    return statistics.median(quantile(values[i * size : (i + 1) * size], 0.99) for i in range(batches))
 
 
-def claim(name: str, ours: float, theirs: float, target: str, holds: bool) -> dict[str, object]:
-    ratio = theirs / ours
-    print(f"{name:46} {ours:9.3f} {theirs:9.1f} ms  {ratio:7.0f} x   {'holds' if holds else 'FAILS'} ({target})")
-    return {
-        "name": name, "ours": ours, "theirs": theirs, "unit": "ms", "ratio": ratio, "target": target, "holds": holds,
-    }  # fmt: skip
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="fewer switches of the comparator")
-    parser.add_argument("--json", type=Path, help="write the claims to this file")
-    options = parser.parse_args()
-    switches = 1000
-    few = 2 if options.quick else 5
-    claims = []
+def main() -> int:
+    options = parser(__doc__, quick="fewer switches of the comparator").parse_args()
+    report = Report("redirect", options)
     sides = [Side(f"fxbench{os.getpid()}{end}") for end in ("c", "s")]
     try:
-        for crowded in (False, True):
-            if crowded:
+        for beside in ("", f", beside {FOREIGN_SERVICES} services"):
+            if beside:
                 for side in sides:
-                    side.crowd()
-            beside = ", beside 2,000 services" if crowded else ""
+                    side.add_foreign_services()
             for count in SIZES:
-                mine = ours_ms(sides, count, switches)
-                thesis = theirs_ms(sides, count, few if count <= 16 else 1)
-                middle = statistics.median(mine)
-                slow = statistics.median(thesis)
-                fast = middle < 2.0 if count == 64 else slow >= 100 * middle if count == 16 else middle < slow
-                target = {64: "p50 under 2 ms", 16: "100 times faster"}.get(count, "faster")
-                claims.append(claim(f"switch of {count} services, p50{beside}", middle, slow, target, fast))
-                tail = p99(mine)
-                claims.append(
-                    claim(f"switch of {count} services, p99{beside}", tail, max(thesis), "under 15 ms", tail < 15.0)
-                )
+                ours_ms = fractus_ms(sides, count)
+                few = 2 if options.quick else 5
+                theirs_ms = thesis_ms(sides, count, few if count <= 16 else 1)
+                middle_ms = statistics.median(ours_ms)
+                claim = CLAIMS.get(count, "median")
+                report.add(claim, middle_ms, statistics.median(theirs_ms), count=count, beside=beside)
+                report.add("tail", tail_ms(ours_ms), max(theirs_ms), count=count, beside=beside)
     finally:
         for side in sides:
             side.close()
-    if options.json:
-        options.json.write_text(json.dumps({"claims": claims}, indent=1))
+    return report.finish()
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

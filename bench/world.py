@@ -1,22 +1,17 @@
-"""What a picture of the simulated world costs, and how true it is.
+"""Cost of a picture of the simulated world, and its likeness to an oversampled picture.
 
-    uv run python bench/world.py [--quick] [--json FILE]
-
-All figures are processor time of one core (OpenCV is held to one thread), so that other load does not count. Beside it
-the naive way: every pixel looked up in the finest level of the ground by itself.
+Durations are processor time of one core, with OpenCV on one thread. The comparator is a naive renderer that looks up every
+pixel separately in the finest level of the ground.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
+import functools
+import itertools
 import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -24,54 +19,20 @@ from fractus_world.optics import Intrinsics, Mount, Pose, View
 from fractus_world.render import render_ground
 from fractus_world.tiles import TILE_PX, TileStore
 from fractus_world.world import World
+from harness import Report, median_ms, memory_mb, parser
 
 LENS = Intrinsics(1920, 1080, 62.2)
 LAT = 50.8637
 LON = 4.6785
-LIMIT_MS = 40.0
-
-
-@dataclass(frozen=True, slots=True)
-class Claim:
-    """One figure."""
-
-    name: str
-    ours: float
-    theirs: float | None
-    unit: str
-    target: str
-    holds: bool
-
-    def as_json(self) -> dict[str, object]:
-        """The claim as the benchmarks' common format has it."""
-        ratio = None if not self.theirs else round(self.ours / self.theirs, 4)
-        return {
-            "name": self.name,
-            "ours": round(self.ours, 3),
-            "theirs": None if self.theirs is None else round(self.theirs, 3),
-            "unit": self.unit,
-            "ratio": ratio,
-            "target": self.target,
-            "holds": self.holds,
-        }
-
-
-def cost_ms(work: Callable[[], object], repeats: int) -> float:
-    """Median processor time."""
-    times = []
-    for _ in range(repeats):
-        begun = time.process_time()
-        work()
-        times.append((time.process_time() - begun) * 1000.0)
-    return statistics.median(times)
 
 
 def pose(world: World, east_m: float, north_m: float, height_m: float) -> Pose:
+    """Return the pose of a camera at a place, in metres from the origin of the world."""
     return Pose(*world.frame.latlon(east_m, north_m), height_m, yaw_deg=25.0)
 
 
-def naive(view: View, store: TileStore, level: int = 0) -> np.ndarray:
-    """The ground below the camera, pixel by pixel."""
+def render_naively(view: View, store: TileStore, level: int = 0) -> np.ndarray:
+    """Return the ground below the camera, pixel by pixel."""
     lens = view.intrinsics
     u, v = np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5)
     ground = np.stack((u, v, np.ones_like(u)), axis=-1) @ view.ground_matrix().T
@@ -83,9 +44,8 @@ def naive(view: View, store: TileStore, level: int = 0) -> np.ndarray:
     return picture[(np.floor(y).astype(int) - top), (np.floor(x).astype(int) - left)]
 
 
-def speed(world: World, repeats: int) -> list[Claim]:
-    """A picture whose ground has been seen before: what a drone that hovers or flies on pays for nearly every one."""
-    claims = []
+def measure_known_ground(report: Report, world: World, repeats: int) -> None:
+    """Measure pictures of ground that has been drawn before, like nearly all pictures of a flight."""
     scenes = {
         "1080p, 60 m, looking down": (pose(world, 70.0, 55.0, 60.0), Mount()),
         "1080p, 120 m, looking down": (pose(world, 70.0, 55.0, 120.0), Mount()),
@@ -93,126 +53,95 @@ def speed(world: World, repeats: int) -> list[Claim]:
         "1080p, 100 m, with horizon": (pose(world, 0.0, 0.0, 100.0), Mount(-12.0)),
     }
     store = TileStore(world.ground)
-    for name, (at, mount) in scenes.items():
-        world.render(at, LENS, mount=mount, time_s=100.0)
-        moments = iter(range(10_000))
-
-        def shoot(at: Pose = at, mount: Mount = mount, moments: object = moments) -> object:
-            return world.render(at, LENS, mount=mount, time_s=100.0 + 0.2 * next(moments))  # type: ignore[call-overload]
-
-        ours = cost_ms(shoot, repeats)
-        theirs = None
+    for name, (camera, mount) in scenes.items():
+        world.render(camera, LENS, mount=mount, time_s=100.0)
+        ours_ms = median_ms(functools.partial(render_next, world, camera, mount, itertools.count()), repeats)
+        theirs_ms = None
         if mount.pitch_deg == -90.0:
-            view = world.view(at, LENS, mount)
-            naive(view, store)
-            theirs = cost_ms(lambda view=view: naive(view, store), max(repeats // 5, 2))
-        claims.append(Claim(name, ours, theirs, "ms", f"< {LIMIT_MS:g}", ours < LIMIT_MS))
-    at = scenes["1080p, 60 m, looking down"][0]
-    thermal = cost_ms(lambda: world.render(at, LENS, time_s=100.0, band="ir"), repeats)
-    claims.append(Claim("the same, thermal", thermal, None, "ms", f"< {LIMIT_MS:g}", thermal < LIMIT_MS))
-    picture = world.render(at, LENS, time_s=100.0)
-    jpeg = cost_ms(lambda: cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 90]), repeats)
-    claims.append(Claim("JPEG of it", jpeg, None, "ms", "-", True))
-    truth = cost_ms(lambda: world.truth(at, LENS, time_s=100.0), repeats)
-    claims.append(Claim("its truth", truth, None, "ms", f"< {LIMIT_MS:g}", truth < LIMIT_MS))
-    return claims
+            view = world.view(camera, LENS, mount)
+            render_naively(view, store)
+            theirs_ms = median_ms(functools.partial(render_naively, view, store), max(repeats // 5, 2))
+        report.add("picture", ours_ms, theirs_ms, scene=name)
+    camera = scenes["1080p, 60 m, looking down"][0]
+    report.add("thermal", median_ms(lambda: world.render(camera, LENS, time_s=100.0, band="ir"), repeats))
+    picture = world.render(camera, LENS, time_s=100.0)
+    report.add("jpeg", median_ms(lambda: cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 90]), repeats))
+    report.add("truth", median_ms(lambda: world.truth(camera, LENS, time_s=100.0), repeats))
 
 
-def flight(frames: int) -> list[Claim]:
-    """A flight over new ground at 10 m/s, five pictures a second: what the tiles cost that no one has seen before."""
+def render_next(world: World, camera: Pose, mount: Mount, numbers: itertools.count[int]) -> None:
+    """Render the next of several pictures at five per second."""
+    world.render(camera, LENS, mount=mount, time_s=100.0 + 0.2 * next(numbers))
+
+
+def measure_new_ground(report: Report, frames: int) -> None:
+    """Measure a flight over new ground at 10 m/s with five pictures per second, including the tiles drawn for it."""
     world = World.procedural(LAT, LON, 11)
-    begun = time.process_time()
+    begun_s = time.process_time()
     world.render(pose(world, 0.0, 0.0, 100.0), LENS)
-    first = (time.process_time() - begun) * 1000.0
-    times = []
+    report.add("first", (time.process_time() - begun_s) * 1000.0)
+    taken_ms = []
     for frame in range(1, frames + 1):
-        at = pose(world, 2.0 * frame, 0.5 * frame, 100.0)
-        begun = time.process_time()
-        world.render(at, LENS, time_s=0.2 * frame)
-        times.append((time.process_time() - begun) * 1000.0)
-    mean = statistics.fmean(times)
-    return [
-        Claim("first picture of a world", first, None, "ms", "-", True),
-        Claim("mean over new ground at 10 m/s, 5 pictures a second", mean, None, "ms", "< 100", mean < 100.0),
-        Claim(
-            "share of those pictures within 40 ms",
-            100.0 * sum(t < 40 for t in times) / len(times),
-            None,
-            "%",
-            "-",
-            True,
-        ),
-    ]
+        camera = pose(world, 2.0 * frame, 0.5 * frame, 100.0)
+        begun_s = time.process_time()
+        world.render(camera, LENS, time_s=0.2 * frame)
+        taken_ms.append((time.process_time() - begun_s) * 1000.0)
+    report.add("new_ground", statistics.fmean(taken_ms))
+    report.add("new_ground_share", 100.0 * sum(t < 40 for t in taken_ms) / len(taken_ms))
 
 
-def visit(world: World) -> float:
-    """Resident memory, MB, after pictures all over a world of many kilometres."""
-    for step in range(24):
-        at = pose(world, 900.0 * step - 8000.0, 700.0 * (step % 5), 60.0 + 20 * (step % 4))
-        world.render(at, Intrinsics(1280, 720), mount=Mount(-90.0 if step % 2 else -35.0))
-    return int(Path("/proc/self/status").read_text(encoding="ascii").split("VmRSS:")[1].split()[0]) / 1024
+def measure_tiles(report: Report) -> None:
+    """Measure the drawing of new tiles."""
+    ground = World.procedural(LAT, LON, 12).ground
+    for level in (0, 2, 4):
+        columns = iter(range(-6, 7))
+        draw = functools.partial(lambda level, columns: ground.tile(level, next(columns), 3), level, columns)
+        report.add("tile", median_ms(draw, 10), size=f"{TILE_PX * 2**level / 32:.0f} m")
 
 
-def memory() -> Claim:
-    """The same in a process of its own."""
-    done = subprocess.run(
-        [sys.executable, __file__, "--visit"], capture_output=True, text=True, check=True, timeout=600
-    )
-    resident = float(done.stdout)
-    return Claim("resident memory after 24 places of 17 km of world", resident, None, "MB", "< 500", resident < 500.0)
-
-
-def likeness(world: World) -> Claim:
-    """How far a slanted picture is from one of sixteen times as many rays; the naive one flickers."""
+def measure_likeness(report: Report) -> None:
+    """Measure the difference of a slanted picture from a picture of sixteen times as many rays."""
+    world = World.procedural(LAT, LON, 7)
     small = Intrinsics(480, 270, 62.2)
     large = Intrinsics(1920, 1080, 62.2)
-    at = pose(world, 0.0, 0.0, 120.0)
+    camera = pose(world, 0.0, 0.0, 120.0)
     mount = Mount(-50.0)
     store = TileStore(world.ground, 600_000_000)
-    fine = render_ground(world.view(at, large, mount), store, "rgb")
+    fine = render_ground(world.view(camera, large, mount), store, "rgb")
     reference = cv2.resize(fine, (small.width, small.height), interpolation=cv2.INTER_AREA).astype(float)
 
     def error(picture: np.ndarray) -> float:
         return float(np.sqrt(np.mean((picture.astype(float) - reference) ** 2)))
 
-    view = world.view(at, small, mount)
-    ours = error(render_ground(view, store, "rgb"))
-    theirs = error(naive(view, store, 1))
-    return Claim("grey levels off a 16-fold oversampled picture", ours, theirs, "rms", "< naive", ours < theirs)
+    view = world.view(camera, small, mount)
+    report.add("likeness", error(render_ground(view, store, "rgb")), error(render_naively(view, store, 1)))
 
 
-def tiles(world: World) -> list[Claim]:
-    """What a tile costs that no one has seen before."""
-    claims = []
-    for level in (0, 2, 4):
-        numbers = iter(range(-6, 7))
-        cost = cost_ms(lambda level=level, numbers=numbers: world.ground.tile(level, next(numbers), 3), 10)
-        claims.append(Claim(f"a new tile of {TILE_PX * 2**level / 32:.0f} m, median", cost, None, "ms", "-", True))
-    return claims
+def visit(world: World) -> float:
+    """Return the resident memory in megabytes after pictures at 24 places of a world."""
+    for step in range(24):
+        camera = pose(world, 900.0 * step - 8000.0, 700.0 * (step % 5), 60.0 + 20 * (step % 4))
+        world.render(camera, Intrinsics(1280, 720), mount=Mount(-90.0 if step % 2 else -35.0))
+    return memory_mb()["resident"]
 
 
-def main() -> None:
-    """Measure and report."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true")
-    parser.add_argument("--json", type=Path)
-    parser.add_argument("--visit", action="store_true", help=argparse.SUPPRESS)
-    arguments = parser.parse_args()
+def main() -> int:
+    arguments = parser(__doc__, quick="fewer repetitions")
+    arguments.add_argument("--visit", action="store_true", help="only print the memory after pictures at 24 places")
+    options = arguments.parse_args()
     world = World.procedural(LAT, LON, 7)
-    if arguments.visit:
+    if options.visit:
         print(visit(world))
-        return
-    claims = speed(world, 8 if arguments.quick else 40)
-    claims += flight(40 if arguments.quick else 250) + tiles(World.procedural(LAT, LON, 12))
-    claims += [likeness(World.procedural(LAT, LON, 7)), memory()]
-    width = max(len(claim.name) for claim in claims)
-    for claim in claims:
-        theirs = "" if claim.theirs is None else f"naive {claim.theirs:.1f}"
-        verdict = "" if claim.target == "-" else "holds" if claim.holds else "MISSED"
-        print(f"{claim.name:<{width}}  {claim.ours:9.2f} {claim.unit:<4} {theirs:<14} {claim.target:<8} {verdict}")
-    if arguments.json is not None:
-        arguments.json.write_text(json.dumps({"claims": [claim.as_json() for claim in claims]}, indent=2) + "\n")
+        return 0
+    report = Report("world", options)
+    measure_known_ground(report, world, 8 if options.quick else 40)
+    measure_new_ground(report, 40 if options.quick else 250)
+    measure_tiles(report)
+    measure_likeness(report)
+    visited = subprocess.run([sys.executable, __file__, "--visit"], capture_output=True, check=True, timeout=600)
+    report.add("memory", float(visited.stdout))
+    return report.finish()
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

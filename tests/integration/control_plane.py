@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import subprocess
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from ipaddress import IPv4Address
 from pathlib import Path
 from typing import Any, TypeVar
@@ -61,10 +61,19 @@ def select_pause(seconds: float) -> None:
 
 
 class ControlPlane:
-    """etcd, kube-apiserver and kube-controller-manager of one test session."""
+    """etcd, kube-apiserver and kube-controller-manager of one test session.
 
-    def __init__(self, programs: dict[str, Path], directory: Path) -> None:
+    Args:
+        programs: Files of the programs.
+        directory: Directory of data, keys and logs.
+        arguments: More arguments of some programs.
+    """
+
+    def __init__(
+        self, programs: Mapping[str, Path], directory: Path, arguments: Mapping[str, tuple[str, ...]] | None = None
+    ) -> None:
         self._programs = programs
+        self._extra_arguments = arguments or {}
         self._directory = directory
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
         self._started: dict[str, tuple[str, ...]] = {}
@@ -178,7 +187,7 @@ class ControlPlane:
     def _run(self, program: str, *arguments: str) -> None:
         self._started[program] = arguments
         with (self._directory / f"{program}.log").open("ab") as log:
-            argv = [str(self._programs[program]), *arguments]
+            argv = [str(self._programs[program]), *arguments, *self._extra_arguments.get(program, ())]
             self._processes[program] = subprocess.Popen(argv, stdout=log, stderr=log, cwd=self._directory)
 
     def _install_crds(self) -> None:

@@ -83,7 +83,6 @@ async def main(folder: Path) -> None:
         await asyncio.wait({running, reading}, return_when=asyncio.FIRST_COMPLETED)
     running.cancel()
     await asyncio.gather(running, return_exceptions=True)
-    (folder / "modules.txt").write_text("\n".join(sorted(sys.modules)))
 
 
 if __name__ == "__main__":

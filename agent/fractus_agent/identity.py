@@ -15,6 +15,7 @@ from datetime import datetime
 from pathlib import Path
 
 from fractus_core.api.conditions import ConditionUpdate
+from fractus_runtime.backoff import Backoff
 from fractus_runtime.files import read_set, write_set
 
 from fractus_agent.certificates import (
@@ -24,7 +25,7 @@ from fractus_agent.certificates import (
     create_request,
     inspect_certificate,
 )
-from fractus_agent.store import Backoff, KubeError, Store
+from fractus_agent.store import KubeError, Store
 
 log = logging.getLogger(__name__)
 

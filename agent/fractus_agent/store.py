@@ -37,7 +37,7 @@ from fractus_runtime.kubernetes import (
 from fractus_runtime.kubernetes.access import SERVICE_ACCOUNT
 from pydantic import ValidationError
 
-__all__ = ["Backoff", "Conflict", "Expired", "Invalid", "KubeError", "Object", "Store", "Unconfigured", "connect"]
+__all__ = ["Conflict", "Expired", "Invalid", "KubeError", "Object", "Store", "Unconfigured", "connect"]
 
 log = logging.getLogger(__name__)
 

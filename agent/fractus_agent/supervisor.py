@@ -9,7 +9,9 @@ import logging
 from collections.abc import Awaitable, Callable, Coroutine
 from typing import Any
 
-from fractus_agent.store import Backoff, KubeError
+from fractus_runtime.backoff import Backoff
+
+from fractus_agent.store import KubeError
 
 log = logging.getLogger(__name__)
 

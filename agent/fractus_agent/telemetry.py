@@ -18,10 +18,10 @@ from fractus_core.exhaustive import exhaustive
 from fractus_proto.v1.mobility_pb2 import MissionOutcome, SubscribeTelemetryRequest, Telemetry
 from fractus_proto.v1.mobility_pb2_grpc import MobilityServiceStub
 from fractus_proto.v1.types_pb2 import AltitudeReference
+from fractus_runtime.backoff import Backoff
 from fractus_runtime.files import read_set
 
 from fractus_agent.certificates import CERTIFICATE_FILES
-from fractus_agent.store import Backoff
 
 log = logging.getLogger(__name__)
 

@@ -16,6 +16,7 @@ from fractus_core.planning.inventory import Inventory, Settings
 from fractus_core.planning.planner import Infeasible
 from fractus_core.planning.scale_up import full_nodes
 from fractus_core.validation import check_application
+from fractus_runtime.backoff import Backoff
 
 from fractus_operator import kinds, status
 from fractus_operator.application_grants import REFUSALS, ApplicationGrants
@@ -41,7 +42,7 @@ from fractus_operator.rollout import Rollout
 from fractus_operator.route_check_cache import RouteCheckCache
 from fractus_operator.status import Blocked, Phase, StatusUpdate, flight, mission_outcome
 from fractus_operator.status_reporter import StatusReporter
-from fractus_operator.store import Backoff, KubeError, Store
+from fractus_operator.store import KubeError, Store
 
 log = logging.getLogger(__name__)
 

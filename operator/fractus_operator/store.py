@@ -27,7 +27,6 @@ from fractus_runtime.kubernetes import (
 from fractus_operator.kinds import EVENT, Body, Key, Kind, key_of
 
 __all__ = [
-    "Backoff",
     "Conflict",
     "ContentType",
     "Informer",

@@ -7,10 +7,12 @@ import logging
 from collections.abc import Awaitable, Callable, Collection, Iterable, Iterator
 from contextlib import contextmanager, suppress
 
+from fractus_runtime.backoff import Backoff
+
 from fractus_operator.kinds import Key
 from fractus_operator.labels import label_key
 from fractus_operator.operator_metrics import reconciling
-from fractus_operator.store import Backoff, KubeError
+from fractus_operator.store import KubeError
 
 log = logging.getLogger(__name__)
 

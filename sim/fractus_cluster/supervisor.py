@@ -1,7 +1,7 @@
 """First process of a node or control plane: starts and restarts programs, and reaps orphans.
 
-It runs as a separate process with only the standard library. A JSON file lists its programs: `{"units": [{"name",
-"argv", "log", "env", "needs"}]}`. It runs until it is killed, and killing it ends all programs.
+It runs as a separate process, which must start fast, so it imports no large library. A JSON file lists its programs:
+`{"units": [{"name", "argv", "log", "env", "needs"}]}`. It runs until it is killed, and killing it ends all programs.
 """
 
 from __future__ import annotations
@@ -16,8 +16,11 @@ import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
-_BACKOFF_FIRST_S = 0.2
-_MAX_BACKOFF_S = 10.0
+from fractus_runtime.backoff import Backoff
+
+_FIRST_RETRY_S = 0.4
+_MAX_RETRY_S = 10.0
+_NEEDS_POLL_S = 0.2
 _STEADY_AFTER_S = 30.0
 _LOG_LIMIT_BYTES = 20_000_000
 _LOG_CHECK_S = 600.0
@@ -28,7 +31,7 @@ ENVIRONMENT = {
     "HOME": "/root",
     "LANG": "C.UTF-8",
 }
-"""OOM score adjustment of the daemons of nodes and control planes."""
+"""Environment of the daemons of nodes and control planes."""
 
 _HANDLED = {signal.SIGCHLD, signal.SIGTERM}
 
@@ -55,7 +58,7 @@ class Unit:
     process: subprocess.Popen[bytes] | None = None
     started_s: float = 0.0
     due_s: float = 0.0
-    backoff_s: float = field(default=_BACKOFF_FIRST_S)
+    backoff: Backoff = field(default_factory=lambda: Backoff(_FIRST_RETRY_S, _MAX_RETRY_S))
 
     def start(self, now_s: float) -> None:
         """Start the program. A failure counts as an exit."""
@@ -73,7 +76,7 @@ class Unit:
                     preexec_fn=self._prepare,  # noqa: PLW1509  (this process has one thread)
                 )
             except OSError as error:
-                _say(f"{self.name}: cannot start {self.argv[0]}: {error}")
+                _log(f"{self.name}: cannot start {self.argv[0]} (error={error})")
                 self.ended(now_s)
 
     def _prepare(self) -> None:
@@ -82,23 +85,24 @@ class Unit:
         try:
             Path("/proc/self/oom_score_adj").write_text(str(self.oom_score_adj))
         except OSError:
-            return  # # not permitted in a container; the kernel's default is used
+            return  # not permitted in a container; the kernel's default is used
 
     def ended(self, now_s: float) -> None:
         """Record the end of the program and schedule its restart."""
         self.process = None
         if now_s - self.started_s > _STEADY_AFTER_S:
-            self.backoff_s = _BACKOFF_FIRST_S
-        self.due_s = now_s + self.backoff_s
-        self.backoff_s = min(2 * self.backoff_s, _MAX_BACKOFF_S)
+            self.backoff.succeeded()
+        delay_s = self.backoff.delay_s()
+        self.due_s = now_s + delay_s
+        _log(f"{self.name}: ended, restarting in {delay_s:.1f} s")
 
     def trim_log(self) -> None:
-        """Truncate a log above the size limit. Its content is kept in one older file."""
+        """Truncate a log above the size limit. Its content is kept in a file with the suffix .1."""
         path = Path(self.log)
         try:
             if path.stat().st_size > _LOG_LIMIT_BYTES:
                 path.with_name(path.name + ".1").write_bytes(path.read_bytes())
-                os.truncate(path, 0)  # # the program appends, so it continues at the new end
+                os.truncate(path, 0)  # the program appends, so it continues at the new end
         except FileNotFoundError:
             return
 
@@ -112,7 +116,7 @@ def supervise(units: list[Unit]) -> None:
         for unit in units:
             if unit.process is None and unit.due_s <= now_s:
                 if unit.needs and not Path(unit.needs).exists():
-                    unit.due_s = now_s + _BACKOFF_FIRST_S
+                    unit.due_s = now_s + _NEEDS_POLL_S
                 else:
                     unit.start(now_s)
         if now_s - trimmed_s >= _LOG_CHECK_S:
@@ -138,11 +142,11 @@ def _reap(units: list[Unit]) -> None:
         for unit in units:
             if unit.process is not None and unit.process.pid == pid:
                 unit.process.returncode = os.waitstatus_to_exitcode(status)
-                _say(f"{unit.name} ended with {unit.process.returncode}; starts again in {unit.backoff_s:.1f} s")
+                _log(f"{unit.name}: exited (code={unit.process.returncode})")
                 unit.ended(time.monotonic())
 
 
-def _say(text: str) -> None:
+def _log(text: str) -> None:
     print(time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()), text, flush=True)
 
 

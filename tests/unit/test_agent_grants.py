@@ -16,10 +16,11 @@ from fractus_agent.grant_synchronizer import (
     mission_outcome,
     serialize_grant,
 )
-from fractus_agent.store import Backoff, GrantList, KubeError, Store
+from fractus_agent.store import GrantList, KubeError, Store
 from fractus_core.api.grants import Grant, ReportedGrant, pack
 from fractus_core.control import Outcome, OutcomeKind
 from fractus_core.policy.grant_signatures import BadSignature, UnknownAuthority
+from fractus_runtime.backoff import Backoff
 
 COMPLETE = Outcome(OutcomeKind.COMPLETE)
 FAILED = Outcome(OutcomeKind.FAILED, "driver lost")

@@ -8,7 +8,6 @@ from datetime import datetime
 from typing import Self
 
 from fractus_core.api.model import timestamp
-from fractus_runtime.backoff import Backoff
 from fractus_runtime.kubernetes import (
     Access,
     Client,

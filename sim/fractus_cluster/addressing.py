@@ -75,9 +75,9 @@ def choose_block(taken: Iterable[IPv4Network]) -> IPv4Network:
     for candidate in _CANDIDATES:
         if not any(candidate.overlaps(network) for network in used):
             return candidate
-    # A route for the whole of 10.0.0.0/8 (VPN, cloud network) allows a more specific route inside it.
+    # A VPN or cloud network may have a route for the whole of 10.0.0.0/8. More specific routes inside it still work.
     narrow = [network for network in used if network.prefixlen > _BROAD]
     for candidate in _CANDIDATES:
         if not any(candidate.overlaps(network) for network in narrow):
             return candidate
-    raise ClusterError("no free addresses: the machine's routes take all of 10.200-249.0.0/16 and 172.20-31.0.0/16")
+    raise ClusterError("no free addresses: routes of the machine use all of 10.200-249.0.0/16 and 172.20-31.0.0/16")

@@ -30,7 +30,7 @@ def administrating(server: str, ca: Path, credential: Credential) -> Iterator[Bl
         raise ClusterError(f"the API server: {error}") from error
 
 
-def answers_ready(host: str, port: int) -> bool:
+def is_ready(host: str, port: int) -> bool:
     """Return True if a server responds to `GET /ready` (plain HTTP) with success."""
     connection = http.client.HTTPConnection(host, port, timeout=_REQUEST_TIMEOUT_S)
     try:

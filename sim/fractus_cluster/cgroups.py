@@ -17,7 +17,7 @@ _NEEDED_V2 = ("cpu", "cpuset", "memory", "pids")
 _DELEGATED_V2 = (*_NEEDED_V2, "io", "hugetlb")
 _DAEMONS = "daemons"
 _WEIGHT = 20
-"""CPU weight of a cluster, equal to 20 processes, because its vehicles fly in real time."""
+"""CPU weight of a cluster, as a multiple of one process. It is high because the vehicles fly in real time."""
 _ONE_V1 = 1024
 _ONE_V2 = 100
 _POLL_S = 0.02
@@ -58,7 +58,8 @@ def find_hierarchies(mounts: str | None = None) -> Hierarchies:
         missing = [name for name in _NEEDED_V1 if not any(name in options for options in old.values())]
         if missing:
             raise PrerequisiteError(f"the kernel's control groups lack {', '.join(missing)}; Kubernetes needs them")
-        return Hierarchies(1, (*old, *new))  # # container runtimes also use the unified hierarchy of a hybrid layout
+        # Container runtimes also use the unified hierarchy of a hybrid layout.
+        return Hierarchies(1, (*old, *new))
     if not new:
         raise PrerequisiteError("no control groups are mounted at /sys/fs/cgroup; Kubernetes needs them")
     return Hierarchies(2, (new[0],))
@@ -86,7 +87,7 @@ class Branch:
         return [root / self.path for root in self.hierarchies.roots]
 
     def create(self) -> list[Path]:
-        """Create the group if it is missing. Return the files that a process is added with."""
+        """Create the group if it is missing. Return its `cgroup.procs` files, which add processes to the group."""
         if self.hierarchies.version == 2:
             return [self._create_v2()]
         for root in self.hierarchies.roots:
@@ -100,7 +101,7 @@ class Branch:
         return [directory / "cgroup.procs" for directory in self.directories]
 
     def _create_v2(self) -> Path:
-        # Version 2 allows processes only in leaf groups, so daemons get a leaf next to the group of the pods.
+        # Version 2 allows processes only in leaf groups, so the daemons have a leaf group beside that of the pods.
         directory = self.hierarchies.roots[0]
         for part in (*Path(self.path).parts, _DAEMONS):
             _delegate(directory)
@@ -111,14 +112,14 @@ class Branch:
 
     def process_ids(self) -> set[int]:
         """Return the processes of the group and its descendants."""
-        found: set[int] = set()
+        pids: set[int] = set()
         for directory in self.directories:
             for folder in _walk(directory):
                 try:
-                    found.update(int(word) for word in (folder / "cgroup.procs").read_text().split())
+                    pids.update(int(word) for word in (folder / "cgroup.procs").read_text().split())
                 except (FileNotFoundError, OSError):
-                    continue  # # removed in the meantime
-        return found - {0}
+                    continue  # removed in the meantime
+        return pids - {0}
 
     def kill_all(self, *, timeout_s: float = 20.0) -> None:
         """Kill all processes of the group and wait until they have ended.
@@ -129,7 +130,9 @@ class Branch:
         deadline = time.monotonic() + timeout_s
         while pids := self.process_ids():
             if time.monotonic() > deadline:
-                raise ClusterError(f"processes {sorted(pids)} in control group {self.path} do not end")
+                raise ClusterError(
+                    f"processes {sorted(pids)} in control group {self.path} did not end within {timeout_s:.0f} s"
+                )
             for pid in pids:
                 try:
                     os.kill(pid, signal.SIGKILL)
@@ -166,7 +169,7 @@ def remove_top() -> None:
         try:
             (root / TOP).rmdir()
         except (FileNotFoundError, OSError):
-            continue  # # missing, or used by another cluster
+            continue  # missing, or used by another cluster
 
 
 def _walk(directory: Path) -> Iterator[Path]:
@@ -182,6 +185,7 @@ def _walk(directory: Path) -> Iterator[Path]:
 
 
 def _remove_tree(directory: Path) -> OSError | None:
+    """Remove a group and its descendants. Return the error of a group that could not be removed."""
     last: OSError | None = None
     for folder in _walk(directory):
         try:
@@ -194,30 +198,33 @@ def _remove_tree(directory: Path) -> OSError | None:
 
 
 def _fill_cpuset(above: Path, directory: Path) -> None:
+    """Copy CPUs and memory nodes of the parent group to a new group, which version 1 leaves empty."""
     for name in ("cpuset.cpus", "cpuset.mems"):
-        own = directory / name
-        if own.exists() and not own.read_text().strip():
-            own.write_text((above / name).read_text())
+        file = directory / name
+        if file.exists() and not file.read_text().strip():
+            file.write_text((above / name).read_text())
 
 
 def _weigh(directory: Path) -> None:
+    """Set the CPU weight of the group of all clusters."""
     for name, one in (("cpu.shares", _ONE_V1), ("cpu.weight", _ONE_V2)):
         if (directory / name).exists():
             (directory / name).write_text(str(_WEIGHT * one))
 
 
 def _delegate(directory: Path) -> None:
-    there = set((directory / "cgroup.controllers").read_text().split())
-    missing = [name for name in _NEEDED_V2 if name not in there]
+    """Make the controllers of a version 2 group available to its child groups."""
+    available = set((directory / "cgroup.controllers").read_text().split())
+    missing = [name for name in _NEEDED_V2 if name not in available]
     if missing:
         raise PrerequisiteError(f"the control groups at {directory} lack {', '.join(missing)}; Kubernetes needs them")
     enabled = set((directory / "cgroup.subtree_control").read_text().split())
     for name in _DELEGATED_V2:
-        if name in there and name not in enabled:
+        if name in available and name not in enabled:
             try:
                 (directory / "cgroup.subtree_control").write_text(f"+{name}")
             except OSError as error:
                 raise PrerequisiteError(
-                    f"the control group {directory} cannot hand {name} on ({error.strerror}); inside a container "
-                    "without control groups of its own the embedded cluster does not run"
+                    f"cannot delegate controller {name} of control group {directory} ({error.strerror}); "
+                    "the embedded cluster does not run in a container without its own control groups"
                 ) from error

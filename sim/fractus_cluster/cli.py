@@ -20,40 +20,45 @@ from fractus_cluster.machine import holders
 from fractus_cluster.prerequisites import check_root
 from fractus_cluster.state import known_clusters, state_root
 
-_name_option = click.option("--name", help="The cluster; may be left out when there is only one.")
+_name_option = click.option("--name", help="Name of the cluster. Not needed if there is only one.")
 
 _output_option = click.option(
-    "-o", "--output", type=click.Choice(["text", "json"]), default="text", help="text for people, json for programs."
+    "-o", "--output", type=click.Choice(["text", "json"]), default="text", help="Output format."
 )
 
-_NOT_WELL = 2
+_EXIT_UNHEALTHY = 2
 
 
 @click.group()
 def cluster() -> None:
-    """A real Kubernetes of several nodes on this machine, without Docker (Linux, root)."""
+    """Run a real Kubernetes cluster of several nodes on this machine, without Docker. Needs Linux and root."""
 
 
 @cluster.command()
 @click.argument("file", type=click.Path(path_type=Path, dir_okay=False, exists=True))
 @click.option("--name", help="Name of the cluster instead of the one in the file.")
-@click.option("--image", "images", multiple=True, help="Image that every node gets before pods start; repeatable.")
+@click.option(
+    "--image",
+    "images",
+    multiple=True,
+    help="Image to load on every node before pods start. Can be given several times.",
+)
 def up(file: Path, name: str | None, images: tuple[str, ...]) -> None:
-    """Make the cluster be as FILE describes, whatever state it is in."""
+    """Start the cluster that FILE describes, or update it if it exists."""
     Cluster.load(file, name=name, report=print_report).up(images=images)
 
 
 @cluster.command()
 @_name_option
-@click.option("--all", "every", is_flag=True, help="All clusters of this machine.")
+@click.option("--all", "every", is_flag=True, help="Remove all clusters of this machine.")
 def down(name: str | None, every: bool) -> None:
-    """Take the cluster away with everything that it put on the machine."""
+    """Remove the cluster and all its resources on the machine."""
     check_root()
-    # A cluster whose state directory was deleted is still in the machine's ledger.
-    ours = sorted({*known_clusters(), *(held for held, at in holders().items() if at.parent == state_root())})
-    if name is None and len(ours) > 1 and not every:
-        raise ClusterError(f"several clusters: {', '.join(ours)}; select one with --name, or remove all with --all")
-    for each in [name] if name is not None else ours:
+    # If a state directory was deleted, only the claims of the machine contain the cluster.
+    names = sorted({*known_clusters(), *(other for other, path in holders().items() if path.parent == state_root())})
+    if name is None and len(names) > 1 and not every:
+        raise ClusterError(f"several clusters: {', '.join(names)}; select one with --name, or remove all with --all")
+    for each in [name] if name is not None else names:
         Cluster.bare(each, report=print_report).down()
 
 
@@ -61,60 +66,62 @@ def down(name: str | None, every: bool) -> None:
 @_name_option
 @_output_option
 def status(name: str | None, output: str) -> None:
-    """Show how the cluster's nodes are.
+    """Show the status of the cluster's nodes.
 
-    Exits with 2 unless all are well.
+    The exit status is 2 if a part does not work.
     """
-    found = Cluster.existing(name)
-    states = found.status()
-    radio = found.radio.running
-    well = found.running and radio is not False and all(map(_well, states))
+    chosen = Cluster.existing(name)
+    states = chosen.status()
+    radio = chosen.radio.running
+    well = chosen.running and radio is not False and all(map(_is_well, states))
     if output == "json":
         nodes = [asdict(node) for node in states]
         click.echo(
-            json.dumps({"name": found.name, "well": well, "running": found.running, "radio": radio, "nodes": nodes})
+            json.dumps({"name": chosen.name, "well": well, "running": chosen.running, "radio": radio, "nodes": nodes})
         )
     else:
-        radio_words = {True: ", radio runs", False: ", radio dead", None: ""}[radio]
-        click.echo(f"cluster {found.name}: control plane {'running' if found.running else 'down'}{radio_words}")
+        radio_state = {True: ", radio running", False: ", radio stopped", None: ""}[radio]
+        click.echo(f"cluster {chosen.name}: control plane {'running' if chosen.running else 'stopped'}{radio_state}")
         for node in states:
-            click.echo(f"  {node.name:<20} {node.node_class:<6} {node.address:<15} {_words(node)}")
+            click.echo(f"  {node.name:<20} {node.node_class:<6} {node.address:<15} {_describe(node)}")
     if not well:
-        sys.exit(_NOT_WELL)
+        sys.exit(_EXIT_UNHEALTHY)
 
 
-def _well(node: NodeStatus) -> bool:
+def _is_well(node: NodeStatus) -> bool:
     hardware = node.vehicle_running is not False and node.camera_running is not False
     return node.powered and node.linked and node.ready is True and hardware
 
 
-def _words(node: NodeStatus) -> str:
-    ready = {True: "Ready", False: "NotReady", None: "API server not in reach"}[node.ready]
+def _describe(node: NodeStatus) -> str:
+    ready = {True: "Ready", False: "NotReady", None: "API server unavailable"}[node.ready]
     words = [ready if node.powered else "off"]
     if not node.linked:
         words.append("link cut")
     if node.vehicle_running is not None:
-        words.append("vehicle runs" if node.vehicle_running else "vehicle dead")
+        words.append("vehicle running" if node.vehicle_running else "vehicle stopped")
     if node.camera_running is not None:
-        words.append("camera runs" if node.camera_running else "camera dead")
+        words.append("camera running" if node.camera_running else "camera stopped")
     return ", ".join(words)
 
 
 @cluster.command()
 @_name_option
-@click.option("--path", "only_path", is_flag=True, help="Print where it is instead of its content.")
+@click.option("--path", "only_path", is_flag=True, help="Print the path of the file instead of its content.")
 def kubeconfig(name: str | None, only_path: bool) -> None:
     """Print the administrator's kubeconfig."""
     file = Cluster.existing(name).kubeconfig
     if not file.exists():
-        raise ClusterError("the cluster has not come up yet; run `fractus cluster up FILE` again")
+        raise ClusterError(
+            "the cluster has no kubeconfig, because its start did not finish; run `fractus cluster up FILE` again"
+        )
     click.echo(str(file) if only_path else file.read_text(), nl=only_path)
 
 
 @cluster.command()
 @_name_option
 def env(name: str | None) -> None:
-    """Print what a shell evaluates to reach the cluster: eval "$(fractus cluster env)"."""
+    """Print shell commands that set KUBECONFIG and PATH. Use them with eval "$(fractus cluster env)"."""
     file = Cluster.existing(name).kubeconfig
     programs = ensure_binaries(("kubectl", "helm"), report=print_report)
     folders = dict.fromkeys(str(programs[program].parent) for program in ("kubectl", "helm"))
@@ -130,7 +137,7 @@ def env(name: str | None) -> None:
     help="Checkout with Dockerfile and charts.",
 )
 def install_(name: str | None, source: Path | None) -> None:
-    """Install or upgrade Fractus: images, charts, until the drones are ready."""
+    """Build the images, install or upgrade the charts of Fractus, and wait until the drones are ready."""
     install(Cluster.existing(name, report=print_report), source or find_source(), report=print_report)
 
 
@@ -139,13 +146,13 @@ def install_(name: str | None, source: Path | None) -> None:
 @_name_option
 @_output_option
 def load_image(images: tuple[str, ...], name: str | None, output: str) -> None:
-    """Deliver images to all nodes: names in buildah's storage, or OCI or Docker archives."""
+    """Load images on all nodes. IMAGE is a name in buildah's storage, or an OCI or Docker archive."""
     delivered = Cluster.existing(name, report=print_report).load_images(images)
     if output == "json":
         click.echo(json.dumps(delivered))
         return
     for node, count in delivered.items():
-        click.echo(f"{node}: {count} new")
+        click.echo(f"{node}: {count} new images")
 
 
 @cluster.command()
@@ -153,7 +160,7 @@ def load_image(images: tuple[str, ...], name: str | None, output: str) -> None:
 @click.argument("node")
 @_name_option
 def power(state: str, node: str, name: str | None) -> None:
-    """Pull a node's power, or give it back; its vehicle keeps its own."""
+    """Power a node off, or on again. The power of its vehicle does not change."""
     Cluster.existing(name, report=print_report).set_power(node, on=state == "on")
 
 
@@ -172,24 +179,24 @@ def link(state: str, node: str, name: str | None) -> None:
 
 @cluster.command()
 @click.argument("node")
-@click.option("--wifi", type=click.Choice(["on", "off", "silent"]), help="silent: hears, but sends nothing.")
-@click.option("--fade", type=float, metavar="DB", help="Loss between it and all others beyond that of the way.")
-@click.option("--uplink", type=click.Choice(["on", "off"]), help="Its mobile uplink.")
+@click.option("--wifi", type=click.Choice(["on", "off", "silent"]), help="silent: receives, but sends nothing.")
+@click.option("--fade", type=float, metavar="DB", help="Additional path loss to all other stations.")
+@click.option("--uplink", type=click.Choice(["on", "off"]), help="Mobile uplink of the node.")
 @_name_option
 def radio(node: str, wifi: str | None, fade: float | None, uplink: str | None, name: str | None) -> None:
     """Disturb a node's simulated WiFi or mobile uplink, or restore it."""
-    found = Cluster.existing(name)
-    hardware = found.node(node).spec.hardware
+    chosen = Cluster.existing(name)
+    hardware = chosen.node(node).spec.hardware
     if (wifi is not None or fade is not None) and hardware.wifi is None:
         raise ClusterError(f"node {node} has no simulated WiFi; add hardware.wifi to the cluster file")
     if uplink is not None and hardware.uplink is None:
-        raise ClusterError(f"node {node} has no mobile uplink; `fractus cluster link cut {node}` cuts its wire")
+        raise ClusterError(f"node {node} has no mobile uplink; cut its wire with `fractus cluster link cut {node}`")
     if wifi is not None:
-        found.radio.command(station=node, off=wifi == "off", silent=wifi == "silent")
+        chosen.radio.command(station=node, off=wifi == "off", silent=wifi == "silent")
     if fade is not None:
-        found.radio.command(station=node, loss_db=fade)
+        chosen.radio.command(station=node, loss_db=fade)
     if uplink is not None:
-        found.radio.command(uplink=node, off=uplink == "off")
+        chosen.radio.command(uplink=node, off=uplink == "off")
 
 
 @cluster.command("exec", context_settings={"ignore_unknown_options": True})
@@ -205,15 +212,15 @@ def exec_(node: str, command: tuple[str, ...], name: str | None) -> None:
 @cluster.command()
 @click.argument("program")
 @click.argument("node", required=False)
-@click.option("--lines", default=100, show_default=True, help="How many of the last lines.")
+@click.option("--lines", default=100, show_default=True, help="Number of lines, counted from the end.")
 @_name_option
 def logs(program: str, node: str | None, lines: int, name: str | None) -> None:
-    """Print the log of PROGRAM (kubelet, containerd, etcd, ...) on NODE, or of the control plane's."""
+    """Print the log of PROGRAM (kubelet, containerd, etcd, ...) on NODE, by default on the control plane."""
     folder = Cluster.existing(name).logs / (node or "control-plane")
     file = folder / f"{program}.log"
     if not file.is_file():
-        there = ", ".join(sorted(path.stem for path in folder.glob("*.log"))) if folder.is_dir() else "nothing"
-        raise ClusterError(f"no log {file}; available: {there}")
+        available = ", ".join(sorted(path.stem for path in folder.glob("*.log"))) or "none"
+        raise ClusterError(f"no log {file}; available logs: {available}")
     for line in file.read_text(errors="replace").splitlines()[-lines:]:
         click.echo(line)
 
@@ -222,13 +229,15 @@ _EXTRA_PROGRAMS = sorted(set(PROGRAMS[DEFAULT_KUBERNETES]) - set(CLUSTER_PROGRAM
 
 
 @cluster.command()
-@click.option("--with", "extra", multiple=True, type=click.Choice(_EXTRA_PROGRAMS))
+@click.option(
+    "--with", "extra", multiple=True, type=click.Choice(_EXTRA_PROGRAMS), help="Program to provide in addition."
+)
 @_output_option
 def binaries(extra: tuple[str, ...], output: str) -> None:
-    """Provide the Kubernetes programs, building those that are missing, and print where they are."""
-    found = ensure_binaries((*CLUSTER_PROGRAMS, *extra), report=print_report)
+    """Build missing Kubernetes programs, and print the paths of all programs."""
+    programs = ensure_binaries((*CLUSTER_PROGRAMS, *extra), report=print_report)
     if output == "json":
-        click.echo(json.dumps({program: str(path) for program, path in found.paths.items()}, sort_keys=True))
+        click.echo(json.dumps({program: str(path) for program, path in programs.paths.items()}, sort_keys=True))
         return
-    for program, path in sorted(found.paths.items()):
+    for program, path in sorted(programs.paths.items()):
         click.echo(f"{program} {path}")

@@ -30,7 +30,7 @@ from fractus_cluster.processes import running
 from fractus_cluster.radio import Radio
 from fractus_cluster.spec import ClusterSpec, load_spec
 from fractus_cluster.startup import CONTROL_PLANE, Startup, claim, wiring_of
-from fractus_cluster.state import Memory, StateDirectory, only_cluster, state_of
+from fractus_cluster.state import ClusterRecord, StateDirectory, only_cluster, state_of
 
 _LOCK_TIMEOUT_S = 300.0
 _API_TIMEOUT_S = 120.0
@@ -67,7 +67,7 @@ class NodeStatus:
 
 
 class Cluster:
-    """A cluster described by a file. It may be running or not."""
+    """A cluster that a file describes. It may be running or not."""
 
     def __init__(self, spec: ClusterSpec, *, report: Report = silent) -> None:
         """Create a cluster object. This does not start the cluster.
@@ -116,7 +116,7 @@ class Cluster:
 
     @classmethod
     def bare(cls, name: str, *, report: Report = silent) -> Cluster:
-        """Return an object that can only remove a cluster whose start was interrupted early."""
+        """Return a cluster for `down`, also if its start was interrupted before its file was stored."""
         spec = state_of(name).read_spec()
         return cls(spec or ClusterSpec.placeholder(name), report=report)
 
@@ -142,13 +142,13 @@ class Cluster:
         Raises:
             ClusterError: The cluster was never started, so its nodes have no addresses.
         """
-        memory = self._memory()
+        record = self._record()
         branch = cluster_branch(self.name)
-        wiring = self._wiring(memory)
+        wiring = self._wiring(record)
         return [
-            Node(spec, memory.indexes[spec.name], wiring, self._state, branch, self.spec.world_origin)
+            Node(spec, record.indexes[spec.name], wiring, self._state, branch, self.spec.world_origin)
             for spec in self.spec.nodes
-            if spec.name in memory.indexes
+            if spec.name in record.indexes
         ]
 
     def node(self, name: str) -> Node:
@@ -167,10 +167,10 @@ class Cluster:
     def up(self, *, images: Sequence[str] = ()) -> None:
         """Start the cluster, or update it to its description. Nothing changes if it is already up to date.
 
-        Ended processes are restarted, nodes powered on, links restored, and ended vehicles and cameras replaced.
+        It restarts ended processes, vehicles and cameras, powers nodes on, and restores links.
 
         Args:
-            images: Images in the machine's store that are delivered to every node before it starts pods.
+            images: Images in buildah's storage to deliver to every node before it starts pods.
 
         Raises:
             PrerequisiteError: The machine lacks a requirement.
@@ -178,20 +178,20 @@ class Cluster:
         """
         started = time.monotonic()
         check_root()
-        if self._state.read_memory() is None or machine.holder(self.name) is None:
+        if self._state.read_record() is None or machine.holder(self.name) is None:
             check_prerequisites()
         binaries = ensure_binaries(report=self._report)
         for sentence in (text for node in self.spec.nodes for text in shortfalls(node, describe_machine())):
             self._report(f"note: {sentence}")
         with self._locked():
-            memory = claim(self.spec, self._state, chosen_kubernetes(), self._report)
+            record = claim(self.spec, self._state, chosen_kubernetes(), self._report)
             self._state.write_spec(self.spec)
-            startup = self._startup(memory)
+            startup = self._startup(record)
             startup.start_control_plane(binaries)
             nodes = self.nodes
             store = ImageStore.default(report=self._report)
-            wanted = store.fetch(images)
-            startup.place_nodes(nodes, binaries, store, wanted)
+            fetched = store.fetch(images)
+            startup.place_nodes(nodes, binaries, store, fetched)
             self.radio.start(nodes, self.spec.air)
             with startup.api() as api:
                 api.wait_ready(_API_TIMEOUT_S)
@@ -205,7 +205,7 @@ class Cluster:
                 startup.wait_nodes(api, [(node, since if node.name in started_nodes else None) for node in nodes])
             startup.wait_dns()
             startup.check_hardware(nodes)
-            store.deliver(wanted, nodes)
+            store.deliver(fetched, nodes)
         self._report(f"cluster {self.name} is up: {len(nodes)} nodes, {time.monotonic() - started:.1f} s")
 
     def down(self) -> None:
@@ -232,9 +232,9 @@ class Cluster:
 
     def status(self) -> list[NodeStatus]:
         """Return the status of each node."""
-        memory = self._memory()
-        cut = network.links_cut(self._wiring(memory))
-        ready = self._startup(memory).ready_nodes()
+        record = self._record()
+        cut = network.links_cut(self._wiring(record))
+        ready = self._startup(record).ready_nodes()
         return [
             NodeStatus(
                 node.name,
@@ -300,22 +300,22 @@ class Cluster:
         return locked(
             machine.cluster_lock(self.name),
             timeout_s=_LOCK_TIMEOUT_S,
-            what=f"another command works on cluster {self.name}",
+            what=f"another command is changing cluster {self.name}",
             report=self._report,
             remove=remove,
         )
 
-    def _memory(self) -> Memory:
-        memory = self._state.read_memory()
-        if memory is None:
+    def _record(self) -> ClusterRecord:
+        record = self._state.read_record()
+        if record is None:
             raise ClusterError(f"cluster {self.name} is not running; start it: fractus cluster up FILE")
-        return memory
+        return record
 
-    def _wiring(self, memory: Memory) -> network.Wiring:
-        return wiring_of(self.name, self._state, memory)
+    def _wiring(self, record: ClusterRecord) -> network.Wiring:
+        return wiring_of(self.name, self._state, record)
 
-    def _startup(self, memory: Memory) -> Startup:
-        return Startup(self.name, self._state, self._wiring(memory), Authority(self._state.pki))
+    def _startup(self, record: ClusterRecord) -> Startup:
+        return Startup(self.name, self._state, self._wiring(record), Authority(self._state.pki))
 
 
 def print_report(message: str) -> None:

@@ -51,6 +51,6 @@ def run(
     except subprocess.TimeoutExpired as error:
         raise ClusterError(f"{' '.join(words[:4])} ... did not end within {timeout_s:.0f} s") from error
     if check and done.returncode != 0:
-        said = (done.stderr.strip() or done.stdout.strip())[-2000:]
-        raise ClusterError(f"{' '.join(words)} failed with exit code {done.returncode}: {said}")
+        output = (done.stderr.strip() or done.stdout.strip())[-2000:]
+        raise ClusterError(f"{' '.join(words)} failed with exit code {done.returncode}: {output}")
     return done

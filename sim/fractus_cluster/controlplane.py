@@ -47,7 +47,7 @@ def server_url(addressing: Addressing) -> str:
 
 
 def server_credential(authority: Authority, addressing: Addressing) -> Credential:
-    """Return the API server's own certificate."""
+    """Return the certificate that the API server serves with."""
     return authority.issue(
         "kube-apiserver",
         common_name="kube-apiserver",
@@ -71,7 +71,7 @@ def administrator(authority: Authority) -> Credential:
 def write_control_plane(
     authority: Authority, addressing: Addressing, files: ControlPlaneFiles, *, cluster: str
 ) -> None:
-    """Write the kubeconfigs of the control plane; its DNS server stays off until `let_dns_start`."""
+    """Write the kubeconfigs of the control plane. The DNS server does not start until `let_dns_start` is called."""
     files.corefile.unlink(missing_ok=True)
     users = {
         "kube-controller-manager": "system:kube-controller-manager",
@@ -91,13 +91,13 @@ def let_dns_start(addressing: Addressing, files: ControlPlaneFiles) -> None:
     Without the permission, the server retries only after 30 s.
     """
     if not files.corefile.exists():
-        fresh = files.corefile.with_suffix(".new")
-        fresh.write_text(corefile(addressing, files.kubeconfig("coredns")))
-        fresh.replace(files.corefile)
+        new = files.corefile.with_suffix(".new")
+        new.write_text(corefile(addressing, files.kubeconfig("coredns")))
+        new.replace(files.corefile)
 
 
 def corefile(addressing: Addressing, kubeconfig: Path) -> str:
-    """Return the DNS server's configuration: the cluster's names, and a prompt refusal of all others."""
+    """Return the DNS server's configuration: it resolves names of the cluster, and refuses all others immediately."""
     return f"""\
 {_CLUSTER_DOMAIN}:53 in-addr.arpa:53 {{
     bind {addressing.control_plane}

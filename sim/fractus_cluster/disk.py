@@ -8,7 +8,7 @@ from fractus_cluster.commands import run
 
 
 def mount_disk(image: Path, target: Path, size_bytes: int) -> None:
-    """Mount an image file as a disk. Create the file if it is missing. Nothing changes if it is mounted.
+    """Mount an image file as a disk unless it is mounted. Create the file if it is missing.
 
     No blocks are reserved for root, so the disk can be filled completely.
 
@@ -23,20 +23,20 @@ def mount_disk(image: Path, target: Path, size_bytes: int) -> None:
     if target.is_mount():
         return
     if not image.exists():
-        making = image.with_suffix(".making")
-        with making.open("wb") as file:
+        new = image.with_suffix(".new")
+        with new.open("wb") as file:
             file.truncate(size_bytes)
-        run(["mkfs.ext4", "-q", "-F", "-m", "0", making])
-        making.replace(image)
+        run(["mkfs.ext4", "-q", "-F", "-m", "0", new])
+        new.replace(image)
     target.mkdir(parents=True, exist_ok=True)
     run(["mount", "-o", "loop,nosuid,nodev", image, target])
 
 
 def unmount_below(directory: Path) -> None:
-    """Unmount all that is mounted below a directory, also by a command that was interrupted.
+    """Unmount everything that is mounted below a directory, including mounts of an interrupted command.
 
     Raises:
-        ClusterError: Something cannot be unmounted.
+        ClusterError: A file system cannot be unmounted.
     """
     lines = Path("/proc/self/mountinfo").read_text().splitlines()
     mounted = [Path(line.split(" ")[4].replace("\\040", " ")) for line in lines]

@@ -1,4 +1,4 @@
-"""Simulated hardware of a node with its own power: the vehicle of a drone and a camera."""
+"""Simulated hardware of a node that has its own power: the vehicle of a drone, and a camera."""
 
 from __future__ import annotations
 
@@ -13,11 +13,10 @@ from fractus_cluster.errors import ClusterError
 from fractus_cluster.spec import NodeSpec, Place, camera_address
 
 CAMERA_LINKS = ("tcp:127.0.0.1:5762", "tcp:127.0.0.1:5763")
-"""Vehicle endpoint of the camera: a separate link, the second if the first is the autopilot's."""
-
+"""Candidates for the vehicle endpoint of the camera. The first is used unless it is the autopilot's."""
 
 RADIO_LINK = "tcp:127.0.0.1:5765"
-"""Vehicle endpoint of the radio, for a vehicle with a station."""
+"""Vehicle endpoint of the radio, if the node has a WiFi device."""
 
 
 def hardware_commands(node: NodeSpec, origin: Place | None) -> dict[str, list[str]]:
@@ -32,8 +31,8 @@ def hardware_commands(node: NodeSpec, origin: Place | None) -> dict[str, list[st
     """
     vehicle = vehicle_command(node)
     camera = camera_command(node, origin)
-    found = {"vehicle": vehicle, "camera": camera}
-    return {name: command for name, command in found.items() if command is not None}
+    commands = {"vehicle": vehicle, "camera": camera}
+    return {name: command for name, command in commands.items() if command is not None}
 
 
 def vehicle_command(node: NodeSpec) -> list[str] | None:
@@ -73,9 +72,9 @@ def camera_command(node: NodeSpec, origin: Place | None) -> list[str] | None:
     mount = features.mount or CameraMount(stabilised=True)
     host = f"[{address[0]}]" if ":" in address[0] else address[0]
     command = [program("fractus-camera-world"), "--listen", f"{host}:{address[1]}", "--seed", str(camera.seed)]
-    middle = camera.origin or origin
-    if middle is not None:
-        command += ["--origin", f"{middle.lat},{middle.lon}"]
+    centre = camera.origin or origin
+    if centre is not None:
+        command += ["--origin", f"{centre.lat},{centre.lon}"]
     command += ["--resolution", features.resolution, "--mount-pitch", str(mount.pitch), "--mount-yaw", str(mount.yaw)]
     command += ["--stabilised" if mount.stabilised or mount.gimbal else "--fixed-mount"]
     if features.horizontal_field_of_view is not None:
@@ -110,7 +109,7 @@ def program(name: str) -> str:
         ClusterError: The program is not installed.
     """
     beside = Path(sys.executable).with_name(name)
-    found = str(beside) if os.access(beside, os.X_OK) else shutil.which(name)
-    if found is None:
-        raise ClusterError(f"{name} is not installed; install the package with its extra `sim`")
-    return found
+    path = str(beside) if os.access(beside, os.X_OK) else shutil.which(name)
+    if path is None:
+        raise ClusterError(f"{name} is not installed; install the package fractus-sim")
+    return path

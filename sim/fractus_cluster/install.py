@@ -1,4 +1,4 @@
-"""Installing Fractus on an embedded cluster: its images on every node, then its charts, until the drones are ready."""
+"""Installation of Fractus on an embedded cluster: images on every node, then charts, until the drones are ready."""
 
 from __future__ import annotations
 
@@ -34,16 +34,16 @@ def install(cluster: Cluster, source: Path, *, report: Report) -> None:
     images = build_images(source, targets=_TARGETS, report=report)
     cluster.load_images(images)
     programs = ensure_binaries(("kubectl", "helm"), report=report)
-    own = ("--kubeconfig", str(cluster.kubeconfig))
+    kubeconfig = ("--kubeconfig", str(cluster.kubeconfig))
     for chart in _CHARTS:
-        place = ("--namespace", NAMESPACE, "--create-namespace")
-        run([programs["helm"], "upgrade", "--install", chart, source / "charts" / chart, *own, *place])
+        namespace = ("--namespace", NAMESPACE, "--create-namespace")
+        run([programs["helm"], "upgrade", "--install", chart, source / "charts" / chart, *kubeconfig, *namespace])
         report(f"installed {chart}")
     for node in cluster.spec.nodes:
         if node.node_class != "drone":
             continue
-        # Its agent must register it first.
+        # The object exists only after the agent has registered the drone.
         for state in ("create", "condition=Ready"):
             waiting = ("wait", f"--for={state}", f"drones.fractus.dev/{node.name}", f"--timeout={_READY_TIMEOUT_S}s")
-            run([programs["kubectl"], *own, *waiting], timeout_s=_READY_TIMEOUT_S + 10)
+            run([programs["kubectl"], *kubeconfig, *waiting], timeout_s=_READY_TIMEOUT_S + 10)
         report(f"{node.name} is ready")

@@ -19,6 +19,6 @@ def read_ledger(path: Path) -> dict[str, str]:
 
 
 def write_ledger(path: Path, content: Mapping[str, str]) -> None:
-    """Remember."""
+    """Write a ledger atomically."""
     path.parent.mkdir(parents=True, exist_ok=True)
     write_file(path, json.dumps(content, indent=1, sort_keys=True).encode(), 0o644, durable=False)

@@ -29,12 +29,12 @@ def locked(
 ) -> Iterator[None]:
     """Hold the lock file `path` inside the block.
 
-    The lock belongs to the open file, so the kernel releases it when its holder ends, even after SIGKILL.
+    The kernel releases the lock when the process that holds it ends, even after SIGKILL.
 
     Args:
         path: Lock file. It is created if it is missing.
         timeout_s: Maximum time to wait for the lock.
-        what: Activity of the holder for messages ("another process is building binaries").
+        what: Activity of the other holder, for messages. Example: "another process is building binaries".
         report: Called once if another process holds the lock.
         remove: Delete the file before the lock is released.
 
@@ -53,7 +53,7 @@ def locked(
 
 def _acquire(path: Path, *, timeout_s: float, what: str, report: Callable[[str], None]) -> int:
     deadline = time.monotonic() + timeout_s
-    told = False
+    reported = False
     while True:
         handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
         try:
@@ -62,20 +62,21 @@ def _acquire(path: Path, *, timeout_s: float, what: str, report: Callable[[str],
             os.close(handle)
             if time.monotonic() > deadline:
                 raise ClusterError(f"timed out after {timeout_s:.0f} s: {what} ({path} is locked)") from None
-            if not told:
+            if not reported:
                 report(f"waiting: {what}")
-                told = True
+                reported = True
             time.sleep(_POLL_S)
             continue
-        if _is_still(path, handle):
+        if _refers_to(path, handle):
             return handle
-        os.close(handle)  # its last holder removed the file while we waited
+        os.close(handle)  # the previous holder removed the file
 
 
-def _is_still(path: Path, handle: int) -> bool:
+def _refers_to(path: Path, handle: int) -> bool:
+    """Return True if a path still refers to an open file."""
     try:
-        there = path.stat()
+        by_path = path.stat()
     except FileNotFoundError:
         return False
-    ours = os.fstat(handle)
-    return (there.st_dev, there.st_ino) == (ours.st_dev, ours.st_ino)
+    by_handle = os.fstat(handle)
+    return (by_path.st_dev, by_path.st_ino) == (by_handle.st_dev, by_handle.st_ino)

@@ -42,7 +42,7 @@ class _Ledger:
     sysctls: dict[str, str] = field(default_factory=dict)
     controllers: list[str] = field(default_factory=list)
     netns_mounted: bool = False
-    netns_there: bool = False
+    netns_existed: bool = False
     claims: dict[str, _Claim] = field(default_factory=dict)
 
 
@@ -65,7 +65,7 @@ def claim(name: str, state: Path, block: IPv4Network | None) -> IPv4Network:
     Raises:
         ClusterError: The name is used by a cluster with a different state directory, or the addresses are in use.
     """
-    with locked(_LOCK, timeout_s=_LOCK_TIMEOUT_S, what="another cluster is coming up or going down"):
+    with locked(_LOCK, timeout_s=_LOCK_TIMEOUT_S, what="another cluster is being started or removed"):
         ledger = _read()
         held = ledger.claims.get(name)
         if held is not None:
@@ -78,9 +78,10 @@ def claim(name: str, state: Path, block: IPv4Network | None) -> IPv4Network:
         elif any(block.overlaps(other) for other in (*networks_in_use(), *others)):
             raise ClusterError(f"{name}: its addresses {block} are used by another network; remove the cluster first")
         if not ledger.claims:
-            _note_machine(ledger)
+            _record_settings(ledger)
         ledger.claims[name] = _Claim(str(state), str(block))
-        _write(ledger)  # before anything changes, so that an interrupted start is undone too
+        # Written before anything changes, so that an interrupted start can be undone.
+        _write(ledger)
         _raise_sysctls(ledger)
         return block
 
@@ -89,7 +90,7 @@ def holders() -> dict[str, Path]:
     """Return the state directory of each cluster that holds a name."""
     if not _LEDGER.exists():
         return {}
-    with locked(_LOCK, timeout_s=_LOCK_TIMEOUT_S, what="another cluster is coming up or going down"):
+    with locked(_LOCK, timeout_s=_LOCK_TIMEOUT_S, what="another cluster is being started or removed"):
         return {name: Path(held.state) for name, held in _read().claims.items()}
 
 
@@ -99,8 +100,8 @@ def holder(name: str) -> Path | None:
 
 
 def release(name: str) -> None:
-    """Give up a cluster's claims; after the last one put the machine's settings back."""
-    with locked(_LOCK, timeout_s=_LOCK_TIMEOUT_S, what="another cluster is coming up or going down", remove=True):
+    """Release a cluster's claims. After the last cluster, restore the settings of the machine."""
+    with locked(_LOCK, timeout_s=_LOCK_TIMEOUT_S, what="another cluster is being started or removed", remove=True):
         ledger = _read()
         ledger.claims.pop(name, None)
         if ledger.claims:
@@ -116,38 +117,38 @@ def remove_directory() -> None:
     try:
         DIRECTORY.rmdir()
     except OSError:
-        return  # # used by another cluster
+        return  # used by another cluster
 
 
-def _note_machine(ledger: _Ledger) -> None:
+def _record_settings(ledger: _Ledger) -> None:
     ledger.netns_mounted = _mounted(NETNS_DIRECTORY)
-    ledger.netns_there = NETNS_DIRECTORY.exists()
+    ledger.netns_existed = NETNS_DIRECTORY.exists()
     hierarchies = find_hierarchies()
     if hierarchies.version == 2:
         ledger.controllers = (hierarchies.roots[0] / "cgroup.subtree_control").read_text().split()
 
 
 def _raise_sysctls(ledger: _Ledger) -> None:
-    for name, wanted in _RAISED_SYSCTLS.items():
+    for name, minimum in _RAISED_SYSCTLS.items():
         path = _sysctl(name)
         present = path.read_text().strip()
-        if int(present) < wanted:
+        if int(present) < minimum:
             ledger.sysctls.setdefault(name, present)
             _write(ledger)
-            path.write_text(str(wanted))
+            path.write_text(str(minimum))
 
 
 def _restore(ledger: _Ledger) -> None:
     for name, value in ledger.sysctls.items():
         path = _sysctl(name)
-        # # otherwise changed by another program in the meantime
+        # A different value was set by another program in the meantime and must stay.
         if path.read_text().strip() == str(_RAISED_SYSCTLS.get(name)):
             path.write_text(value)
-    # `ip netns add` mounts the directory on itself the first time.
+    # The first `ip netns add` mounts the directory on itself.
     if NETNS_DIRECTORY.is_dir() and not any(NETNS_DIRECTORY.iterdir()):
         if not ledger.netns_mounted and _mounted(NETNS_DIRECTORY):
             run(["umount", str(NETNS_DIRECTORY)], check=False)
-        if not ledger.netns_there:
+        if not ledger.netns_existed:
             NETNS_DIRECTORY.rmdir()
     hierarchies = find_hierarchies()
     if hierarchies.version == 2 and ledger.controllers:
@@ -156,7 +157,7 @@ def _restore(ledger: _Ledger) -> None:
             try:
                 control.write_text(f"-{name}")
             except OSError:
-                continue  # # in use by another program
+                continue  # in use by another program
 
 
 def _mounted(path: Path) -> bool:

@@ -17,7 +17,7 @@ DNS_USER = "fractus-sim:dns"
 
 
 def node_object(node: NodeSpec, index: int, addressing: Addressing) -> tuple[str, Json]:
-    """Return path and content of the Node, which is created before its kubelet so that its labels exist early."""
+    """Return path and content of the Node. It is created before its kubelet starts, so that its labels exist early."""
     pods = str(addressing.pods(index))
     labels = {
         "kubernetes.io/hostname": node.name,
@@ -34,24 +34,24 @@ def node_object(node: NodeSpec, index: int, addressing: Addressing) -> tuple[str
 
 
 def taints_patch(node: NodeSpec, present: Json) -> tuple[str, Json] | None:
-    """Return path and merge patch that keep pods off a drone or edge node unless they are meant for such; None when done.
+    """Return path and merge patch of the taint that keeps other pods off a drone or edge node. Return None if it is set.
 
-    Taints of others stay; Kubernetes itself keeps some there.
+    The patch keeps all other taints, because Kubernetes sets some itself.
 
     Args:
-        node: The node's part of the cluster file.
-        present: Its Node object.
+        node: Part of the cluster file that describes the node.
+        present: Node object on the API server.
     """
     taints = present["spec"].get("taints", [])
-    # NoExecute is also enforced by kubelet, so setting nodeName in a pod does not bypass it.
-    wanted = [{"key": CLASS_LABEL, "value": node.node_class, "effect": "NoExecute"}]
+    # kubelet also enforces NoExecute, so a pod cannot bypass the taint by setting nodeName.
+    taint = [{"key": CLASS_LABEL, "value": node.node_class, "effect": "NoExecute"}]
     if node.node_class == "cloud":
-        wanted = []
-    others = [taint for taint in taints if taint["key"] != CLASS_LABEL]
-    if len(others) + len(wanted) == len(taints) and all(taint in taints for taint in wanted):
+        taint = []
+    others = [entry for entry in taints if entry["key"] != CLASS_LABEL]
+    if len(others) + len(taint) == len(taints) and all(entry in taints for entry in taint):
         return None
     metadata = {"resourceVersion": present["metadata"]["resourceVersion"]}
-    return f"/api/v1/nodes/{node.name}", {"metadata": metadata, "spec": {"taints": [*others, *wanted]}}
+    return f"/api/v1/nodes/{node.name}", {"metadata": metadata, "spec": {"taints": [*others, *taint]}}
 
 
 def dns_objects(listen: IPv4Address) -> list[tuple[str, Json]]:
@@ -102,13 +102,13 @@ def dns_objects(listen: IPv4Address) -> list[tuple[str, Json]]:
 
 def extended_resources_patch(node: NodeSpec, present: Json) -> tuple[str, Json] | None:
     """Return path and merge patch for a node's extended resources, or None if the node already offers them."""
-    wanted = dict(node.extended_resources)
+    resources = dict(node.extended_resources)
     status = present.get("status", {})
-    # Kubelet would update allocatable only at its next heartbeat.
+    # kubelet would update `allocatable` only at its next heartbeat.
     patch = {
-        field: wanted
+        field: resources
         for field in ("capacity", "allocatable")
-        if any(str(status.get(field, {}).get(name)) != amount for name, amount in wanted.items())
+        if any(str(status.get(field, {}).get(name)) != amount for name, amount in resources.items())
     }
     return (f"/api/v1/nodes/{node.name}/status", {"status": patch}) if patch else None
 

@@ -1,7 +1,7 @@
-"""The cluster's wires: a network namespace for the control plane and each node, joined by a bridge.
+"""Network of a cluster: one namespace for the control plane and for each node, connected by a bridge.
 
-The bridge lives in the control plane's namespace, not in the machine's, so neither the machine's firewall nor its
-forwarding touch the cluster's traffic. All that the machine itself gets is one link and one route.
+The bridge is in the namespace of the control plane. Therefore firewall and forwarding of the machine do not affect the
+traffic of the cluster. The machine itself only gets one link and one route.
 """
 
 from __future__ import annotations
@@ -38,21 +38,27 @@ class Wiring:
 
     @property
     def host_link(self) -> str:
-        """The machine's end of its link into the cluster."""
+        """Name of the machine's end of its link into the cluster."""
         return host_link(self.cluster)
 
     def namespace(self, node: str | None = None) -> str:
-        """Return the namespace of a node, or of the control plane."""
+        """Return the name of the network namespace of a node, by default of the control plane."""
         return _namespace_name(self.cluster) + ("" if node is None else f".{node}")
 
     def namespace_path(self, node: str | None = None) -> Path:
-        """Return the file that keeps a namespace."""
+        """Return the file of a network namespace."""
         return NETNS_DIRECTORY / self.namespace(node)
 
 
 @dataclass(frozen=True, slots=True)
 class _Mark:
-    """Record of a completely configured namespace: its identity, its peer, and the code version that configured it."""
+    """Record of a completely configured namespace.
+
+    Attributes:
+        inode: Identity of the namespace.
+        hub: Identity of the control plane's namespace, or 0 in its own record.
+        mobile: True if the radio carries the uplink.
+    """
 
     inode: int
     hub: int
@@ -70,19 +76,19 @@ def _namespace_name(cluster: str) -> str:
 
 def networks_in_use() -> list[IPv4Network]:
     """Return the networks of all IPv4 routes and addresses of the machine."""
-    found: list[IPv4Network] = []
+    networks: list[IPv4Network] = []
     for route in _json(["ip", "-4", "-j", "route", "show", "table", "all"]):
         destination = str(route["dst"])
         if destination != "default":
-            found.append(IPv4Network(destination, strict=False))
+            networks.append(IPv4Network(destination, strict=False))
     for link in _json(["ip", "-4", "-j", "address"]):
         addresses = link.get("addr_info", ())
-        found.extend(IPv4Network(f"{entry['local']}/{entry['prefixlen']}", strict=False) for entry in addresses)
-    return found
+        networks.extend(IPv4Network(f"{entry['local']}/{entry['prefixlen']}", strict=False) for entry in addresses)
+    return networks
 
 
 def wire_control_plane(wiring: Wiring) -> None:
-    """Configure the control plane's namespace with the bridge and the link of the machine. Nothing changes if done."""
+    """Create the control plane's namespace with the bridge and the machine's link, unless they exist."""
     path = wiring.namespace_path()
     inode = _inode(path)
     if _read_mark(wiring, None) == _Mark(inode, 0) and inode and _link_exists(wiring.host_link):
@@ -115,13 +121,13 @@ def wire_control_plane(wiring: Wiring) -> None:
 
 
 def wire_node(wiring: Wiring, node: str, index: int, *, mobile: bool = False) -> None:
-    """Set up a node's namespace and its uplink; a no-op when that was done and its link is not cut.
+    """Create a node's namespace and uplink unless they exist. Restore the uplink if it is cut.
 
     Args:
-        wiring: The cluster's network.
-        node: Its name.
-        index: Its place in the addressing.
-        mobile: Whether the radio carries the uplink, between a device at each end, instead of a wire.
+        wiring: Network of the cluster.
+        node: Name of the node.
+        index: Index of the node in the addressing.
+        mobile: True if the radio carries the uplink between two devices. False for a wire.
     """
     path = wiring.namespace_path(node)
     hub = _inode(wiring.namespace_path())
@@ -133,18 +139,18 @@ def wire_node(wiring: Wiring, node: str, index: int, *, mobile: bool = False) ->
     if not inode:
         run(["ip", "netns", "add", wiring.namespace(node)])
     place = wiring.addressing
-    own = port(index)
+    device = port(index)
     _delete_link(UPLINK, wiring.namespace(node))
-    _delete_link(own, wiring.namespace())
+    _delete_link(device, wiring.namespace())
     if mobile:
-        # The devices remain when the radio process ends, but lose their carrier.
+        # When the radio process ends, the devices remain but lose their carrier.
         _ip(wiring.namespace(node), f"tuntap add dev {UPLINK} mode tap")
-        _ip(wiring.namespace(), f"tuntap add dev {own} mode tap")
+        _ip(wiring.namespace(), f"tuntap add dev {device} mode tap")
     else:
-        _ip(wiring.namespace(), f"link add {own} type veth peer name {UPLINK} netns {wiring.namespace(node)}")
+        _ip(wiring.namespace(), f"link add {device} type veth peer name {UPLINK} netns {wiring.namespace(node)}")
     _ip(
         wiring.namespace(),
-        f"link set {own} master {_BRIDGE} up",
+        f"link set {device} master {_BRIDGE} up",
         f"route replace {place.pods(index)} via {place.node(index)} dev {_BRIDGE}",
     )
     _ip(
@@ -171,20 +177,20 @@ def unwire_node(wiring: Wiring, node: str, index: int) -> None:
 def unwire(cluster: str) -> None:
     """Remove every namespace and link of a cluster."""
     _delete_link(host_link(cluster))
-    own = _namespace_name(cluster)
+    name = _namespace_name(cluster)
     if NETNS_DIRECTORY.is_dir():
         for path in sorted(NETNS_DIRECTORY.iterdir()):
-            if path.name == own or path.name.startswith(own + "."):
+            if path.name == name or path.name.startswith(name + "."):
                 run(["ip", "netns", "delete", path.name])
 
 
 def cut_link(wiring: Wiring, index: int) -> None:
-    """Take a node's uplink down at the far end, as when radio contact is lost."""
+    """Take a node's uplink down at its far end, like a loss of radio contact."""
     _ip(wiring.namespace(), f"link set {port(index)} down")
 
 
 def heal_link(wiring: Wiring, index: int) -> None:
-    """Take a node's uplink up again."""
+    """Restore a node's uplink."""
     _ip(wiring.namespace(), f"link set {port(index)} up")
 
 
@@ -201,7 +207,7 @@ def links_cut(wiring: Wiring) -> set[int]:
 
 
 def flush_firewall(wiring: Wiring, node: str) -> None:
-    """Forget a node's firewall rules, as a machine does that loses power."""
+    """Remove a node's firewall rules, like a loss of power."""
     run(["ip", "netns", "exec", wiring.namespace(node), "nft", "flush", "ruleset"])
 
 
@@ -237,16 +243,14 @@ def _settings(namespace: Path, values: dict[str, str]) -> None:
 
 
 def _inode(path: Path) -> int:
-    """Return the identity of a network namespace, or 0 if the file refers to none."""
+    """Return the identity of a network namespace, or 0 if the file does not exist or refers to no namespace."""
     try:
         facts = path.stat()
     except FileNotFoundError:
         return 0
-    # An interrupted `ip netns add` leaves a plain file on /run's own file system.
-    return facts.st_ino if facts.st_dev != NETNS_DIRECTORY.stat().st_dev else _discard(path)
-
-
-def _discard(path: Path) -> int:
+    if facts.st_dev != NETNS_DIRECTORY.stat().st_dev:
+        return facts.st_ino
+    # An interrupted `ip netns add` leaves a regular file on the file system of /run.
     path.unlink()
     return 0
 

@@ -49,15 +49,15 @@ def init_command(config: Path, namespace: Path) -> list[str]:
 
 @dataclass(frozen=True, slots=True)
 class Node:
-    """A node: real containerd, kubelet and kube-proxy in namespaces of their own.
+    """A node: real containerd, kubelet and kube-proxy in separate namespaces.
 
     Attributes:
-        spec: Its part of the cluster file.
-        index: Its place in the cluster's addressing.
-        wiring: The cluster's network.
-        state: The cluster's state directory.
-        branch: The cluster's control groups.
-        world_origin: The middle of the landscape that the cluster's cameras see.
+        spec: Part of the cluster file that describes the node.
+        index: Index of the node in the addressing.
+        wiring: Network of the cluster.
+        state: State directory of the cluster.
+        branch: Control group of the cluster.
+        world_origin: Centre of the landscape of the cluster's cameras.
     """
 
     spec: NodeSpec
@@ -69,7 +69,7 @@ class Node:
 
     @property
     def name(self) -> str:
-        """The name of the Kubernetes node."""
+        """Name of the Kubernetes node."""
         return self.spec.name
 
     @property
@@ -79,11 +79,11 @@ class Node:
 
     @property
     def directory(self) -> Path:
-        """Files of the node. `var-lib/` and `etc/` below are its /var/lib and its changes to /etc."""
+        """Directory of the node's files. It contains `var-lib/`, the node's /var/lib, and `etc/`, its changes to /etc."""
         return self.state.node(self.name)
 
     @property
-    def own_state(self) -> Path:
+    def fractus_state(self) -> Path:
         """Directory that is mounted as /var/lib/fractus on the node."""
         return self.directory / "var-lib" / "fractus"
 
@@ -154,12 +154,12 @@ class Node:
         network.heal_link(self.wiring, self.index)
 
     def power_off(self) -> None:
-        """Pull the node's power: all its processes die at once, its vehicle does not."""
+        """Power off the node: kill all its processes. Its vehicle keeps running."""
         record_path = self.state.process(f"node.{self.name}")
         kill_recorded(record_path)
         self._cgroup.kill_all()
         record_path.unlink(missing_ok=True)
-        # Groups of pods that are no more would make the next kubelet slow.
+        # The control groups of old pods would slow down the next kubelet.
         self._cgroup.remove()
 
     def power_on(self) -> bool:
@@ -172,7 +172,7 @@ class Node:
             return False
         self.power_off()
         if self.spec.hardware.disk is not None:
-            mount_disk(self.directory / "disk.img", self.own_state, self.spec.hardware.disk.size_bytes)
+            mount_disk(self.directory / "disk.img", self.fractus_state, self.spec.hardware.disk.size_bytes)
         network.flush_firewall(self.wiring, self.name)
         record = spawn(
             init_command(self.directory / "config" / "init.json", self.wiring.namespace_path(self.name)),
@@ -201,7 +201,7 @@ class Node:
             write_record(self.state.process(f"{name}.{self.name}"), record)
 
     def stop_hardware(self) -> None:
-        """Take the node's vehicle and camera away."""
+        """Stop the node's vehicle and camera."""
         for name in ("vehicle", "camera"):
             path = self.state.process(f"{name}.{self.name}")
             kill_recorded(path)
@@ -219,7 +219,11 @@ class Node:
         shutil.rmtree(self.state.logs / self.name, ignore_errors=True)
 
     def files(self, binaries: Binaries, authority: Authority) -> dict[str, str]:
-        """Return the files that make the node, by path below its directory; secrets are in `config/`."""
+        """Return the content of the node's files by their path below its directory. Secrets are in `config/`.
+
+        Raises:
+            ClusterError: The CNI plugins are not installed.
+        """
         plugins = plugin_directory()
         if plugins is None:
             raise ClusterError("no CNI plugins; install containernetworking-plugins")

@@ -1,7 +1,7 @@
-"""First program of a node: sets up its view of the machine, then supervises its daemons.
+"""First program of a node: builds the node's mount tree, then supervises its daemons.
 
-It runs as root in new mount, uts, ipc and pid namespaces and in the node's network namespace. It uses only the standard
-library and changes nothing outside of these namespaces.
+It runs as root in new mount, uts, ipc and pid namespaces and in the network namespace of the node. It imports no large
+library, so that it starts fast, and changes nothing outside of these namespaces.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ RUN = Path("/run/fractus")
 
 @dataclass(frozen=True, slots=True)
 class NodeView:
-    """View of the machine for a node.
+    """Contents of a node's mount tree.
 
     Attributes:
-        hostname: Host name. None leaves the mount tree unchanged (control plane).
-        files: Directory with etc/, etc-work/, var-lib/, var-log/ and config/ of the node.
-        logs: Directory of its daemons' logs.
+        hostname: Host name. None for the control plane, whose mount tree is not changed.
+        files: Directory with the node's etc/, etc-work/, var-lib/, var-log/ and config/.
+        logs: Directory of the daemons' logs.
         programs: Paths on the machine by program name.
-        sysctls: Machine-wide settings as shown to the node, so that no daemon changes the actual ones.
+        sysctls: Values of machine-wide kernel settings that the node's daemons see. They cannot change the real values.
     """
 
     hostname: str | None
@@ -50,7 +50,7 @@ class NodeView:
 
 
 def main(argument: str) -> None:
-    """Read the JSON file that `argument` names, prepare the view, and supervise."""
+    """Build the mount tree of a node and supervise its daemons, according to a JSON file with `view` and `units`."""
     content = json.loads(Path(argument).read_text())
     view = NodeView(**content["view"])
     units = [Unit(**entry) for entry in content["units"]]
@@ -62,7 +62,7 @@ def main(argument: str) -> None:
 
 
 def release_namespaces() -> None:
-    """Drop our copies of other network namespaces' handles, which would keep them from ending."""
+    """Unmount the files of all network namespaces in this mount tree, so that the namespaces can be deleted."""
     for line in Path("/proc/self/mountinfo").read_text().splitlines():
         before, _, after = line.partition(" - ")
         if after.split(" ", 1)[0] == "nsfs":
@@ -72,7 +72,7 @@ def release_namespaces() -> None:
 def prepare(view: NodeView) -> None:
     """Build the node's mount tree."""
     with ExitStack() as stack:
-        # File descriptors, because the paths may be below directories that are covered by mounts.
+        # File descriptors stay valid when a mount covers a directory above their path.
         source = {name: _handle(Path(view.files) / name, stack) for name in ("etc", "etc-work", "var-lib", "var-log")}
         source["config"] = _handle(Path(view.files) / "config", stack)
         source["logs"] = _handle(Path(view.logs), stack)
@@ -89,7 +89,7 @@ def prepare(view: NodeView) -> None:
         layers = f"lowerdir=/etc,upperdir={source['etc']},workdir={source['etc-work']}"
         _mount("overlay", "/etc", "overlay", 0, layers)
         _bind(source["var-log"], Path("/var/log"))
-        # Recursive, to include the separate disk of the node.
+        # A recursive mount includes the node's separate disk.
         _mount(source["var-lib"], "/var/lib", None, _MS_BIND | _MS_REC, None)
     _settings(view.sysctls)
     _mount("none", "/", None, _MS_SHARED | _MS_REC, None)

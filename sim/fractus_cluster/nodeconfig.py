@@ -1,4 +1,4 @@
-"""Configuration of a node's daemons. Pure builders: a node and its place in the cluster -> text of files."""
+"""Configuration files of a node's daemons. All functions are pure."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ CONTAINERD_SOCKET = "/run/containerd/containerd.sock"
 CONFIG = RUN / "config"
 
 SHOWN_SYSCTLS = {
-    # Values required by kubelet. It finds them set and does not change the machine's settings.
+    # Values that kubelet requires. If they are set, kubelet does not change the settings of the machine.
     "vm.overcommit_memory": "1",
     "vm.panic_on_oom": "0",
     "kernel.panic": "10",
@@ -43,16 +43,20 @@ class Machine:
 
 
 def shortfalls(node: NodeSpec, machine: Machine) -> list[str]:
-    """Return a sentence for each resource of which the node is to offer more than the machine has."""
-    said = []
+    """Return a sentence for each resource of which the node should offer more than the machine has."""
+    sentences = []
     cpu = node.resources.get("cpu")
     memory = node.resources.get("memory")
     if cpu and parse_quantity(cpu) > machine.cpus:
-        said.append(f"node {node.name} offers {machine.cpus} CPUs, not {cpu}: the machine has no more")
+        sentences.append(
+            f"node {node.name} offers {machine.cpus} CPUs instead of {cpu}, because the machine has no more"
+        )
     if memory and parse_quantity(memory) > machine.memory_bytes:
         mebibytes = machine.memory_bytes >> 20
-        said.append(f"node {node.name} offers {mebibytes}Mi of memory, not {memory}: the machine has no more")
-    return said
+        sentences.append(
+            f"node {node.name} offers {mebibytes}Mi of memory instead of {memory}, because the machine has no more"
+        )
+    return sentences
 
 
 def _reserved(node: NodeSpec, machine: Machine) -> dict[str, str]:
@@ -93,13 +97,13 @@ def kubelet_config(node: NodeSpec, *, cgroup_root: str, cgroup_version: int, mac
         "systemReserved": _reserved(node, machine),
         "registryPullQPS": 0,
         "serializeImagePulls": False,
-        # The nodes share one disk: an eviction or a collection by one would not help any of them.
+        # Evictions and image collections are off, because all nodes share one disk.
         "evictionHard": dict.fromkeys(
             ("memory.available", "nodefs.available", "nodefs.inodesFree", "imagefs.available"), "0%"
         ),
         "imageGCHighThresholdPercent": 100,
         "imageGCLowThresholdPercent": 99,
-        # Heartbeats often enough to notice a lost node in seconds, seldom enough for an idle machine.
+        # A lost node is noticed within seconds. More frequent heartbeats would load an idle machine.
         "nodeLeaseDurationSeconds": 8,
         "nodeStatusUpdateFrequency": "10s",
         "nodeStatusReportFrequency": "5m",
@@ -179,7 +183,7 @@ disabled_plugins = [
 
 
 def cni_config(index: int, addressing: Addressing) -> str:
-    """Return the list of CNI plugins that connect a pod: a link pair to the node, and host ports."""
+    """Return the CNI configuration: a point-to-point link between pod and node, and host ports."""
     content = {
         "cniVersion": "1.0.0",
         "name": "fractus-sim",
@@ -213,7 +217,7 @@ def resolver_file(addressing: Addressing) -> str:
 def node_units(node: NodeSpec, *, address: str) -> list[dict[str, Any]]:
     """Return the units that the node's first program supervises."""
     logs = RUN / "logs"
-    # kubelet gives up when the container runtime is not there yet.
+    # kubelet exits if the socket of the container runtime does not exist yet.
     wait = f'i=0; while [ ! -S {CONTAINERD_SOCKET} ] && [ $i -lt 400 ]; do sleep 0.05; i=$((i+1)); done; exec "$@"'
     kubelet = [
         f"{RUN}/bin/kubelet",

@@ -1,4 +1,4 @@
-"""Keys, certificates and kubeconfigs of a cluster, made once and kept in its state directory."""
+"""Keys, certificates and kubeconfigs of a cluster, created once and kept in its state directory."""
 
 from __future__ import annotations
 
@@ -43,11 +43,11 @@ class Authority:
         directory.mkdir(parents=True, exist_ok=True, mode=0o700)
         self.credential = Credential(directory / "ca.crt", directory / "ca.key")
         if not self.credential.complete:
-            self._found()
+            self._create()
         self._key = _load_key(self.credential.key)
         self._certificate = x509.load_pem_x509_certificate(self.credential.certificate.read_bytes())
 
-    def _found(self) -> None:
+    def _create(self) -> None:
         key = ec.generate_private_key(ec.SECP256R1())
         name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "fractus-sim cluster")])
         certificate = (
@@ -117,7 +117,7 @@ class Authority:
         return pair
 
     def kubeconfig(self, credential: Credential, *, server: str, cluster: str) -> str:
-        """Return a kubeconfig with all certificates inside it."""
+        """Return a kubeconfig that contains all certificates."""
         ca = _base64(self.credential.certificate)
         user = {
             "client-certificate-data": _base64(credential.certificate),
@@ -188,7 +188,7 @@ def _key_bytes(key: ec.EllipticCurvePrivateKey) -> bytes:
 
 
 def _store(credential: Credential, key: ec.EllipticCurvePrivateKey, certificate: x509.Certificate) -> None:
-    credential.certificate.unlink(missing_ok=True)  # # written last: the pair is complete when the certificate exists
+    credential.certificate.unlink(missing_ok=True)  # written last, so that the pair is complete if it exists
     _write(credential.key, _key_bytes(key))
     _write(credential.certificate, certificate.public_bytes(serialization.Encoding.PEM))
 

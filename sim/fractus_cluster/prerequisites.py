@@ -28,7 +28,7 @@ _PLUGIN_DIRECTORIES = ("/usr/lib/cni", "/opt/cni/bin", "/usr/libexec/cni")
 _PLUGINS = ("ptp", "portmap", "host-local", "loopback")
 _NAMESPACES = ("net", "mnt", "pid", "uts", "ipc")
 
-# Kernel features of kube-proxy and the redirector, tested in a temporary network namespace.
+# Firewall rules of the kinds that kube-proxy and the redirector need, created in a temporary network namespace.
 _FIREWALL_TRIAL = """
 table ip fractus_trial {
   map targets { type ipv4_addr . inet_proto . inet_service : verdict; }
@@ -50,8 +50,8 @@ def check_root() -> None:
         raise PrerequisiteError("the embedded cluster needs Linux; elsewhere use kind or k3s through KUBECONFIG")
     if os.geteuid() != 0:
         raise PrerequisiteError(
-            "the embedded cluster makes network namespaces, mounts and control groups, so it needs root; "
-            "run the command with sudo, or use your own cluster through KUBECONFIG"
+            "the embedded cluster needs root, because it creates network namespaces, mounts and control groups; "
+            "run the command with sudo, or use another cluster through KUBECONFIG"
         )
 
 

@@ -38,8 +38,8 @@ class ProcessRecord:
         """True if this process is running. A zombie is not running."""
         if self.boot_id != boot_id():
             return False
-        found = _stat(self.pid)
-        return found is not None and found[1] == self.start_ticks and found[0] not in "ZX"
+        present = _stat(self.pid)
+        return present is not None and present[1] == self.start_ticks and present[0] not in "ZX"
 
 
 @cache
@@ -60,8 +60,8 @@ def _stat(pid: int) -> tuple[str, int] | None:
 
 def record_of(pid: int) -> ProcessRecord | None:
     """Return the identity of a running process, or None if no process has this pid."""
-    found = _stat(pid)
-    return None if found is None else ProcessRecord(pid, found[1], boot_id())
+    present = _stat(pid)
+    return None if present is None else ProcessRecord(pid, present[1], boot_id())
 
 
 def spawn(
@@ -102,9 +102,9 @@ def spawn(
             raise ClusterError(f"cannot start {words[0]}: {error}") from error
     # The child is not reaped yet, so its pid cannot be reused.
     record = record_of(process.pid)
-    process.returncode = 0  # # prevent subprocess from waiting for the process and from warning about it
+    process.returncode = 0  # keeps subprocess from waiting for the process and from warning about it
     if record is None:
-        raise ClusterError(f"{words[0]} ended at once; see {log}")
+        raise ClusterError(f"{words[0]} ended immediately; see {log}")
     return record
 
 
@@ -120,14 +120,14 @@ def kill(record: ProcessRecord, *, timeout_s: float = 10.0) -> None:
         except ProcessLookupError:
             return
         try:
-            if record.alive:  # # the pidfd now refers to the process that was checked
+            if record.alive:  # now the pidfd refers to the recorded process
                 signal.pidfd_send_signal(handle, signal.SIGKILL)
         finally:
             os.close(handle)
     deadline = time.monotonic() + timeout_s
     while record.alive:
         if time.monotonic() > deadline:
-            raise ClusterError(f"process {record.pid} does not end")
+            raise ClusterError(f"process {record.pid} did not end within {timeout_s:.0f} s")
         time.sleep(_POLL_S)
     reap(record.pid)
 

@@ -44,10 +44,12 @@ class Radio:
     @property
     def running(self) -> bool | None:
         """True if the radio is running. None for a cluster without radio."""
-        return None if not self._layout.exists() else running(self._record) is not None
+        if not self._layout.exists():
+            return None
+        return running(self._record) is not None
 
     def start(self, nodes: Sequence[Node], air: AirSpec) -> None:
-        """Start the radio for the nodes' devices. Restart it if they changed, and stop it if no node needs it.
+        """Start the radio of the nodes. Restart it if its layout changed, and stop it if no node has a radio device.
 
         Raises:
             ClusterError: The radio did not start.
@@ -73,7 +75,7 @@ class Radio:
             time.sleep(_POLL_S)
 
     def command(self, **command: object) -> None:
-        """Change a station or an uplink, for example `station="drone-1", off=True`. Rejections are written to its log.
+        """Change a station or an uplink, for example `station="drone-1", off=True`. The radio logs an invalid command.
 
         Raises:
             ClusterError: The radio is not running.
@@ -82,7 +84,9 @@ class Radio:
             try:
                 sender.sendto(json.dumps(command).encode(), str(self._control))
             except OSError as error:
-                raise ClusterError(f"the radio does not run ({error.strerror}); bring the cluster up again") from error
+                raise ClusterError(
+                    f"the radio is not running ({error.strerror}); run `fractus cluster up` again"
+                ) from error
 
     @property
     def _record(self) -> Path:

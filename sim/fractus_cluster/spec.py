@@ -51,11 +51,11 @@ def parse_quantity(text: str) -> Decimal:
         raise ValueError(f"{text!r} is not a quantity such as 2, 500m or 4Gi") from error
 
 
-class _Value(BaseModel):
+class _Frozen(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
-class VehicleHardware(_Value):
+class VehicleHardware(_Frozen):
     """Simulated vehicle of a drone node.
 
     Attributes:
@@ -69,14 +69,14 @@ class VehicleHardware(_Value):
     arguments: tuple[str, ...] = ()
 
 
-class Place(_Value):
+class Place(_Frozen):
     """A position on the ground, degrees (WGS 84)."""
 
     lat: Annotated[float, Field(ge=-85, le=85)]
     lon: Annotated[float, Field(ge=-180, le=180)]
 
 
-class CameraHardware(_Value):
+class CameraHardware(_Frozen):
     """Simulated camera of a drone or edge node. Its properties are taken from `description.services.camera`.
 
     Attributes:
@@ -90,7 +90,7 @@ class CameraHardware(_Value):
     arguments: tuple[str, ...] = ()
 
 
-class WifiHardware(_Value):
+class WifiHardware(_Frozen):
     """A WiFi device of a node in the simulated radio.
 
     Attributes:
@@ -102,7 +102,7 @@ class WifiHardware(_Value):
     range: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None
 
 
-class UplinkHardware(_Value):
+class UplinkHardware(_Frozen):
     """A mobile uplink that replaces a wire.
 
     Attributes:
@@ -114,7 +114,7 @@ class UplinkHardware(_Value):
     delay: Annotated[float, Field(ge=0, le=10_000)] = 60.0
 
 
-class DiskHardware(_Value):
+class DiskHardware(_Frozen):
     """A separate disk for a node's /var/lib/fractus. Default: the disk of the machine.
 
     Attributes:
@@ -127,7 +127,7 @@ class DiskHardware(_Value):
     @classmethod
     def _holds_files(cls, value: str) -> str:
         if parse_quantity(value) < MIN_DISK_BYTES:
-            raise ValueError(f"a disk has {MIN_DISK_BYTES // 2**20}Mi at least")
+            raise ValueError(f"the minimum size of a disk is {MIN_DISK_BYTES // 2**20}Mi")
         return value
 
     @property
@@ -136,7 +136,7 @@ class DiskHardware(_Value):
         return int(parse_quantity(self.size))
 
 
-class Hardware(_Value):
+class Hardware(_Frozen):
     """Simulated hardware of a node that keeps its power when the node is powered off."""
 
     vehicle: VehicleHardware | None = None
@@ -146,7 +146,7 @@ class Hardware(_Value):
     disk: DiskHardware | None = None
 
 
-class AirSpec(_Value):
+class AirSpec(_Frozen):
     """Settings shared by all WiFi devices of a cluster.
 
     Attributes:
@@ -158,7 +158,7 @@ class AirSpec(_Value):
     seed: int = 1
 
 
-class NodeSpec(_Value):
+class NodeSpec(_Frozen):
     """One node.
 
     Attributes:
@@ -201,8 +201,8 @@ class NodeSpec(_Value):
         if self.hardware.wifi is not None:
             if self.wifi() is None:
                 raise ValueError(
-                    f"node {self.name}: hardware.wifi reaches nowhere; give its range, or describe "
-                    f"{self.hardware.wifi.device} with one in description.interfaces"
+                    f"node {self.name}: hardware.wifi has no range; set its range, or the range of "
+                    f"{self.hardware.wifi.device} in description.interfaces"
                 )
             if self.vehicle() is None and self.place() is None:
                 raise ValueError(f"node {self.name}: hardware.wifi needs a vehicle or description.location")
@@ -216,21 +216,19 @@ class NodeSpec(_Value):
         height = _dig(self.description, "services", "camera", "mount", "height")
         if self.node_class == "edge" and height is None:
             raise ValueError(
-                f"node {self.name}: hardware.camera hangs nowhere; "
-                "give description.services.camera.mount.height, metres above the ground"
+                f"node {self.name}: hardware.camera has no height; "
+                "set description.services.camera.mount.height, metres above the ground"
             )
         if camera_address(self.camera_url) is None:
             raise ValueError(
-                f"node {self.name}: hardware.camera serves http://127.0.0.1:8090/snapshot.jpg; "
-                f"write that as description.services.camera.connection, which is {self.camera_url!r}"
+                f"node {self.name}: hardware.camera cannot serve {self.camera_url!r}; "
+                "set description.services.camera.connection to http://127.0.0.1:8090/snapshot.jpg"
             )
 
     @model_validator(mode="after")
     def _description_fits(self) -> NodeSpec:
         if self.node_class == "cloud" and self.description:
-            raise ValueError(
-                f"node {self.name}: a cloud node has no description; only drones and edge nodes have kinds"
-            )
+            raise ValueError(f"node {self.name}: description is for drones and edge nodes, not for cloud nodes")
         if self.manifest is not None:
             kind: type[Resource] = Drone if self.node_class == "drone" else EdgeNode
             try:
@@ -258,29 +256,29 @@ class NodeSpec(_Value):
         Raises:
             ClusterError: The node is a drone and the position of its vehicle is not specified.
         """
-        given = self.hardware.vehicle
+        vehicle = self.hardware.vehicle
         connection = _dig(self.description, "services", "mobility", "connection")
-        if self.node_class != "drone" or (given is None and connection is None):
+        if self.node_class != "drone" or (vehicle is None and connection is None):
             return None
-        given = given or VehicleHardware()
-        listen = given.listen or (connection if isinstance(connection, str) else _DEFAULT_CONNECTION)
-        home = given.home or self._location()
+        vehicle = vehicle or VehicleHardware()
+        listen = vehicle.listen or (connection if isinstance(connection, str) else _DEFAULT_CONNECTION)
+        home = vehicle.home or self._location()
         if home is None:
             raise ClusterError(
-                f"node {self.name}: its vehicle stands nowhere; "
-                "give hardware.vehicle.home or description.location with lat and lon"
+                f"node {self.name}: its vehicle has no start position; "
+                "set hardware.vehicle.home or description.location with lat and lon"
             )
-        return home, listen, given.arguments
+        return home, listen, vehicle.arguments
 
     def wifi(self) -> tuple[str, float] | None:
-        """Name and range in metres of the node's simulated WiFi device. None without device."""
-        given = self.hardware.wifi
-        if given is None:
+        """Return device name and range in metres of the node's simulated WiFi. Return None without WiFi or range."""
+        wifi = self.hardware.wifi
+        if wifi is None:
             return None
         described = self.description.get("interfaces") or []
-        own = (each for each in described if isinstance(each, dict) and each.get("device") == given.device)
-        range_m = given.range or next((each["range"] for each in own if each.get("range")), None)
-        return None if range_m is None else (given.device, float(range_m))
+        interfaces = (each for each in described if isinstance(each, dict) and each.get("device") == wifi.device)
+        range_m = wifi.range or next((each["range"] for each in interfaces if each.get("range")), None)
+        return None if range_m is None else (wifi.device, float(range_m))
 
     @property
     def camera_url(self) -> str:
@@ -289,9 +287,11 @@ class NodeSpec(_Value):
         return url if isinstance(url, str) else "test:"
 
     def place(self) -> Home | None:
-        """Start position of the node. None if it is not specified."""
-        given = self.hardware.vehicle
-        return (given.home if given is not None else None) or self._location()
+        """Return the start position of the node, or None if it is not specified."""
+        vehicle = self.hardware.vehicle
+        if vehicle is not None and vehicle.home is not None:
+            return vehicle.home
+        return self._location()
 
     def _location(self) -> Home | None:
         location = _dig(self.description, "location")
@@ -300,7 +300,7 @@ class NodeSpec(_Value):
         return Home(lat=location["lat"], lon=location["lon"], alt=location.get("alt") or 0.0)
 
 
-class ClusterSpec(_Value):
+class ClusterSpec(_Frozen):
     """A cluster: name, nodes, and radio settings."""
 
     name: Annotated[str, Field(pattern=DNS_LABEL, max_length=30)]
@@ -312,16 +312,22 @@ class ClusterSpec(_Value):
         names = [node.name for node in self.nodes]
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
-            raise ValueError(f"nodes: the name {', '.join(twice)} is given twice")
+            raise ValueError(f"nodes: several nodes have the name {', '.join(twice)}")
         return self
 
     @property
     def world_origin(self) -> Place | None:
         """Centre of the landscape of the cameras. None without cameras."""
-        seeing = [node for node in self.nodes if node.hardware.camera is not None]
-        given = [node.hardware.camera.origin for node in seeing if node.hardware.camera is not None]
-        places = [Place(lat=home.lat, lon=home.lon) for home in (node.place() for node in seeing) if home is not None]
-        return next((origin for origin in given if origin is not None), places[0] if places else None)
+        origin: Place | None = None
+        for node in self.nodes:
+            if node.hardware.camera is None:
+                continue
+            if node.hardware.camera.origin is not None:
+                return node.hardware.camera.origin
+            home = node.place()
+            if origin is None and home is not None:
+                origin = Place(lat=home.lat, lon=home.lon)
+        return origin
 
     @classmethod
     def placeholder(cls, name: str) -> ClusterSpec:
@@ -333,13 +339,13 @@ class ClusterSpec(_Value):
         return dump_documents([self.model_dump(mode="json", by_alias=True)])
 
 
-def parse_spec(content: object, *, source: str, found: Documents | None = None) -> ClusterSpec:
+def parse_spec(content: object, *, source: str, documents: Documents | None = None) -> ClusterSpec:
     """Create the cluster from parsed YAML.
 
     Args:
         content: Result of the YAML parser.
         source: Source for messages.
-        found: Maps fields to line numbers.
+        documents: Maps fields to line numbers.
 
     Raises:
         ClusterError: A field is missing or invalid. The message names it.
@@ -348,10 +354,10 @@ def parse_spec(content: object, *, source: str, found: Documents | None = None) 
         return ClusterSpec.model_validate(content)
     except ValidationError as error:
         wrong = [(".".join(str(part) for part in fault["loc"]), fault["msg"]) for fault in error.errors()]
-        # A list with an invalid entry is also reported as too short. Only the error of the entry is useful.
+        # pydantic reports a list with an invalid entry also as too short. Only the error of the entry is useful.
         real = [(place, text) for place, text in wrong if not any(other.startswith(f"{place}.") for other, _ in wrong)]
         faults = "; ".join(f"{place or 'file'}: {text.removeprefix('Value error, ')}" for place, text in real)
-        where = found.where(content, real[0][0]) if found is not None else source
+        where = documents.where(content, real[0][0]) if documents is not None else source
         raise ClusterError(f"{where}: {faults}") from error
 
 
@@ -362,12 +368,12 @@ def load_spec(path: Path) -> ClusterSpec:
         ClusterError: The file is missing, is not YAML, or has an invalid field.
     """
     try:
-        content, found = parse_document(path.read_bytes(), str(path))
+        content, documents = parse_document(path.read_bytes(), str(path))
     except OSError as error:
         raise ClusterError(f"cannot read {path}: {error.strerror}") from error
     except BadDocument as error:
         raise ClusterError(str(error)) from None
-    return parse_spec(content, source=str(path), found=found)
+    return parse_spec(content, source=str(path), documents=documents)
 
 
 def camera_address(url: str) -> tuple[str, int] | None:
@@ -379,10 +385,13 @@ def camera_address(url: str) -> tuple[str, int] | None:
     except ValueError:
         return None
     local = parts.scheme == "http" and host in ("127.0.0.1", "localhost", "::1") and parts.path == "/snapshot.jpg"
-    return ("127.0.0.1" if host == "localhost" else str(host), port) if local else None
+    if not local:
+        return None
+    return "127.0.0.1" if host == "localhost" else str(host), port
 
 
 def _dig(tree: object, *keys: str) -> object:
+    """Return the value below nested mappings, or None if a key is missing."""
     for key in keys:
         if not isinstance(tree, dict):
             return None

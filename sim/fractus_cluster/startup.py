@@ -14,7 +14,7 @@ from fractus_runtime.kubernetes import BlockingClient, Conflict, KubeError
 
 from fractus_cluster import machine, manifests, network
 from fractus_cluster.addressing import Addressing
-from fractus_cluster.apiclient import administrating, answers_ready
+from fractus_cluster.apiclient import administrating, is_ready
 from fractus_cluster.binaries import Binaries
 from fractus_cluster.cgroups import cluster_branch
 from fractus_cluster.controlplane import (
@@ -35,7 +35,7 @@ from fractus_cluster.node import Node, init_command
 from fractus_cluster.pki import Authority, write_private
 from fractus_cluster.processes import kill_recorded, running, spawn, write_record
 from fractus_cluster.spec import ClusterSpec
-from fractus_cluster.state import Memory, StateDirectory
+from fractus_cluster.state import ClusterRecord, StateDirectory
 from fractus_cluster.supervisor import ENVIRONMENT
 
 _READY_TIMEOUT_S = 90.0
@@ -92,33 +92,33 @@ class Startup:
         write_record(record_path, record)
 
     def place_nodes(self, nodes: list[Node], binaries: Binaries, store: ImageStore, images: Sequence[Image]) -> None:
-        """Connect the nodes and write their files. New nodes get their images on disk before they start."""
+        """Connect the nodes and write their files. Unpack images on the disks of new nodes before they start."""
         for node in nodes:
             network.wire_node(node.wiring, node.name, node.index, mobile=node.spec.hardware.uplink is not None)
             node.write_files(node.files(binaries, self.authority))
-        fresh = [node for node in nodes if not has_storage(node)]
-        if fresh:
+        new = [node for node in nodes if not has_storage(node)]
+        if new:
             template = store.template(images, binaries["pause"])
             with ThreadPoolExecutor(max_workers=2) as pool:
-                list(pool.map(template.furnish, fresh))
+                list(pool.map(template.copy_to, new))
 
     def api(self) -> AbstractContextManager[BlockingClient]:
-        """API server client with administrator rights."""
+        """Return an API server client with administrator rights."""
         server = server_url(self.wiring.addressing)
         return administrating(server, self.authority.credential.certificate, administrator(self.authority))
 
     def apply_objects(self, api: BlockingClient, nodes: list[Node]) -> None:
         """Create or update the objects of nodes and DNS. Delete the Nodes that are not part of the description."""
-        place = self.wiring.addressing
+        addressing = self.wiring.addressing
         names = {node.name for node in nodes}
         for present in api.list("/api/v1/nodes"):
             name = present["metadata"]["name"]
             if name not in names and "fractus-sim" in str(present["metadata"].get("managedFields")):
                 api.call("DELETE", f"/api/v1/nodes/{name}")
         for node in nodes:
-            # Before the kubelet starts, so that no pod is scheduled before labels and taints exist.
-            _apply_node(api, node, place)
-        for path, body in manifests.dns_objects(place.control_plane):
+            # The kubelet starts later, so no pod is scheduled before labels and taints exist.
+            _apply_node(api, node, addressing)
+        for path, body in manifests.dns_objects(addressing.control_plane):
             api.apply(path, body)
 
     def write_kubeconfig(self) -> None:
@@ -157,20 +157,20 @@ class Startup:
             time.sleep(_POLL_S)
 
     def check_hardware(self, nodes: Sequence[Node]) -> None:
-        """Start vehicles and cameras that are not running.
+        """Check that the vehicles and cameras are running.
 
         Raises:
-            ClusterError: A process ended immediately.
+            ClusterError: A process has ended.
         """
         for node in nodes:
-            for name, runs in (("vehicle", node.vehicle_running), ("camera", node.camera_running)):
-                if runs is False:
+            for name, is_running in (("vehicle", node.vehicle_running), ("camera", node.camera_running)):
+                if is_running is False:
                     log = self.state.logs / node.name / f"{name}.log"
                     last = log.read_text(errors="replace").splitlines()[-1:] if log.exists() else []
-                    raise ClusterError(f"the {name} of node {node.name} ended at once: {' '.join(last)} (see {log})")
+                    raise ClusterError(f"the {name} of node {node.name} has ended: {' '.join(last)} (see {log})")
 
     def let_dns_start(self) -> None:
-        """Start DNS, after the objects that it serves exist."""
+        """Start DNS. The objects that it serves must exist."""
         let_dns_start(self.wiring.addressing, self._files())
 
     def wait_dns(self) -> None:
@@ -181,7 +181,7 @@ class Startup:
         """
         address = str(self.wiring.addressing.control_plane)
         deadline = time.monotonic() + _DNS_TIMEOUT_S
-        while not answers_ready(address, DNS_READY_PORT):
+        while not is_ready(address, DNS_READY_PORT):
             if time.monotonic() > deadline:
                 log = self.state.logs / CONTROL_PLANE / "coredns.log"
                 raise ClusterError(f"the cluster's DNS was not ready within {_DNS_TIMEOUT_S:.0f} s; see {log}")
@@ -204,47 +204,48 @@ class Startup:
         return ControlPlaneFiles(self.state.control_plane, self.state.logs / CONTROL_PLANE)
 
 
-def wiring_of(cluster: str, state: StateDirectory, memory: Memory) -> network.Wiring:
+def wiring_of(cluster: str, state: StateDirectory, record: ClusterRecord) -> network.Wiring:
     """Return the network of a cluster with known addresses."""
-    return network.Wiring(cluster, Addressing(memory.block), state.marks)
+    return network.Wiring(cluster, Addressing(record.block), state.marks)
 
 
-def claim(spec: ClusterSpec, state: StateDirectory, kubernetes: str, report: Report) -> Memory:
-    """Claim addresses, and remove nodes that are not in the description any longer.
+def claim(spec: ClusterSpec, state: StateDirectory, kubernetes: str, report: Report) -> ClusterRecord:
+    """Claim addresses, and remove nodes that are no longer part of the description.
 
     Raises:
         ClusterError: The cluster was started with another minor version of Kubernetes, or no addresses are free.
     """
-    remembered = state.read_memory()
-    if remembered is not None and remembered.kubernetes != kubernetes:
+    previous = state.read_record()
+    if previous is not None and previous.kubernetes != kubernetes:
         raise ClusterError(
-            f"cluster {spec.name} runs Kubernetes {remembered.kubernetes}; set FRACTUS_KUBERNETES={remembered.kubernetes}, "
-            f"or take it down before it comes up with {kubernetes}: fractus cluster down --name {spec.name}"
+            f"cluster {spec.name} runs Kubernetes {previous.kubernetes}; set FRACTUS_KUBERNETES={previous.kubernetes}, "
+            f"or remove it before you start it with {kubernetes}: fractus cluster down --name {spec.name}"
         )
     names = [node.name for node in spec.nodes]
-    block = machine.claim(spec.name, state.path, remembered.block if remembered else None)
-    memory = (remembered or Memory(block, {}, kubernetes)).with_nodes(names)
+    block = machine.claim(spec.name, state.path, previous.block if previous else None)
+    record = (previous or ClusterRecord(block, {}, kubernetes)).with_nodes(names)
     old_spec = state.read_spec()
-    if remembered is not None and old_spec is not None:
-        gone = [node for node in old_spec.nodes if node.name in remembered.indexes and node.name not in names]
-        for node in gone:
+    if previous is not None and old_spec is not None:
+        removed = [node for node in old_spec.nodes if node.name in previous.indexes and node.name not in names]
+        for node in removed:
             report(f"removing node {node.name}")
-            index = remembered.indexes[node.name]
-            Node(node, index, wiring_of(spec.name, state, remembered), state, cluster_branch(spec.name)).remove()
-    if memory != remembered:
-        state.write_memory(memory)
-    return memory
+            index = previous.indexes[node.name]
+            Node(node, index, wiring_of(spec.name, state, previous), state, cluster_branch(spec.name)).remove()
+    if record != previous:
+        state.write_record(record)
+    return record
 
 
-def _apply_node(api: BlockingClient, node: Node, place: Addressing) -> None:
+def _apply_node(api: BlockingClient, node: Node, addressing: Addressing) -> None:
+    """Create or update a Node and its taint."""
     for tries_left in reversed(range(_CONFLICTS)):
-        present = api.apply(*manifests.node_object(node.spec, node.index, place))
+        present = api.apply(*manifests.node_object(node.spec, node.index, addressing))
         patch = manifests.taints_patch(node.spec, present)
         if patch is None:
             return
         try:
             api.merge(*patch)
         except Conflict:
-            # The node controller has added its own taint in the meantime.
+            # The node controller has added a taint in the meantime.
             if not tries_left:
                 raise

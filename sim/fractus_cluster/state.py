@@ -22,8 +22,8 @@ def state_root() -> Path:
 
 
 @dataclass(frozen=True, slots=True)
-class Memory:
-    """Persistent data of a cluster.
+class ClusterRecord:
+    """Data of a cluster that is kept between commands.
 
     Attributes:
         block: Addresses.
@@ -35,7 +35,7 @@ class Memory:
     indexes: dict[str, int]
     kubernetes: str = DEFAULT_KUBERNETES
 
-    def with_nodes(self, names: list[str]) -> Memory:
+    def with_nodes(self, names: list[str]) -> ClusterRecord:
         """Return data for the given nodes. Known nodes keep their index, new nodes get the lowest free one."""
         kept = {name: index for name, index in self.indexes.items() if name in names}
         free = (index for index in range(len(names) + len(kept) + 1) if index not in kept.values())
@@ -91,17 +91,19 @@ class StateDirectory:
         """Return the record of a process: `control-plane`, `node.NAME`, `vehicle.NAME`, `camera.NAME` or `radio`."""
         return self.path / "processes" / f"{name}.json"
 
-    def read_memory(self) -> Memory | None:
+    def read_record(self) -> ClusterRecord | None:
         """Return the persistent data, or None if the cluster was never started."""
         try:
             content = json.loads((self.path / "memory.json").read_text())
         except FileNotFoundError:
             return None
-        return Memory(IPv4Network(content["block"]), content["indexes"], content.get("kubernetes", DEFAULT_KUBERNETES))
+        return ClusterRecord(
+            IPv4Network(content["block"]), content["indexes"], content.get("kubernetes", DEFAULT_KUBERNETES)
+        )
 
-    def write_memory(self, memory: Memory) -> None:
+    def write_record(self, record: ClusterRecord) -> None:
         """Write the persistent data."""
-        content = {"block": str(memory.block), "indexes": memory.indexes, "kubernetes": memory.kubernetes}
+        content = {"block": str(record.block), "indexes": record.indexes, "kubernetes": record.kubernetes}
         self._write("memory.json", json.dumps(content))
 
     def read_spec(self) -> ClusterSpec | None:
@@ -142,6 +144,6 @@ def only_cluster() -> str:
     """
     names = known_clusters()
     if len(names) != 1:
-        several = f"there are clusters {', '.join(names)}; name one with --name"
+        several = f"there are several clusters: {', '.join(names)}; select one with --name"
         raise ClusterError(several if names else "no cluster; start one: fractus cluster up FILE")
     return names[0]

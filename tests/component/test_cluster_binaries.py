@@ -23,7 +23,7 @@ from fractus_cluster.ledger import write_ledger
 from fractus_cluster.prerequisites import check_root
 from fractus_cluster.spec import ClusterSpec
 from fractus_cluster.startup import claim
-from fractus_cluster.state import Memory, StateDirectory
+from fractus_cluster.state import ClusterRecord, StateDirectory
 
 GOMOD = resources.files("fractus_cluster.binaries") / "gomod"
 
@@ -124,17 +124,17 @@ def test_other_kubernetes_is_refused(machine: Path, monkeypatch: pytest.MonkeyPa
     assert str(error.value) == f"Kubernetes {chosen} is not supported; set FRACTUS_KUBERNETES to 1.35 or 1.34"
 
 
-def test_a_cluster_keeps_its_kubernetes(tmp_path: Path) -> None:
+def test_cluster_keeps_its_kubernetes_version(tmp_path: Path) -> None:
     state = StateDirectory(tmp_path)
-    state.write_memory(Memory(IPv4Network("10.200.0.0/16"), {}, "1.35"))
-    with pytest.raises(ClusterError, match=r"runs Kubernetes 1\.35; set FRACTUS_KUBERNETES=1\.35, or take it down"):
+    state.write_record(ClusterRecord(IPv4Network("10.200.0.0/16"), {}, "1.35"))
+    with pytest.raises(ClusterError, match=r"runs Kubernetes 1\.35; set FRACTUS_KUBERNETES=1\.35, or remove it before"):
         claim(ClusterSpec.placeholder("demo"), state, "1.34", print)
-    assert state.read_memory() == Memory(IPv4Network("10.200.0.0/16"), {}, "1.35")
+    assert state.read_record() == ClusterRecord(IPv4Network("10.200.0.0/16"), {}, "1.35")
 
 
 def test_old_go_is_refused(machine: Path) -> None:
     script(machine / "path" / "go", "go1.21.3\nlocal")
-    with pytest.raises(PrerequisiteError, match=r"Go 1\.25 or newer is needed to build pause, found go1\.21\.3"):
+    with pytest.raises(PrerequisiteError, match=r"building pause needs Go 1\.25 or newer; this is go1\.21\.3"):
         ensure_binaries(["pause"], report=print)
 
 
@@ -155,7 +155,7 @@ def test_wrong_version_of_a_build_is_refused(machine: Path) -> None:
 
 
 def test_unknown_program_is_named() -> None:
-    with pytest.raises(ClusterError, match="no program called vim"):
+    with pytest.raises(ClusterError, match="unknown program vim"):
         ensure_binaries(["vim"], report=print)
 
 

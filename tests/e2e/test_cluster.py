@@ -209,7 +209,7 @@ def test_power_off_kills_the_node_but_not_its_vehicle(healthy: Cluster) -> None:
     assert vehicle is not None
     uid = pods(healthy)["drone-1"]["metadata"]["uid"]
     drone.exec(["sh", "-c", "echo kept > /var/lib/fractus/file"])
-    assert drone.own_state.is_mount()
+    assert drone.fractus_state.is_mount()
     drone.power_off()
     assert not drone.powered
     assert vehicle.alive
@@ -222,9 +222,10 @@ def test_power_off_kills_the_node_but_not_its_vehicle(healthy: Cluster) -> None:
     until(lambda: running(healthy, "drone-1"), "the pod to be back")
     assert pods(healthy)["drone-1"]["metadata"]["uid"] == uid
     assert vehicle.alive
-    assert (drone.own_state / "file").read_text() == "kept\n"
+    assert (drone.fractus_state / "file").read_text() == "kept\n"
     assert (
-        drone.exec(["stat", "-f", "-c", "%b", "/var/lib/fractus"]).stdout == f"{os.statvfs(drone.own_state).f_blocks}\n"
+        drone.exec(["stat", "-f", "-c", "%b", "/var/lib/fractus"]).stdout
+        == f"{os.statvfs(drone.fractus_state).f_blocks}\n"
     )
 
 

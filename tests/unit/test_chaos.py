@@ -215,7 +215,7 @@ def test_orphan_invariant_includes_grants_stored_on_nodes(tmp_path: Path) -> Non
     stored.mkdir()
     for application in ("flies", "stored"):
         (stored / f"{application}.json").write_text(json.dumps(body(application)))
-    cluster = SimpleNamespace(nodes=[SimpleNamespace(own_state=tmp_path)])
+    cluster = SimpleNamespace(nodes=[SimpleNamespace(fractus_state=tmp_path)])
     target = cast("ChaosTarget", SimpleNamespace(objects=lambda kinds, *_: objects.get(kinds, []), cluster=cluster))
     left = Missions(target, "chaos", print).orphans()
     assert [each["metadata"]["name"] for each in left] == ["default.carried-navigator", "default.stored-navigator"]

@@ -7,7 +7,7 @@ from ipaddress import IPv4Network
 import pytest
 from fractus_cluster.addressing import MAX_NODES, SERVICE_NETWORK, Addressing, choose_block
 from fractus_cluster.errors import ClusterError
-from fractus_cluster.state import Memory
+from fractus_cluster.state import ClusterRecord
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -71,7 +71,7 @@ def test_node_index_beyond_the_block_is_refused() -> None:
 
 @given(st.lists(st.lists(st.sampled_from("abcdefgh"), unique=True, min_size=1), min_size=1, max_size=6))
 def test_node_keeps_its_index(histories: list[list[str]]) -> None:
-    memory = Memory(BLOCK, {})
+    memory = ClusterRecord(BLOCK, {})
     for names in histories:
         before = memory.indexes
         memory = memory.with_nodes(names)

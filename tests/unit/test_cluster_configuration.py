@@ -46,8 +46,8 @@ def test_kubelet_reserves_nothing_when_node_offers_all_resources() -> None:
 def test_resources_beyond_the_machine_are_reported() -> None:
     assert shortfalls(node(cpu="4", memory="16Gi"), MACHINE) == []
     cpu, memory = shortfalls(node(cpu="8", memory="64Gi"), MACHINE)
-    assert "4 CPUs, not 8" in cpu
-    assert "16384Mi of memory, not 64Gi" in memory
+    assert "4 CPUs instead of 8" in cpu
+    assert "16384Mi of memory instead of 64Gi" in memory
 
 
 def test_kubelet_accepts_cgroup_v1_only_on_machines_with_cgroup_v1() -> None:

@@ -160,7 +160,7 @@ def test_source_is_found_from_a_subfolder(checkout: Path, tmp_path_factory: pyte
 
 
 def test_unknown_target_is_refused(checkout: Path) -> None:
-    with pytest.raises(ClusterError, match="no image plane"):
+    with pytest.raises(ClusterError, match="unknown image plane"):
         build_images(checkout, targets=["plane"], report=print)
 
 

@@ -92,7 +92,7 @@ def test_wired_cluster_has_no_radio() -> None:
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (without("nodes", 0, "description", "interfaces"), "hardware.wifi reaches nowhere"),
+        (without("nodes", 0, "description", "interfaces"), "hardware.wifi has no range"),
         (without("nodes", 1, "description", "location"), "needs a vehicle or description.location"),
         (json.loads(json.dumps(CONTENT).replace('"fading": 4', '"fading": 0.1')), "air.fading"),
     ],

@@ -35,7 +35,7 @@ def module_digest(module: Module) -> str:
 
 
 def build(programs: Sequence[Program], into: Path, *, report: Report) -> None:
-    """Build programs of one module, and move them to `into` when all are complete.
+    """Build programs of one module, and move them to a directory when all are complete.
 
     Args:
         programs: Programs to build, all of the same module.
@@ -52,7 +52,7 @@ def build(programs: Sequence[Program], into: Path, *, report: Report) -> None:
     names = ", ".join(program.name for program in programs)
     report(f"building {names} {programs[0].version} from Go modules (once; kept in {into})")
     started = time.monotonic()
-    for left in into.glob(".building-*"):  # # left by a killed build; the lock is held
+    for left in into.glob(".building-*"):  # of a killed build, because this process holds the lock
         shutil.rmtree(left)
     with tempfile.TemporaryDirectory(prefix=".building-", dir=into) as scratch:
         source = Path(scratch) / "source"
@@ -100,10 +100,12 @@ def _go_build(module: Module, programs: Sequence[Program], source: Path, output:
 
 
 def _follow(process: subprocess.Popen[str], module: str, report: Report) -> list[str]:
-    """Read the compiler output until it ends, with progress lines. Return the last lines."""
+    """Read the compiler output until it ends, and report progress. Return its last lines."""
     tail: list[str] = []
-    packages = downloads = 0
-    started = reported = time.monotonic()
+    packages = 0
+    downloads = 0
+    started = time.monotonic()
+    reported = started
     assert process.stderr is not None
     for line in process.stderr:
         text = line.rstrip()
@@ -128,18 +130,18 @@ def check_go(module: Module) -> None:
     Raises:
         PrerequisiteError: The toolchain is missing or too old.
     """
-    wanted = _go_version((_sources(module) / "go.mod").read_text(), r"^go (\d+)\.(\d+)")
-    text = ".".join(map(str, wanted))
+    required = _go_version((_sources(module) / "go.mod").read_text(), r"^go (\d+)\.(\d+)")
+    text = ".".join(map(str, required))
     if shutil.which("go") is None:
         raise PrerequisiteError(
-            f"{module.name} has to be built once, which needs Go {text} or newer on PATH "
-            "(or put ready-made programs into a directory and name it in KUBEBUILDER_ASSETS)"
+            f"{module.name} must be built once, which needs Go {text} or newer on PATH "
+            "(or set KUBEBUILDER_ASSETS to a directory that contains the programs)"
         )
-    found, toolchain = run(["go", "env", "GOVERSION", "GOTOOLCHAIN"], timeout_s=60).stdout.split()
-    if _go_version(found, r"go(\d+)\.(\d+)") < wanted and toolchain == "local":
+    present, toolchain = run(["go", "env", "GOVERSION", "GOTOOLCHAIN"], timeout_s=60).stdout.split()
+    if _go_version(present, r"go(\d+)\.(\d+)") < required and toolchain == "local":
         raise PrerequisiteError(
-            f"Go {text} or newer is needed to build {module.name}, found {found}, "
-            "and GOTOOLCHAIN=local forbids it to fetch a newer one"
+            f"building {module.name} needs Go {text} or newer; this is {present}, "
+            "and GOTOOLCHAIN=local prevents the download of a newer version"
         )
 
 
@@ -148,10 +150,10 @@ def _sources(module: Module) -> Traversable:
 
 
 def _go_version(text: str, pattern: str) -> tuple[int, int]:
-    found = re.search(pattern, text, re.MULTILINE)
-    if found is None:
+    match = re.search(pattern, text, re.MULTILINE)
+    if match is None:
         raise ClusterError(f"no Go version in {text[:100]!r}")
-    return int(found[1]), int(found[2])
+    return int(match[1]), int(match[2])
 
 
 def reported_version(path: Path, program: Program) -> str | None:
@@ -159,8 +161,8 @@ def reported_version(path: Path, program: Program) -> str | None:
     if not program.version_arguments:
         return None
     done = run([path, *program.version_arguments], timeout_s=60, check=False)
-    found = re.search(r"\bv?(\d+\.\d+\.\d+)\b", done.stdout + done.stderr)
-    return found[1] if found else None
+    match = re.search(r"\bv?(\d+\.\d+\.\d+)\b", done.stdout + done.stderr)
+    return match[1] if match else None
 
 
 def check_version(path: Path, program: Program) -> None:

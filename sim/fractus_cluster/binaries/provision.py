@@ -83,20 +83,20 @@ def ensure_binaries(names: Iterable[str] = CLUSTER_PROGRAMS, *, report: Report) 
         PrerequisiteError: A build is required and Go is missing or too old.
     """
     minor = chosen_kubernetes()
-    wanted = [_program(minor, name) for name in names]
+    programs = [_program(minor, name) for name in names]
     directory = cache_directory() / f"v{KUBERNETES_VERSIONS[minor]}"
-    paths = _present(wanted, directory)
-    if len(paths) < len(wanted):
+    paths = _present(programs, directory)
+    if len(paths) < len(programs):
         with locked(
             directory / "lock", timeout_s=_LOCK_TIMEOUT_S, what="another process is building binaries", report=report
         ):
-            paths = _present(wanted, directory)
-            missing = [program for program in wanted if program.name not in paths]
+            paths = _present(programs, directory)
+            missing = [program for program in programs if program.name not in paths]
             for name in dict.fromkeys(program.module for program in missing):
                 group = [program for program in missing if program.module == name]
                 build(group, directory / "bin", report=report)
                 _stamp(group, directory)
-        paths = _present(wanted, directory)
+        paths = _present(programs, directory)
     return Binaries(paths)
 
 
@@ -104,23 +104,24 @@ def _program(minor: str, name: str) -> Program:
     try:
         return PROGRAMS[minor][name]
     except KeyError:
-        raise ClusterError(f"no program called {name}; there are {', '.join(sorted(PROGRAMS[minor]))}") from None
+        raise ClusterError(f"unknown program {name}; the programs are {', '.join(sorted(PROGRAMS[minor]))}") from None
 
 
-def _present(wanted: Iterable[Program], directory: Path) -> dict[str, Path]:
+def _present(programs: Iterable[Program], directory: Path) -> dict[str, Path]:
     assets = os.environ.get("KUBEBUILDER_ASSETS")
     stamps = read_ledger(directory / "built.json")
     versions = _Versions(directory / "found.json")
     paths: dict[str, Path] = {}
-    for program in wanted:
-        own = directory / "bin" / program.name
-        given = Path(assets) / program.name if assets else None
-        if given is not None and versions.acceptable(given, program):
-            paths[program.name] = given
-        elif own.is_file() and stamps.get(program.name) == module_digest(MODULES[program.module]):
-            paths[program.name] = own
-        elif (there := shutil.which(program.name)) and versions.acceptable(Path(there), program):
-            paths[program.name] = Path(there)
+    for program in programs:
+        built = directory / "bin" / program.name
+        asset = Path(assets) / program.name if assets else None
+        installed = shutil.which(program.name)
+        if asset is not None and versions.acceptable(asset, program):
+            paths[program.name] = asset
+        elif built.is_file() and stamps.get(program.name) == module_digest(MODULES[program.module]):
+            paths[program.name] = built
+        elif installed is not None and versions.acceptable(Path(installed), program):
+            paths[program.name] = Path(installed)
     versions.save()
     return paths
 
@@ -132,11 +133,11 @@ def _stamp(programs: Iterable[Program], directory: Path) -> None:
 
 
 class _Versions:
-    """Cache of program versions by path, size and modification time, so that each version is requested once."""
+    """Versions of programs by path, size and modification time, cached so that each program is run only once."""
 
-    def __init__(self, memo: Path) -> None:
-        self._memo = memo
-        self._known = read_ledger(memo)
+    def __init__(self, file: Path) -> None:
+        self._file = file
+        self._known = read_ledger(file)
         self._changed = False
 
     def acceptable(self, path: Path, program: Program) -> bool:
@@ -151,4 +152,4 @@ class _Versions:
 
     def save(self) -> None:
         if self._changed:
-            write_ledger(self._memo, self._known)
+            write_ledger(self._file, self._known)

@@ -1,1 +1,1 @@
-"""Container images: building them, keeping them, and delivering them to the nodes of an embedded cluster."""
+"""Container images: builds, a local store, and delivery to the nodes of an embedded cluster."""

@@ -1,4 +1,4 @@
-"""`python -m fractus_cluster.images`: building the images."""
+"""`python -m fractus_cluster.images`: build the container images."""
 
 from fractus_cluster.images.cli import images
 

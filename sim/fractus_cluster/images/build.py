@@ -1,4 +1,4 @@
-"""Builds of the images of Fractus: the targets of the Dockerfile whose sources changed."""
+"""Builds of the container images whose sources changed since their last build."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _SOURCES = (
     "Dockerfile", ".dockerignore", "pyproject.toml", "uv.lock", "sim/pyproject.toml", "README.md", "LICENSE",
     "core", "runtime", "operator", "agent", "services", "cli", "view/fractus_view", "sdk", "proto",
 )  # fmt: skip
-"""Sources of every image: each has the whole distribution fractus-drones."""
+"""Sources of every image, because each image contains the whole distribution fractus-drones."""
 _MORE_SOURCES: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
         "component": (),
@@ -43,11 +43,11 @@ _MORE_SOURCES: Mapping[str, tuple[str, ...]] = MappingProxyType(
     }
 )
 TARGETS = tuple(_MORE_SOURCES)
-"""The targets of the Dockerfile that are images of their own."""
+"""Targets of the Dockerfile that are images."""
 _NOT_IN_SLIM = (
     "usr/share/locale", "usr/share/man", "var/cache/apt/archives", "var/cache/debconf", "var/lib/apt/lists", "var/log",
 )  # fmt: skip
-"""Folders that are empty in debian:trixie-slim, too. The base image replaces it without a registry."""
+"""Directories to empty, as in debian:trixie-slim. The base image replaces that image if no registry is in reach."""
 _BUILD_TIMEOUT_S = 1800.0
 _LOCK_TIMEOUT_S = 1800.0
 _HOST_CA = Path("/etc/ssl/certs/ca-certificates.crt")
@@ -62,11 +62,11 @@ def find_source(start: Path | None = None) -> Path:
     Raises:
         ClusterError: No such directory has a Dockerfile.
     """
-    here = (start or Path.cwd()).resolve()
-    for folder in (here, *here.parents):
+    directory = (start or Path.cwd()).resolve()
+    for folder in (directory, *directory.parents):
         if all((folder / name).is_file() for name in ("Dockerfile", "pyproject.toml", "uv.lock")):
             return folder
-    raise ClusterError(f"no Dockerfile of Fractus in {here} or above; name the checkout with --source")
+    raise ClusterError(f"no Dockerfile of Fractus in {directory} or above; set the checkout with --source")
 
 
 def image_name(target: str, tag: str = "dev") -> str:
@@ -85,22 +85,22 @@ def build_images(
     """Build targets of the Dockerfile with buildah and return the images' names.
 
     Args:
-        source: The checkout.
-        targets: The images to build. A target whose sources did not change since its last build is skipped.
-        tag: The images' tag.
+        source: Checkout of Fractus.
+        targets: Images to build. A target whose sources did not change since its last build is skipped.
+        tag: Tag of the images.
         force: Build targets even if their sources did not change.
         report: Called with each line of progress.
 
     Raises:
-        PrerequisiteError: buildah or debootstrap is missing, or this is not root.
+        PrerequisiteError: buildah or debootstrap is missing, or the process is not root.
         ClusterError: A build failed. The message ends with the output of buildah.
     """
     unknown = sorted(set(targets) - set(TARGETS))
     if unknown:
-        raise ClusterError(f"no image {', '.join(unknown)}; there are {', '.join(TARGETS)}")
+        raise ClusterError(f"unknown image {', '.join(unknown)}; the images are {', '.join(TARGETS)}")
     check_root()
     if shutil.which("buildah") is None:
-        raise PrerequisiteError("images are built with buildah; install it: apt-get install buildah")
+        raise PrerequisiteError("buildah is missing; install it: apt-get install buildah")
     names = [image_name(target, tag) for target in targets]
     ledger = cache_directory() / "images.json"
     with locked(
@@ -147,21 +147,21 @@ def _files(source: Path, names: Iterable[str]) -> Iterator[Path]:
 
 
 def _build_stale(source: Path, targets: Sequence[str], tag: str, report: Report) -> None:
-    """Build the first target alone, so that the others find most steps in the cache."""
+    """Build the first target before all others, so that they find most steps in the cache."""
 
-    def one(target: str) -> None:
+    def build_one(target: str) -> None:
         started = time.monotonic()
         _build(source, target, tag)
         report(f"built {image_name(target, tag)} in {time.monotonic() - started:.1f} s")
 
     report(f"building images: {', '.join(targets)}")
-    one(targets[0])
+    build_one(targets[0])
     with ThreadPoolExecutor(max_workers=2) as pool:
-        list(pool.map(one, targets[1:]))
+        list(pool.map(build_one, targets[1:]))
 
 
 def _remove_replaced(identities: Iterable[str]) -> None:
-    """Remove images that were replaced by newer ones, because builds would fill the disk. Images in use stay."""
+    """Remove images that were replaced by newer ones, so that builds do not fill the disk. Images in use stay."""
     for identity in identities:
         run(["buildah", "rmi", identity], check=False)
 
@@ -169,7 +169,7 @@ def _remove_replaced(identities: Iterable[str]) -> None:
 def _build(source: Path, target: str, tag: str) -> None:
     argv = ["buildah", "build", "--quiet", "--layers", "--timestamp", "0", "--build-arg", f"BASE={BASE_IMAGE}"]
     if _HOST_CA.is_file():
-        # The package index may be behind a proxy whose CA only this machine trusts. The image does not keep the bundle.
+        # A proxy of the package index may have a CA that only this machine trusts. The image does not keep the bundle.
         argv += ["--volume", f"{_HOST_CA}:{_CA_IN_BUILD}:ro", "--build-arg", f"SSL_CERT_FILE={_CA_IN_BUILD}"]
     argv += ["--target", target, "--tag", image_name(target, tag), str(source)]
     run(argv, timeout_s=_BUILD_TIMEOUT_S, env={**os.environ, "BUILDAH_ISOLATION": "chroot"})
@@ -184,9 +184,11 @@ def ensure_base(*, report: Report) -> None:
     if BASE_IMAGE in image_ids():
         return
     if shutil.which("debootstrap") is None:
-        raise PrerequisiteError("the base image is made with debootstrap; install it: apt-get install debootstrap")
+        raise PrerequisiteError(
+            "debootstrap is missing, which creates the base image; install it: apt-get install debootstrap"
+        )
     started = time.monotonic()
-    report("making the Debian base image (once)")
+    report("creating the Debian base image (once)")
     with tempfile.TemporaryDirectory(prefix="fractus-base-") as scratch:
         root = Path(scratch) / "root"
         run(["debootstrap", "--variant=minbase", "trixie", root], timeout_s=_BUILD_TIMEOUT_S)
@@ -199,4 +201,4 @@ def ensure_base(*, report: Report) -> None:
             run(["buildah", "commit", "--quiet", container, BASE_IMAGE], timeout_s=_BUILD_TIMEOUT_S)
         finally:
             run(["buildah", "rm", container], check=False)
-    report(f"made the Debian base image in {time.monotonic() - started:.0f} s")
+    report(f"created the Debian base image in {time.monotonic() - started:.0f} s")

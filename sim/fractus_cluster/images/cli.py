@@ -1,4 +1,4 @@
-"""`fractus images`: the images of Fractus on the command line."""
+"""`fractus images`: command line for the container images."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from fractus_cluster.images.build import TARGETS, build_images, find_source
 
 @click.group()
 def images() -> None:
-    """The container images of Fractus, built from its Dockerfile with buildah."""
+    """Build the container images of Fractus from its Dockerfile with buildah."""
 
 
 @images.command()
@@ -22,7 +22,7 @@ def images() -> None:
 @click.option(
     "--source", type=click.Path(path_type=Path, file_okay=False, exists=True), help="Checkout with the Dockerfile."
 )
-@click.option("--tag", default="dev", show_default=True)
+@click.option("--tag", default="dev", show_default=True, help="Tag of the images.")
 @click.option("--force", is_flag=True, help="Build images even if their sources did not change.")
 @click.option(
     "--sbom",

@@ -17,32 +17,34 @@ _IMPORT_TIMEOUT_S = 300.0
 
 
 def deliver(layout: Layout, images: Sequence[Image], nodes: Sequence[Node]) -> dict[str, int]:
-    """Import images on nodes. A node that has all of them is skipped.
+    """Import images on nodes. Skip nodes that have all of them.
 
     Args:
-        layout: The layout that has the images.
-        images: The images to deliver.
-        nodes: The nodes, which must be running.
+        layout: Layout that contains the images.
+        images: Images to deliver.
+        nodes: Running nodes.
 
     Returns:
-        The number of images that were new, by the name of the node.
+        Number of new images by node name.
 
     Raises:
         ClusterError: A node is not running, or its import failed.
     """
+    if not images:
+        return {node.name: 0 for node in nodes}
     missing = {node.name: _missing(node, images) for node in nodes}
     # Nodes that lack the same layers share an archive.
     groups: dict[tuple[frozenset[str], frozenset[str]], list[Node]] = {}
     for node in nodes:
         if missing[node.name]:
-            wanted = frozenset(image.name for image in missing[node.name])
+            names = frozenset(image.name for image in missing[node.name])
             needed = {digest for image in missing[node.name] for digest in layout.digests(image)}
-            groups.setdefault((wanted, frozenset(_content(node) & needed)), []).append(node)
-    for (wanted, there), members in groups.items():
+            groups.setdefault((names, frozenset(_content(node) & needed)), []).append(node)
+    for (names, present), members in groups.items():
         manifests = {image.digest for image in images}
         with tempfile.TemporaryFile() as archive:
             layout.write_archive(
-                [image for image in images if image.name in wanted], without=there - manifests, out=archive
+                [image for image in images if image.name in names], without=present - manifests, out=archive
             )
             archive.flush()
             with ThreadPoolExecutor(max_workers=4) as pool:
@@ -51,8 +53,8 @@ def deliver(layout: Layout, images: Sequence[Image], nodes: Sequence[Node]) -> d
 
 
 def _missing(node: Node, images: Sequence[Image]) -> list[Image]:
-    there = node.exec([*_CTR, "images", "list"]).stdout
-    known = {fields[0]: fields[2] for line in there.splitlines()[1:] if len(fields := line.split()) > 2}
+    listing = node.exec([*_CTR, "images", "list"]).stdout
+    known = {fields[0]: fields[2] for line in listing.splitlines()[1:] if len(fields := line.split()) > 2}
     return [image for image in images if known.get(image.name) != image.digest]
 
 
@@ -61,7 +63,7 @@ def _content(node: Node) -> set[str]:
 
 
 def _import(node: Node, archive: IO[bytes]) -> None:
-    """Import an archive. Repeat once if containerd's garbage collector removed a snapshot during the import."""
+    """Import an archive. Try once more if containerd's garbage collector removed a snapshot during the import."""
     error = _attempt(node, archive)
     if error and "snapshot" in error:
         error = _attempt(node, archive)
@@ -70,7 +72,7 @@ def _import(node: Node, archive: IO[bytes]) -> None:
 
 
 def _attempt(node: Node, archive: IO[bytes]) -> str:
-    """Import an archive and return the error, empty on success."""
+    """Import an archive. Return the error message, or an empty string on success."""
     argv = node.exec_command([*_CTR, "images", "import", "-"])
     with open(f"/proc/self/fd/{archive.fileno()}", "rb") as stream:  # noqa: PTH123  (a separate read position)
         try:

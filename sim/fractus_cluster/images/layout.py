@@ -32,10 +32,10 @@ class Image:
     """An image of a layout.
 
     Attributes:
-        name: Its full name, such as `localhost/fractus/agent:dev`.
-        digest: Digest of its manifest, which identifies the content.
-        size_bytes: Size of its manifest.
-        media_type: Media type of its manifest.
+        name: Full name, such as `localhost/fractus/agent:dev`.
+        digest: Digest of the manifest, which identifies the content.
+        size_bytes: Size of the manifest.
+        media_type: Media type of the manifest.
     """
 
     name: str
@@ -49,7 +49,7 @@ class Layout:
     """An OCI image layout.
 
     Attributes:
-        path: Its directory.
+        path: Directory of the layout.
     """
 
     path: Path
@@ -105,7 +105,7 @@ class Layout:
                 path.unlink()
 
     def add_program(self, name: str, program: Path) -> Image:
-        """Add an image that consists of one static program, its entry point."""
+        """Add an image that contains only a static program, which is its entry point."""
         self.create()
         layer = _layer_with(program)
         layer_digest = self._add_blob(layer)
@@ -139,14 +139,14 @@ class Layout:
         """Write an archive that `ctr images import` reads.
 
         Args:
-            images: The images of the archive.
-            without: Digests of layers to omit because the receiver has them.
+            images: Images to write.
+            without: Digests of blobs to omit, because the receiver has them.
             out: Binary stream for the archive.
         """
-        wanted = list(images)
-        digests = {digest: None for image in wanted for digest in self.digests(image) if digest not in without}
+        images = list(images)
+        digests = {digest: None for image in images for digest in self.digests(image) if digest not in without}
         manifests = []
-        for image in wanted:
+        for image in images:
             entry = _descriptor(image.media_type, image.digest, image.size_bytes)
             entry["annotations"] = {_NAME_ANNOTATION: image.name, _REF_ANNOTATION: image.name.rpartition(":")[2]}
             entry["platform"] = {"architecture": _architecture(), "os": "linux"}

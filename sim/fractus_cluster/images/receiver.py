@@ -58,8 +58,8 @@ class _Server(ThreadingHTTPServer):
         self.layout = layout
         self.unpacked: dict[str, str] = {}  # digest of a compressed layer -> digest of the stored layer
 
-    def keep(self, file: Path) -> str:
-        """Move an uploaded file into the layout, uncompressed, and return its digest as it was sent."""
+    def store(self, file: Path) -> str:
+        """Move an uploaded file into the layout, uncompressed. Return the digest of the uploaded file."""
         sent = _digest_of(file)
         with file.open("rb") as content:
             packed = content.read(2) == _GZIP_MAGIC
@@ -69,13 +69,13 @@ class _Server(ThreadingHTTPServer):
         plain = file.with_name(file.name + ".plain")
         with gzip.open(file) as source, plain.open("wb") as out:
             shutil.copyfileobj(source, out, _PIECE_BYTES)
-        kept = _digest_of(plain)
-        plain.replace(self.layout.blob(kept))
+        stored = _digest_of(plain)
+        plain.replace(self.layout.blob(stored))
         file.unlink()
-        self.unpacked[sent] = kept
+        self.unpacked[sent] = stored
         return sent
 
-    def keep_manifest(self, name: str, content: bytes) -> None:
+    def store_manifest(self, name: str, content: bytes) -> None:
         """Add a manifest to the layout, with the digests of the uncompressed layers."""
         manifest = json.loads(content)
         for layer in manifest["layers"]:
@@ -94,14 +94,14 @@ class _Handler(BaseHTTPRequestHandler):
     server: _Server
 
     def log_message(self, format: str, *args: object) -> None:
-        """Write no log."""
+        """Suppress the log."""
 
     def do_GET(self) -> None:
         """Confirm the protocol version. The registry serves no content."""
         self._respond(HTTPStatus.OK if self.path == "/v2/" else HTTPStatus.NOT_FOUND)
 
     def do_HEAD(self) -> None:
-        """Report if the layout has a layer."""
+        """Return 200 if the layout has a layer."""
         match = _BLOB.match(self.path)
         path = self.server.layout.blob(match[1]) if match else None
         if match and path is not None and path.is_file():
@@ -144,13 +144,13 @@ class _Handler(BaseHTTPRequestHandler):
             with file.open("ab") as out:
                 for piece in self._body():
                     out.write(piece)
-            digest = self.server.keep(file)
+            digest = self.server.store(file)
             if parse_qs(address.query).get("digest") != [digest]:
                 self._respond(HTTPStatus.BAD_REQUEST)
                 return
             self._respond(HTTPStatus.CREATED, {"Docker-Content-Digest": digest})
         elif manifest is not None:
-            self.server.keep_manifest(f"{manifest[1]}:{manifest[2]}", b"".join(self._body()))
+            self.server.store_manifest(f"{manifest[1]}:{manifest[2]}", b"".join(self._body()))
             self._respond(HTTPStatus.CREATED)
         else:
             self._respond(HTTPStatus.NOT_FOUND)

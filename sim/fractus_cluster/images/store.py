@@ -1,4 +1,4 @@
-"""The machine's image store for embedded clusters, between buildah or archives and the nodes."""
+"""Image store of the machine: it takes images from buildah or archives and delivers them to nodes."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ Report = Callable[[str], None]
 
 @dataclass(frozen=True, slots=True)
 class ImageStore:
-    """A directory with an OCI layout of images, and node templates with images unpacked.
+    """A directory with images in an OCI layout, and templates of nodes with unpacked images.
 
     Attributes:
-        path: The directory. It is on the file system of the clusters' state, because nodes share files by hard links.
-        report: Called with each line of progress.
+        path: Directory. It is on the file system of the clusters' state, because nodes share files by hard links.
+        report: Called with progress lines.
     """
 
     path: Path
@@ -43,16 +43,16 @@ class ImageStore:
 
     @classmethod
     def default(cls, *, report: Report) -> ImageStore:
-        """Return the store in the folder of the clusters' state."""
+        """Return the store in the state directory of all clusters."""
         return cls(state_root() / ".images", report)
 
     @property
     def layout(self) -> Layout:
-        """The images."""
+        """Layout with the images."""
         return Layout(self.path / "layout")
 
     def fetch(self, names: Sequence[str]) -> list[Image]:
-        """Copy images into the store, if they are new or changed, and return them.
+        """Copy new and changed images into the store, and return all of them.
 
         Args:
             names: Names in buildah's storage, or paths of OCI or Docker archives.
@@ -64,17 +64,19 @@ class ImageStore:
             return []
         with self._locked():
             self.layout.create()
-            wanted = [name for entry in names for name in _names_behind(entry)]
+            full_names = list(dict.fromkeys(name for entry in names for name in _names_of(entry)))
             ids = image_ids()
-            missing = [name for name in wanted if name not in ids]
+            missing = [name for name in full_names if name not in ids]
             if missing:
-                raise ClusterError(f"no image {', '.join(missing)} in buildah's storage; there are {', '.join(ids)}")
-            here = {name: self.layout.image_id(image) for name, image in self.layout.images().items()}
-            stale = [name for name in dict.fromkeys(wanted) if here.get(name) != ids[name]]
+                raise ClusterError(
+                    f"no image {', '.join(missing)} in buildah's storage; available images: {', '.join(ids)}"
+                )
+            stored = {name: self.layout.image_id(image) for name, image in self.layout.images().items()}
+            stale = [name for name in full_names if stored.get(name) != ids[name]]
             if stale:
                 self._receive(stale)
                 self.layout.remove_unused()
-            return [self.layout.image(name) for name in dict.fromkeys(wanted)]
+            return [self.layout.image(name) for name in full_names]
 
     def _receive(self, names: Sequence[str]) -> None:
         with receiving(self.layout) as address:
@@ -86,15 +88,15 @@ class ImageStore:
         """Return a template of a node's container storage with these images unpacked. Create it if it is missing."""
         with self._locked():
             sandbox = self._sandbox(pause)
-            wanted = [sandbox, *images]
-            digest = hashlib.sha256("\n".join(sorted(f"{i.name} {i.digest}" for i in wanted)).encode()).hexdigest()
+            contents = [sandbox, *images]
+            digest = hashlib.sha256("\n".join(sorted(f"{i.name} {i.digest}" for i in contents)).encode()).hexdigest()
             template = Template(self.path / "templates" / digest[:16])
-            template.make(self.layout, wanted, report=self.report)
+            template.create(self.layout, contents, report=self.report)
             return template
 
     def deliver(self, images: Sequence[Image], nodes: Sequence[Node]) -> dict[str, int]:
-        """Deliver images of the store to running nodes; return how many were new to each."""
-        return deliver(self.layout, images, nodes) if images else {node.name: 0 for node in nodes}
+        """Deliver images of the store to running nodes. Return the number of new images by node name."""
+        return deliver(self.layout, images, nodes)
 
     def _sandbox(self, pause: Path) -> Image:
         self.layout.create()
@@ -102,7 +104,7 @@ class ImageStore:
 
     def _locked(self) -> AbstractContextManager[None]:
         return locked(
-            self.path / "lock", timeout_s=_LOCK_TIMEOUT_S, what="another process works on images", report=self.report
+            self.path / "lock", timeout_s=_LOCK_TIMEOUT_S, what="another process is changing images", report=self.report
         )
 
 
@@ -123,21 +125,18 @@ def image_ids() -> dict[str, str]:
     return {pair[0]: pair[1].removeprefix("sha256:") for pair in pairs if len(pair) == 2 and "<none>" not in pair[0]}
 
 
-def _names_behind(entry: str) -> list[str]:
-    """Return the names of the images of an entry: the name itself, or the content of an archive."""
+def _names_of(entry: str) -> list[str]:
+    """Return the image names of an entry, which is a name itself or the path of an archive."""
     if not Path(entry).is_file():
         return [entry]
     with tarfile.open(entry) as archive:
-        kind = (
-            "oci-archive"
-            if "oci-layout" in {name.removeprefix("./") for name in archive.getnames()}
-            else "docker-archive"
-        )
+        members = {name.removeprefix("./") for name in archive.getnames()}
+    kind = "oci-archive" if "oci-layout" in members else "docker-archive"
     before = image_ids()
     identity = run(["buildah", "pull", "--quiet", f"{kind}:{entry}"], timeout_s=_COPY_TIMEOUT_S).stdout.strip()
     after = image_ids()
     names = [name for name, other in after.items() if other == identity]
-    fresh = [name for name in names if before.get(name) != identity]
+    new = [name for name in names if before.get(name) != identity]
     if not names:
-        raise ClusterError(f"{entry}: the archive gives its image no name")
-    return fresh or names
+        raise ClusterError(f"{entry}: the archive contains no name for its image")
+    return new or names

@@ -1,4 +1,4 @@
-"""Templates of a node's container storage with images unpacked. Nodes get hard links to their files."""
+"""Templates of a node's container storage with unpacked images. Nodes get hard links to the files of a template."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ disabled_plugins = ["io.containerd.grpc.v1.cri", "io.containerd.internal.v1.opt"
   "io.containerd.snapshotter.v1.devmapper", "io.containerd.snapshotter.v1.zfs"]
 [grpc]
   address = "{socket}"
-# ctr unpacks without a lease. A garbage collection in between would remove layers that others build on.
+# ctr unpacks without a lease. Garbage collection would remove layers that other layers need.
 [plugins."io.containerd.gc.v1.scheduler"]
   deletion_threshold = 0
   mutation_threshold = 0
@@ -50,24 +50,24 @@ class Template:
     """Initial content of a node's /var/lib/containerd.
 
     Attributes:
-        path: The directory, which exists only if it is complete.
+        path: Directory. It exists only if the template is complete.
     """
 
     path: Path
 
-    def make(self, layout: Layout, images: Sequence[Image], *, report: Report) -> None:
-        """Unpack the images with a separate container daemon, unless the template exists.
+    def create(self, layout: Layout, images: Sequence[Image], *, report: Report) -> None:
+        """Create the template unless it exists. A separate container daemon unpacks the images.
 
-        The daemon starts from a copy of the newest template, so that only new layers are unpacked.
+        The daemon starts with a copy of the newest template, so that it unpacks only new layers.
         """
         if self.path.exists():
             os.utime(self.path)
             return
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        for left in self.path.parent.glob(".making-*"):
+        for left in self.path.parent.glob(".new-*"):
             shutil.rmtree(left)
         started = time.monotonic()
-        scratch = self.path.parent / f".making-{self.path.name}"
+        scratch = self.path.parent / f".new-{self.path.name}"
         scratch.mkdir()
         others = sorted(self.path.parent.glob("[!.]*"), key=lambda path: path.stat().st_mtime, reverse=True)
         if others:
@@ -80,8 +80,8 @@ class Template:
             shutil.rmtree(old)
         report(f"unpacked {len(images)} images in {time.monotonic() - started:.1f} s")
 
-    def furnish(self, node: Node) -> None:
-        """Copy the template into a node that has no container storage yet."""
+    def copy_to(self, node: Node) -> None:
+        """Copy the template to a node that has no container storage yet."""
         target = _storage(node)
         if target.exists():
             return
@@ -103,9 +103,9 @@ def _storage(node: Node) -> Path:
 
 
 def _copy_storage(source: Path, target: Path) -> None:
-    """Copy a daemon's storage by hard links, except its databases, because the daemon writes to them."""
+    """Copy a daemon's storage by hard links. Databases become real copies, because the daemon writes to them."""
     linked = run(["cp", "-al", source, target], check=False, timeout_s=_IMPORT_TIMEOUT_S)
-    if linked.returncode != 0:  # another file system
+    if linked.returncode != 0:  # the target is on another file system
         shutil.rmtree(target, ignore_errors=True)
         run(["cp", "-a", "--reflink=auto", source, target], timeout_s=_IMPORT_TIMEOUT_S)
     for database in source.rglob("*.db"):
@@ -116,7 +116,7 @@ def _copy_storage(source: Path, target: Path) -> None:
 
 @contextmanager
 def _daemon(scratch: Path) -> Iterator[list[str]]:
-    """Run a container daemon on `scratch/root`, and yield the beginning of its client's command line."""
+    """Run a container daemon with its storage in `scratch/root`, and yield the command line of its client."""
     socket = scratch / "s"
     config = scratch / "config.toml"
     log = scratch / "log"
@@ -150,7 +150,7 @@ def _die_with_parent() -> None:
 
 
 def _import(layout: Layout, images: Sequence[Image], ctr: list[str], scratch: Path) -> None:
-    wanted = {image.name for image in images}
+    names = {image.name for image in images}
     present = set(run([*ctr, "images", "list", "--quiet"]).stdout.split())
     content = set(run([*ctr, "content", "list", "--quiet"]).stdout.split())
     manifests = {image.digest for image in images}
@@ -160,5 +160,5 @@ def _import(layout: Layout, images: Sequence[Image], ctr: list[str], scratch: Pa
     run([*ctr, "images", "import", str(archive)], timeout_s=_IMPORT_TIMEOUT_S)
     for image in images:
         run([*ctr, "images", "label", image.name, _MANAGED], timeout_s=30)
-    if present - wanted:
-        run([*ctr, "images", "remove", "--sync", *sorted(present - wanted)], timeout_s=_IMPORT_TIMEOUT_S)
+    if present - names:
+        run([*ctr, "images", "remove", "--sync", *sorted(present - names)], timeout_s=_IMPORT_TIMEOUT_S)

@@ -74,7 +74,7 @@ class ChaosTarget:
     @property
     def state(self) -> Path:
         """Local directory that is mounted as /var/lib/fractus on the drone's node."""
-        return self.node.own_state
+        return self.node.fractus_state
 
     @property
     def control_plane(self) -> Path:
@@ -162,7 +162,7 @@ def chaos_cluster(report: Callable[[str], None], *, keep: bool) -> Iterator[Chao
         (target.state / BALLAST).unlink(missing_ok=True)
         nodes = [node for node in fractus.cluster.nodes if node.spec.node_class != "cloud"]
         with cluster_errors():
-            clock_faults.install_library(node.own_state for node in nodes)
+            clock_faults.install_library(node.fractus_state for node in nodes)
         install_fractus(kube, traffic_example_objects(), clock_faults.chart_values())
         yield target
     finally:

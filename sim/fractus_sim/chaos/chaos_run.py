@@ -267,7 +267,7 @@ class Missions:
         """Return the Grants on the disks of nodes."""
         grants = []
         for node in self.target.cluster.nodes:
-            for path in (node.own_state / "grants").glob("*.json"):
+            for path in (node.fractus_state / "grants").glob("*.json"):
                 # The agent may remove a file meanwhile.
                 with suppress(FileNotFoundError):
                     grants.append(json.loads(path.read_bytes()))
@@ -344,7 +344,7 @@ def _evaluate_invariants(target: ChaosTarget, watch: VehicleWatch, run: ChaosRun
         violations += invariants.landings_away_from_home(samples, watch.home)
     boot_time_s = time.time() - time.clock_gettime(time.CLOCK_BOOTTIME)
     for node in target.cluster.nodes:
-        folder = node.own_state / "audit"
+        folder = node.fractus_state / "audit"
         for log in read_audit_logs([folder] if folder.is_dir() else []):
             run.audit_entries += log.length
             if log.problem:

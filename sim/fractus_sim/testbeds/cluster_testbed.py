@@ -112,7 +112,7 @@ class ClusterTestbed(Testbed):
         """Read the audit logs from the disks of the drones."""
         self._stop.set()
         for setup in self.experiment.setups():
-            self.read_audit_logs(setup.name, self._cluster.node(setup.name).own_state / "audit")
+            self.read_audit_logs(setup.name, self._cluster.node(setup.name).fractus_state / "audit")
 
     def _take_down(self) -> None:
         """Remove the cluster. If it was running before, delete only the applied Applications."""

@@ -111,6 +111,7 @@ def message(name: str, **values: Value) -> Message:
     )
 
 
+@functools.cache
 def message_class(name: str) -> type[mavlink.MAVLink_message]:
     """Return pymavlink's class of a message.
 

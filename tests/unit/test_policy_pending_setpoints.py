@@ -9,7 +9,7 @@ import pytest
 import shapely
 from fractus_core.policy.decision_types import Call, Situation, VelocityArgs
 from fractus_core.policy.engine import judge
-from fractus_core.policy.kinematics import is_moving, motion_before_reaction, stop_point, velocity_leg
+from fractus_core.policy.kinematics import motion_before_reaction, stop_point, velocity_leg
 from policy_world import at, box, compiled, exclusion, goto
 
 Velocity = tuple[float, float]
@@ -85,9 +85,9 @@ def test_pending_setpoint_may_end_braking() -> None:
 
 
 def test_drone_with_pending_setpoint_counts_as_moving() -> None:
-    assert not is_moving(at(0, 0))
-    assert is_moving(at(0, 0, pending=((5.0, 0.0, 0.0),)))
-    assert not is_moving(at(0, 0, pending=((0.0, 0.0, 0.0),)))
+    assert not at(0, 0).is_moving
+    assert at(0, 0, pending=((5.0, 0.0, 0.0),)).is_moving
+    assert not at(0, 0, pending=((0.0, 0.0, 0.0),)).is_moving
 
 
 def test_goto_is_judged_with_pending_setpoints() -> None:

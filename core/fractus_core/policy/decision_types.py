@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field, fields
 from operator import attrgetter
@@ -274,6 +275,20 @@ class Situation:
     def height_margin_m(self) -> float:
         """Vertical distance that a leg keeps from floors and ceilings of zones: altitude error plus tracking error."""
         return self.altitude_error_m + self.airframe.tracking_m
+
+    @property
+    def is_moving(self) -> bool:
+        """True if the drone is too fast to turn on the spot, or may be when a command takes effect."""
+        moves = math.hypot(self.north_mps, self.east_mps) >= STATIONARY_MPS or abs(self.down_mps) >= STATIONARY_MPS
+        return moves or self.is_pending_motion
+
+    @property
+    def is_pending_motion(self) -> bool:
+        """True if a pending velocity setpoint is too fast for a turn on the spot."""
+        return any(
+            math.hypot(north, east) >= STATIONARY_MPS or abs(down) >= STATIONARY_MPS
+            for north, east, down in self.pending
+        )
 
     @property
     def is_plausible(self) -> bool:

@@ -30,7 +30,6 @@ from fractus_core.policy.decision_types import (
     format_distance,
 )
 from fractus_core.policy.goto_rules import judge_goto
-from fractus_core.policy.kinematics import is_moving
 from fractus_core.policy.limits import settle_correction
 from fractus_core.policy.monitoring import must_stop_first
 from fractus_core.policy.picture_rules import by_priority, judge_privacy, rule_names, rules_in_view
@@ -63,7 +62,7 @@ def judge(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
     verdict = _judge_once(call, now, grant)
     if verdict.action == "correct" and call.method in _ARGUMENT_TYPES:
         verdict = settle_correction(call, verdict, lambda corrected: _judge_once(corrected, now, grant))
-    if verdict.brake_first or not is_moving(now):
+    if verdict.brake_first or not now.is_moving:
         return verdict
     # A moving drone stops first if it is taken over, or if it is on its way into a fence.
     changes_course = verdict.permits and call.method in _COURSE_METHODS

@@ -14,7 +14,6 @@ from fractus_core.policy.kinematics import (
     XY,
     Leg,
     goto_leg,
-    is_moving,
     pending_outcomes,
     situation_at_rest,
     stop_altitude_m,
@@ -62,7 +61,7 @@ def judge_goto(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
     if args.speed_mps is not None and args.speed_mps > now.speed_setpoint_mps:
         now = replace(now, speed_setpoint_mps=args.speed_mps)
     verdict = _judge_from(_Request(args, now, grant, position), target)
-    if verdict.action == "allow" or not is_moving(now) or not _turns_too_wide(verdict, args):
+    if verdict.action == "allow" or not now.is_moving or not _turns_too_wide(verdict, args):
         return verdict
     stopped = _judge_after_stop(_Request(args, now, grant, position), target)
     return stopped if stopped is not None and stopped.permits and not _shortened(stopped, args) else verdict

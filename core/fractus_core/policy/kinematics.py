@@ -38,17 +38,6 @@ def reaction_s(situation: Situation, accel_mps2: float) -> float:
     return situation.latency_s + accel_mps2 / (2 * situation.airframe.jerk_mps3)
 
 
-def is_moving(now: Situation) -> bool:
-    """Return True if the drone is too fast to turn on the spot, or may be when a command takes effect."""
-    if _exceeds_stationary_speed(now.north_mps, now.east_mps, now.down_mps):
-        return True
-    return bool(now.pending) and any(_exceeds_stationary_speed(*velocity) for velocity in now.pending)
-
-
-def _exceeds_stationary_speed(north_mps: float, east_mps: float, down_mps: float) -> bool:
-    return math.hypot(north_mps, east_mps) >= STATIONARY_MPS or abs(down_mps) >= STATIONARY_MPS
-
-
 def pending_outcomes(now: Situation, position: XY) -> list[tuple[XY, Situation]]:
     """Return the states that the drone may reach by its pending velocity setpoints before a decision takes effect.
 
@@ -131,7 +120,7 @@ def motion_before_reaction(situation: Situation) -> MotionBeforeReaction:
     forward = situation.forward_mps2
     if forward is None:
         forward = airframe.accel_mps2 if STATIONARY_MPS <= speed < situation.speed_setpoint_mps else 0.0
-    elif forward < 0.0 and any(_exceeds_stationary_speed(*velocity) for velocity in situation.pending):
+    elif forward < 0.0 and situation.is_pending_motion:
         forward = 0.0  # A pending setpoint may have ended the braking.
     forward = min(max(forward, -airframe.accel_mps2), airframe.accel_mps2)
     if forward <= 0.0:

@@ -23,7 +23,6 @@ from fractus_core.policy.decision_types import GotoArgs, SetSpeedArgs, Situation
 from fractus_core.policy.geofences import SEVERITY, TAKEOVERS, find_breaches, signed_depth_m
 from fractus_core.policy.kinematics import (
     XY,
-    is_moving,
     pending_outcomes,
     reaction_s,
     stop_altitude_m,
@@ -110,7 +109,7 @@ def monitor(
         _fence_reactions(now, grant, _stopping_path(now, start, ahead, margin, level_m), system_flies=system_flies)
     )
     if worst is not None:
-        return replace(worst, brake_first=worst.action == "takeover" and is_moving(now))
+        return replace(worst, brake_first=worst.action == "takeover" and now.is_moving)
     for outcome_position, outcome in outlooks:
         # The drone's way may end before the fence. It is stopped now, and taken over only if it really goes too far.
         further = _stopping_path(
@@ -131,7 +130,7 @@ def monitor(
             )
         )
         if worst is not None:
-            return replace(worst, brake_first=worst.action == "takeover" and is_moving(now))
+            return replace(worst, brake_first=worst.action == "takeover" and now.is_moving)
     rest_m = _altitude_after_stop_m(now, level_m)
     # A climb initiated by the autopilot was never judged and may end anywhere, so it gets only part of the tolerance.
     unjudged_climb = system_flies and current_leg is None and now.down_mps < -CLIMBING_MPS
@@ -207,7 +206,7 @@ def must_stop_first(now: Situation, grant: CompiledGrant) -> bool:
     The check uses the margin of legs, and ignores braking that has begun, because a new command may interrupt it.
     """
     position = grant.locate(now)
-    if position is None or not now.in_air or not is_moving(now):
+    if position is None or not now.in_air or not now.is_moving:
         return False
     outlooks = [(position, replace(now, forward_mps2=0.0)), *pending_outcomes(now, position)]
     return any(

@@ -98,10 +98,6 @@ class GrantFiles:
         """Grants in force, by identity."""
         return self._active
 
-    def of(self, identity: str) -> ActiveGrant | None:
-        """Return the Grant of a caller, or None."""
-        return self._active.get(identity)
-
     def listen(self, listener: Listener) -> None:
         """Add a listener that is called at each change."""
         self._listeners.append(listener)

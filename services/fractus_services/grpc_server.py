@@ -233,7 +233,7 @@ class CallAdmission(grpc.aio.ServerInterceptor):  # type: ignore[misc]  # grpc h
         Raises:
             PolicyDenied: The caller has no Grant on this node.
         """
-        grant = self._grants.of(caller.identity)
+        grant = self._grants.active.get(caller.identity)
         if grant is None:
             log.warning(
                 "policy: call refused because the caller has no Grant on this node (caller=%s)",

@@ -112,7 +112,7 @@ class Wanderer:
     def remove(self) -> None:
         grants = self._flight.world.grants
         mine = self._grants.get(self._key)
-        if mine is not None and grants.of(mine.identity) is mine:
+        if mine is not None and grants.active.get(mine.identity) is mine:
             grants.remove(self._grants.pop(self._key))
 
     def zone(self) -> None:

@@ -49,7 +49,7 @@ def test_grant_files_report_added_changed_and_removed_grants(tmp_path: Path) -> 
     files.scan()
     (grant,) = files.active.values()
     assert isinstance(grant, ActiveGrant)
-    assert files.of(grant.identity) is grant
+    assert files.active.get(grant.identity) is grant
     path.write_text(body(uid="u2"))
     files.scan()
     path.write_text("{")

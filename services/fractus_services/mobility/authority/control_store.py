@@ -203,7 +203,7 @@ class ControlStore:
         mission = self._state.mission
         if lease is not None:
             return lease.grant
-        grant = self._grants.of(mission.identity) if mission is not None else None
+        grant = self._grants.active.get(mission.identity) if mission is not None else None
         return grant if grant is not None and mission is not None and grant.key == mission.key else None
 
     @property
@@ -232,7 +232,7 @@ class ControlStore:
 
     def is_valid(self, grant: ActiveGrant) -> bool:
         """Return True if the grant is still in force."""
-        current = self._grants.of(grant.identity)
+        current = self._grants.active.get(grant.identity)
         return current is not None and current.key == grant.key
 
     def not_ready_reason(self, key: str) -> str | None:

@@ -299,22 +299,16 @@ class AutopilotLink:
         """Queue the vehicle's messages with these names until the block ends."""
         return self._subscriptions.subscribe(*names)
 
-    def recipient(self) -> dict[str, int]:
-        """Return the target fields of messages that are also sent to a vehicle without recent heartbeats.
+    def address(self, *, silent: bool = False) -> dict[str, int]:
+        """Return the target fields of messages to the vehicle.
+
+        Args:
+            silent: True for messages that are also sent to a vehicle without recent heartbeats.
 
         Raises:
-            AutopilotError: The vehicle was not identified since the connection was opened.
+            AutopilotError: The vehicle was not identified since the connection was opened. Unless `silent` is True, also if the
+                vehicle sends no heartbeats.
         """
-        if self.target is None:
+        if self.target is None or not (silent or self.connected):
             raise AutopilotError("the autopilot is not connected", link=True)
         return {"target_system": self.target[0], "target_component": self.target[1]}
-
-    def address(self) -> dict[str, int]:
-        """Return the target fields of messages to a connected vehicle.
-
-        Raises:
-            AutopilotError: The vehicle is not connected.
-        """
-        if not self.connected:
-            raise AutopilotError("the autopilot is not connected", link=True)
-        return self.recipient()

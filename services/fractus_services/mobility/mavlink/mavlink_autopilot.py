@@ -492,7 +492,7 @@ class MavlinkAutopilot(AutopilotLink):
                     vy=east_mps,
                     vz=down_mps,
                     yaw=math.radians(yaw_deg or 0.0),
-                    **self.recipient(),
+                    **self.address(silent=True),
                 )
             )
 

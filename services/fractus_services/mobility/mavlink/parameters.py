@@ -46,7 +46,7 @@ class Recipient(Protocol):
     def send(self, outgoing: Message) -> None:
         """Send a message."""
 
-    def recipient(self) -> dict[str, int]:
+    def address(self, *, silent: bool = ...) -> dict[str, int]:
         """Return the target fields of messages to the vehicle."""
 
 
@@ -159,7 +159,7 @@ class Parameters:
                         param_id=name.encode(),
                         param_value=value,
                         param_type=mavlink.MAV_PARAM_TYPE_REAL32,
-                        **self._link.recipient(),
+                        **self._link.address(silent=True),
                     )
                 )
                 while different_values < 2 and await self._answered(lambda: self._received.get(name, 0) > last_number):  # noqa: B023
@@ -202,7 +202,9 @@ class Parameters:
         return known[:1] or names
 
     def _request(self, name: bytes, index: int) -> None:
-        self._link.send(message("PARAM_REQUEST_READ", param_index=index, param_id=name, **self._link.recipient()))
+        self._link.send(
+            message("PARAM_REQUEST_READ", param_index=index, param_id=name, **self._link.address(silent=True))
+        )
 
     @property
     def _complete(self) -> bool:
@@ -226,7 +228,7 @@ class Parameters:
         """Request the list, or its missing entries."""
         size = self._size or 0
         if size - len(self._list) > FEW_MISSING * size or not size:
-            self._link.send(message("PARAM_REQUEST_LIST", **self._link.recipient()))
+            self._link.send(message("PARAM_REQUEST_LIST", **self._link.address(silent=True)))
             last_number = -1
             while last_number != self._number and not self._complete:
                 last_number = self._number

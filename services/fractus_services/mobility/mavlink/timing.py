@@ -257,7 +257,7 @@ class Timing:
         When the link becomes slow, the first slow answer arrives late. Until then, the delay of the link is at least this much longer.
         """
         if self.unanswering and now - self._latest_answered_sent > STALE_S:
-            return 0.0  # The vehicle does not answer TIMESYNC. Acknowledgements measure its link.
+            return 0.0  # Acknowledgements measure this link. Before `STALE_S`, the answers may only have become slow.
         waiting = min(
             (sent for sent, _ in self._open_requests.values() if sent > self._latest_answered_sent), default=now
         )

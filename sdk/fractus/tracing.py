@@ -49,7 +49,7 @@ def _tracer() -> trace.Tracer:
             "tracing: off, a collector is configured but OpenTelemetry is not installed; install the extra `tracing` (missing=%s)",
             error.name,
         )
-    except Exception as error:  # a wrong variable must not keep a component from flying
+    except Exception as error:  # An invalid variable must not prevent a flight.
         log.warning("tracing: off, cannot set up OpenTelemetry; check the OTEL_ variables (error=%s)", error)
     return trace.NoOpTracer()
 

@@ -245,7 +245,7 @@ class Plane(MavlinkAutopilot):
 
     def _show(self, boot_ms: int, *state: float) -> None:
         vehicle = self.vehicle
-        late_s = self.timing.sampled(boot_ms, self.now)
+        late_s = self.timing.take_position(boot_ms, self.now)
         if late_s is None:
             return
         (

@@ -17,7 +17,7 @@ def legs(*targets: tuple[float, float, float]) -> RecentSetpoints:
     vehicle = VehicleState(lat=POSITION[0], lon=POSITION[1], altitude_m=10.0)
     for east, north, at in targets:
         lat, lon = LocalFrame(*POSITION).latlon(east, north)
-        setpoints.go_to(lat, lon, 10.0, vehicle, at)
+        setpoints.add_leg(lat, lon, 10.0, vehicle, at)
     return setpoints
 
 
@@ -32,7 +32,7 @@ def legs(*targets: tuple[float, float, float]) -> RecentSetpoints:
     ],
 )
 def test_leg_is_pending_until_the_drone_has_turned_onto_it(velocity: Velocity, turning: bool) -> None:
-    pending = legs((-100.0, 0.0, 1.0)).since(9.0, velocity)
+    pending = legs((-100.0, 0.0, 1.0)).pending_since(9.0, velocity)
     assert len(pending) == turning
     if turning:
         assert pending[0] == pytest.approx(WEST, abs=0.01)
@@ -40,15 +40,15 @@ def test_leg_is_pending_until_the_drone_has_turned_onto_it(velocity: Velocity, t
 
 def test_later_leg_replaces_the_earlier_one_when_it_is_old_enough() -> None:
     setpoints = legs((-100.0, 0.0, 1.0), (100.0, 0.0, 9.5))
-    assert [leg[1] for leg in setpoints.since(9.0, (5.0, -2.0, 0.0))] == pytest.approx([-LEG_MPS, LEG_MPS])
-    assert [leg[1] for leg in setpoints.since(9.6, (5.0, -2.0, 0.0))] == pytest.approx([LEG_MPS])
-    assert setpoints.since(10.0, (0.0, 6.0, 0.0)) == (), "the drone flies east by then"
+    assert [leg[1] for leg in setpoints.pending_since(9.0, (5.0, -2.0, 0.0))] == pytest.approx([-LEG_MPS, LEG_MPS])
+    assert [leg[1] for leg in setpoints.pending_since(9.6, (5.0, -2.0, 0.0))] == pytest.approx([LEG_MPS])
+    assert setpoints.pending_since(10.0, (0.0, 6.0, 0.0)) == (), "the drone flies east by then"
 
 
 def test_held_velocity_is_pending_until_another_setpoint_is_sent() -> None:
     setpoints = RecentSetpoints()
-    setpoints.fly((0.0, 3.0, 0.0), 1.0)
-    assert setpoints.since(9.0, (0.0, 3.0, 0.0)) == ((0.0, 3.0, 0.0),)
-    setpoints.fly((0.0, 0.0, 0.0), 10.0)
-    assert setpoints.since(9.5, (0.0, 3.0, 0.0)) == ((0.0, 3.0, 0.0), (0.0, 0.0, 0.0))
-    assert setpoints.since(10.5, (0.0, 2.0, 0.0)) == ()
+    setpoints.add_velocity((0.0, 3.0, 0.0), 1.0)
+    assert setpoints.pending_since(9.0, (0.0, 3.0, 0.0)) == ((0.0, 3.0, 0.0),)
+    setpoints.add_velocity((0.0, 0.0, 0.0), 10.0)
+    assert setpoints.pending_since(9.5, (0.0, 3.0, 0.0)) == ((0.0, 3.0, 0.0), (0.0, 0.0, 0.0))
+    assert setpoints.pending_since(10.5, (0.0, 2.0, 0.0)) == ()

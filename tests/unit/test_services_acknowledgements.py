@@ -47,10 +47,10 @@ class Heard(Timing):
 def measured(way_s: float, silence: Callable[[float], float] = lambda _now: 0.2) -> Timing:
     timing = Heard(silence) if math.isfinite(way_s) else Timing()
     if math.isfinite(way_s):
-        timing.sampled(1000, 0.0)
+        timing.take_position(1000, 0.0)
         number = timing.request(0.0)
         assert number is not None
-        timing.replied(1_000_000_000, number, way_s)
+        timing.take_reply(1_000_000_000, number, way_s)
     return timing
 
 
@@ -66,11 +66,11 @@ async def test_second_acknowledgement_of_a_repeated_command_does_not_deny_the_ne
     acks = link()
     first = Answer()
     later = Answer()
-    acks.sent(SPEED, first, 0.0)
-    acks.sent(SPEED, first, 0.7)
+    acks.add_transmission(SPEED, first, 0.0)
+    acks.add_transmission(SPEED, first, 0.7)
     acks.take(ack(), 1.0)
     assert first.result() == ACCEPTED
-    acks.sent(SPEED, later, 1.1)
+    acks.add_transmission(SPEED, later, 1.1)
     acks.take(ack(DENIED), 1.7)
     assert not later.done()
     acks.take(ack(), 2.1)
@@ -82,9 +82,9 @@ async def test_earlier_acceptance_does_not_accept_a_denied_command() -> None:
     first = Answer()
     later = Answer()
     for at in (0.0, 0.7):
-        acks.sent(SPEED, first, at)
+        acks.add_transmission(SPEED, first, at)
     acks.take(ack(), 1.0)
-    acks.sent(SPEED, later, 1.1)
+    acks.add_transmission(SPEED, later, 1.1)
     acks.take(ack(), 1.7)
     acks.take(ack(DENIED), 2.1)
     assert later.result() == DENIED
@@ -96,11 +96,11 @@ async def test_lost_transmission_does_not_consume_the_next_acknowledgement(way_s
     first = Answer()
     later = Answer()
     again = acks.timeout_s
-    acks.sent(SPEED, first, 0.0)
-    acks.sent(SPEED, first, again)
+    acks.add_transmission(SPEED, first, 0.0)
+    acks.add_transmission(SPEED, first, again)
     acks.take(ack(), again + way_s)
     assert first.result() == ACCEPTED
-    acks.sent(SPEED, later, again + way_s)
+    acks.add_transmission(SPEED, later, again + way_s)
     acks.take(ack(DENIED), again + 2 * way_s)
     assert later.result() == DENIED
 
@@ -109,9 +109,9 @@ async def test_acknowledgement_of_an_abandoned_command_is_not_assigned_to_the_ne
     acks = link()
     first = Answer()
     later = Answer()
-    acks.sent(SPEED, first, 0.0)
+    acks.add_transmission(SPEED, first, 0.0)
     first.cancel()
-    acks.sent(SPEED, later, 0.1)
+    acks.add_transmission(SPEED, later, 0.1)
     acks.take(ack(DENIED), 1.0)
     assert not later.done()
     acks.take(ack(), 1.1)
@@ -122,7 +122,7 @@ async def test_acknowledgements_are_assigned_while_the_link_becomes_slow() -> No
     acks = link(0.02)
     answer = Answer()
     for at in (0.0, 0.7):
-        acks.sent(SPEED, answer, at)
+        acks.add_transmission(SPEED, answer, at)
     acks.take(ack(), 2.0)
     assert answer.result() == ACCEPTED
 
@@ -132,9 +132,9 @@ async def test_missing_acknowledgements_may_still_arrive() -> None:
     first = Answer()
     later = Answer()
     acks = Acknowledgements(245, timing)
-    acks.sent(SPEED, first, 0.1)
+    acks.add_transmission(SPEED, first, 0.1)
     first.cancel()
-    acks.sent(SPEED, later, 1.9)
+    acks.add_transmission(SPEED, later, 1.9)
     acks.take(ack(DENIED), 2.1)
     assert not later.done()
 
@@ -144,9 +144,9 @@ async def test_late_acknowledgements_are_expected_while_the_delay_is_unknown() -
     first = Answer()
     later = Answer()
     for at in (0.0, 0.7, 1.4):
-        acks.sent(SPEED, first, at)
+        acks.add_transmission(SPEED, first, at)
     acks.take(ack(), 2.0)
-    acks.sent(SPEED, later, 2.1)
+    acks.add_transmission(SPEED, later, 2.1)
     acks.take(ack(DENIED), 2.7)
     acks.take(ack(DENIED), 3.4)
     assert not later.done()
@@ -158,10 +158,10 @@ async def test_in_progress_keeps_the_transmission_open() -> None:
     acks = link()
     first = Answer()
     later = Answer()
-    acks.sent(SPEED, first, 0.0)
+    acks.add_transmission(SPEED, first, 0.0)
     acks.take(ack(IN_PROGRESS), 1.0)
     assert not first.done()
-    acks.sent(SPEED, later, 1.5)
+    acks.add_transmission(SPEED, later, 1.5)
     acks.take(ack(DENIED), 2.0)
     assert first.result() == DENIED
     assert not later.done()
@@ -170,7 +170,7 @@ async def test_in_progress_keeps_the_transmission_open() -> None:
 async def test_acknowledgements_for_other_systems_and_commands_are_ignored() -> None:
     acks = link()
     answer = Answer()
-    acks.sent(SPEED, answer, 0.0)
+    acks.add_transmission(SPEED, answer, 0.0)
     acks.take(ack(DENIED, target=255), 0.5)
     acks.take(ack(DENIED, MODE), 0.6)
     assert not answer.done()
@@ -189,10 +189,10 @@ async def test_duplicate_frame_is_ignored() -> None:
         (incoming,) = parser.feed(autopilot.encode("COMMAND_ACK", ack(result).values))
         return incoming
 
-    acks.sent(SPEED, first, 0.0)
+    acks.add_transmission(SPEED, first, 0.0)
     denied = heard(DENIED)
     acks.take(denied, 0.05)
-    acks.sent(SPEED, later, 0.06)
+    acks.add_transmission(SPEED, later, 0.06)
     acks.take(denied, 0.07)
     assert not later.done()
     acks.take(heard(DENIED), 0.11)
@@ -203,14 +203,14 @@ async def test_transmissions_are_dropped_when_the_connection_breaks(caplog: pyte
     acks = link()
     before = Answer()
     after = Answer()
-    acks.sent(SPEED, before, 0.0)
+    acks.add_transmission(SPEED, before, 0.0)
     acks.forget()
-    assert not acks.overtaken(SPEED, before)
+    assert not acks.is_overtaken(SPEED, before)
     with caplog.at_level("DEBUG"):
         acks.take(ack(DENIED), 0.2)
     assert "unexpected acknowledgement" in caplog.text
     assert not before.done()
-    acks.sent(SPEED, after, 0.3)
+    acks.add_transmission(SPEED, after, 0.3)
     acks.take(ack(), 0.9)
     assert after.result() == ACCEPTED
 
@@ -218,7 +218,7 @@ async def test_transmissions_are_dropped_when_the_connection_breaks(caplog: pyte
 async def test_number_of_open_transmissions_is_limited() -> None:
     acks = link()
     for at in range(10 * MAX_UNACKNOWLEDGED):
-        acks.sent(SPEED, Answer(), float(at))
+        acks.add_transmission(SPEED, Answer(), float(at))
     assert len(acks._sent[SPEED]) == MAX_UNACKNOWLEDGED
 
 
@@ -226,8 +226,8 @@ async def test_later_command_overtakes_an_unanswered_one() -> None:
     acks = link()
     first = Answer()
     later = Answer()
-    acks.sent(MODE, first, 0.0)
-    assert not acks.overtaken(MODE, first)
-    acks.sent(MODE, later, 0.1)
-    assert acks.overtaken(MODE, first)
-    assert not acks.overtaken(MODE, later)
+    acks.add_transmission(MODE, first, 0.0)
+    assert not acks.is_overtaken(MODE, first)
+    acks.add_transmission(MODE, later, 0.1)
+    assert acks.is_overtaken(MODE, first)
+    assert not acks.is_overtaken(MODE, later)

@@ -71,7 +71,7 @@ class Bench:
         self.later(self.every_s, self._state)
 
     def _arrives(self, stamp: float) -> None:
-        if self.timing.sampled(round(stamp * 1e3) % (1 << 32), self.now) is not None:
+        if self.timing.take_position(round(stamp * 1e3) % (1 << 32), self.now) is not None:
             self._told_at = stamp
 
     def _probe(self) -> None:
@@ -81,9 +81,9 @@ class Bench:
             up = self.up()
             tc1 = round(self.clock(self.now + min(up, 1e6)) * 1e9)
             for _ in range(self.copies):
-                self.later(up + self.down(), lambda: self.timing.replied(tc1, number, self.now))
+                self.later(up + self.down(), lambda: self.timing.take_reply(tc1, number, self.now))
         elif number is not None and self.timing.unanswering:
-            self.later(self.up() + self.down(), lambda: self.timing.acknowledged(sent, self.now))
+            self.later(self.up() + self.down(), lambda: self.timing.take_acknowledgement(sent, self.now))
         self.later(PROBE_S, self._probe)
 
     def _judge(self) -> None:
@@ -233,19 +233,19 @@ def test_latency_is_measured_by_acknowledgements_without_timesync() -> None:
 def test_timesync_replies_to_others_and_duplicates_are_ignored() -> None:
     timing = Timing()
     for i in range(40):
-        timing.sampled(5000 + 50 * i, 1.0 + 0.05 * i)
+        timing.take_position(5000 + 50 * i, 1.0 + 0.05 * i)
     for foreign in (0, 1, 2**62, -1, 10**18):
-        timing.replied(10**9, foreign, 3.0)
+        timing.take_reply(10**9, foreign, 3.0)
     assert math.isinf(timing.latency_s(3.0))
     number = timing.request(3.0)
     assert number is not None
-    timing.replied(0, number, 3.02)
+    timing.take_reply(0, number, 3.02)
     assert math.isinf(timing.latency_s(3.02)), "a request of the vehicle's own"
     number = timing.request(3.04)
     assert number is not None
-    timing.replied(round(7.01e9), number, 3.06)
+    timing.take_reply(round(7.01e9), number, 3.06)
     measured = timing.delay_s
-    timing.replied(round(9.9e9), number, 3.5)
+    timing.take_reply(round(9.9e9), number, 3.5)
     assert timing.delay_s == measured
 
 
@@ -256,11 +256,11 @@ def test_repeated_command_after_gap_is_not_a_latency_sample() -> None:
     bench.up = bench.down = steady(math.inf)
     bench.fly(2.5)
     assert bench.timing.unanswering
-    bench.timing.acknowledged(sent, bench.now)
+    bench.timing.take_acknowledgement(sent, bench.now)
     assert bench.timing.delay_s < 0.1, "its answer comes before the first position"
     bench.up = bench.down = steady(0.02)
-    bench.timing.sampled(round(bench.clock(bench.now) * 1e3), bench.now + 0.02)
-    bench.timing.acknowledged(sent, bench.now + 0.03)
+    bench.timing.take_position(round(bench.clock(bench.now) * 1e3), bench.now + 0.02)
+    bench.timing.take_acknowledgement(sent, bench.now + 0.03)
     assert bench.timing.delay_s < 0.1
     bench.now += 0.03
     bench.fly(1)
@@ -272,7 +272,7 @@ def test_timesync_reply_with_another_clock_is_ignored() -> None:
     bench.fly(3)
     number = bench.timing.request(bench.now)
     assert number is not None
-    bench.timing.replied(1_790_000_000 * 10**9, number, bench.now + 0.04)
+    bench.timing.take_reply(1_790_000_000 * 10**9, number, bench.now + 0.04)
     assert bench.timing.unanswering
 
 
@@ -307,10 +307,10 @@ def test_vehicle_restart_resets_timing() -> None:
 def test_late_old_position_is_not_a_restart(stamps: tuple[int, ...], told: list[bool]) -> None:
     timing = Timing()
     for i in range(200):
-        timing.sampled(100_000 + 50 * i, 50.0 + 0.05 * i)
+        timing.take_position(100_000 + 50 * i, 50.0 + 0.05 * i)
     restarted = []
     for i, stamp in enumerate(stamps):
-        timing.sampled(stamp, 60.0 + 0.05 * i)
+        timing.take_position(stamp, 60.0 + 0.05 * i)
         restarted.append(timing.restarted)
     assert restarted == told
 
@@ -321,7 +321,7 @@ def test_restart_is_detected_from_replies_alone() -> None:
     for seconds, restarted in (1000, False), (1001, False), (998, False), (10, True), (11, True):
         number = bench.timing.request(bench.now)
         assert number is not None
-        bench.timing.replied(seconds * 10**9, number, bench.now)
+        bench.timing.take_reply(seconds * 10**9, number, bench.now)
         assert bench.timing.restarted is restarted
     bench.timing.reset()
     assert not bench.timing.restarted
@@ -363,21 +363,21 @@ def test_burst_after_stalled_connection_does_not_speed_up_clock(stall_s: float, 
 def test_delay_of_the_own_event_loop_is_included() -> None:
     timing = Timing()
     for i in range(60):
-        timing.sampled(5000 + 50 * i, 1.0 + 0.05 * i)
+        timing.take_position(5000 + 50 * i, 1.0 + 0.05 * i)
     number = timing.request(3.5)
     assert number is not None
     # It was due at 3.5, sent at 3.9 by a loop that was busy, and heard at once.
-    timing.replied(round((5.0 + 3.9 - 1.0) * 1e9), number, 3.95)
+    timing.take_reply(round((5.0 + 3.9 - 1.0) * 1e9), number, 3.95)
     assert timing.delay_s == pytest.approx(0.4, abs=0.01)
 
 
 def test_restarted_vehicle_is_detected_after_two_consistent_old_timestamps() -> None:
     timing = Timing()
     for number in range(100):
-        assert timing.sampled(60_000 + 50 * number, 1.0 + 0.05 * number) is not None
-    assert timing.sampled(30_000, 6.0) is None
-    assert timing.sampled(65_000, 6.0) is not None
+        assert timing.take_position(60_000 + 50 * number, 1.0 + 0.05 * number) is not None
+    assert timing.take_position(30_000, 6.0) is None
+    assert timing.take_position(65_000, 6.0) is not None
     assert not timing.restarted
-    assert timing.sampled(2_000, 6.05) is None
-    assert timing.sampled(2_050, 6.1) is not None
+    assert timing.take_position(2_000, 6.05) is None
+    assert timing.take_position(2_050, 6.1) is not None
     assert timing.restarted

@@ -120,7 +120,7 @@ class MobilitySettings:
     """Largest acceptance radius of a goto."""
 
     rejudge_after_s: float = 0.05
-    """Seconds of the vehicle's clock after which a waiting command is judged again from the present position.
+    """Seconds of the vehicle's clock after which a waiting command is judged again from the current position.
 
     At 15 m/s the drone moves 0.75 m in this time.
 """
@@ -192,7 +192,7 @@ class MobilitySettings:
     """Number of new routes that are searched after the monitor stopped the drone, under the same flight constraints."""
 
     max_legs: int = 60
-    """Number of legs after which a flight makes no progress, because every leg is planned again from the present position."""
+    """Number of legs after which a flight makes no progress, because every leg is planned again from the current position."""
 
     at_waypoint_m: float = 0.3
     """Distance within which the drone is at a waypoint. Waypoints keep more than this beyond the margin of legs."""

@@ -53,7 +53,7 @@ from fractus_services.mobility.autopilot import BEING_SET, Approach, Autopilot, 
 from fractus_services.mobility.settings import SETTINGS
 
 CORRECTION = "Correction"
-"""Kind of the motions by which the monitor leads a driver's drone back into its limits."""
+"""Kind of the motions with which the monitor flies a driver's drone back into its limits."""
 
 
 class ControlStore:
@@ -219,7 +219,7 @@ class ControlStore:
 
     @property
     def cruise_mps(self) -> float:
-        """Speed of legs that specify none: the driver's setting for its own legs, otherwise the vehicle's."""
+        """Default speed of legs: for legs of a driver its setting, otherwise the vehicle's parameter."""
         state = self._state
         corrects = state.motion is not None and state.motion.kind == CORRECTION
         if state.speed_mps is not None and state.authority is Authority.DRIVER and not corrects:

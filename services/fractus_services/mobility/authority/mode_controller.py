@@ -26,7 +26,7 @@ class ControlAccess(Protocol):
 
     @property
     def state(self) -> ControlState:
-        """The present state."""
+        """The current state."""
 
     def dispatch(self, event: Event) -> object:
         """Apply an event to the state."""

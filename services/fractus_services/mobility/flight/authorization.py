@@ -1,4 +1,4 @@
-"""Authorization of calls and of system flights: present situation, verdict, audit entry, throttling, and control of the drone."""
+"""Authorization of calls and of system flights: current situation, verdict, audit entry, throttling, and control of the drone."""
 
 from __future__ import annotations
 

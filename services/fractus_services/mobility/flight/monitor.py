@@ -38,7 +38,7 @@ Permits = Callable[[Motion | None], Permit]
 
 
 class MotionMonitor:
-    """Judges the present state of the flying drone and reacts to violations.
+    """Judges the current state of the flying drone and reacts to violations.
 
     Args:
         control: Control state.
@@ -195,7 +195,7 @@ class MotionMonitor:
         return returns and control.authority is Authority.SYSTEM
 
     def _take_back(self, verdict: Verdict) -> None:
-        """Stop the drone in GUIDED. The driver receives the reason, or the system searches a legal return."""
+        """Stop the drone in GUIDED. A driver receives the reason. A return flight continues on a legal route."""
         control = self._control
         state = control.state
         control.stop_motion(verdict)

@@ -206,7 +206,7 @@ class ReturnFlight:
         return now.lat is None or now.home is None
 
     def _straight_return_legal(self, grant: CompiledGrant) -> bool:
-        """Return True if the autopilot's own straight return is legal from the present position."""
+        """Return True if the autopilot's own straight return is legal from the current position."""
         now = self._gate.situation()
         if now.lat is None or now.lon is None or now.home is None:
             return True

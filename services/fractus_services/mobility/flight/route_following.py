@@ -119,7 +119,7 @@ class NextLeg:
 async def first_leg(
     goal: tuple[float, float], heights_m: Iterable[float], now: Situation, flight: SystemFlight
 ) -> tuple[GotoArgs, bool, float] | None:
-    """Return the first leg of the shortest legal route from the present position.
+    """Return the first leg of the shortest legal route from the current position.
 
     The search runs in slices between other tasks of the event loop. It restarts if the constraints change.
 
@@ -212,7 +212,7 @@ class RouteFollower:
 
         Args:
             flight: System flight.
-            search: Returns the next leg from the present position at rest; None at the target.
+            search: Returns the next leg from the current position at rest; None at the target.
         """
         replans = ReplanBudget(flight.constraints)
         while True:

@@ -256,14 +256,14 @@ class AutopilotLink:
         """Process a message of the vehicle."""
         at = self.now
         if incoming.name == "GLOBAL_POSITION_INT":
-            late_s = self.timing.sampled(incoming.integer("time_boot_ms"), at)
+            late_s = self.timing.take_position(incoming.integer("time_boot_ms"), at)
             if late_s is None or self._restarted():
                 return
             at -= late_s
         elif incoming.has("time_boot_ms"):
             at -= self.timing.age_s(incoming.integer("time_boot_ms"), at)
         elif incoming.name == "TIMESYNC":
-            self.timing.replied(incoming.integer("tc1"), incoming.integer("ts1"), at)
+            self.timing.take_reply(incoming.integer("tc1"), incoming.integer("ts1"), at)
             if self._restarted():
                 return
         self.vehicle.take(incoming, at)

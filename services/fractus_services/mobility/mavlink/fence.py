@@ -102,7 +102,7 @@ def _outline(whole: shapely.Geometry, vertices: int) -> shapely.Polygon:
 
 
 @dataclass(frozen=True, slots=True)
-class Owned:
+class OwnerFence:
     """The fence of the vehicle's owner.
 
     Attributes:
@@ -138,7 +138,7 @@ class MissionFence:
         self._parameters = autopilot.vehicle_parameters
         self._path = directory / "fence.json"
         self._lock = asyncio.Lock()
-        self._standing: tuple[FenceBounds, bool] | None = None
+        self._raised_bounds: tuple[FenceBounds, bool] | None = None
         self._compared_at = self._switched_at = -math.inf
         self.missing = ""
 
@@ -164,7 +164,7 @@ class MissionFence:
         if bounds is None:
             return
         async with self._lock:
-            if not await self._offered():
+            if not await self._is_supported():
                 return
             try:
                 await self._raise(spec, bounds, retraces)
@@ -196,9 +196,9 @@ class MissionFence:
             owned = await asyncio.to_thread(self._load)
             if owned is None or not owned.raised:
                 return ()
-            return await self._keep(owned)
+            return await self._revert_changes(owned)
 
-    async def _keep(self, owned: Owned) -> tuple[str, ...]:
+    async def _revert_changes(self, owned: OwnerFence) -> tuple[str, ...]:
         raised = owned.raised
         total = self._stack.fence_total
         changed = await self._set(raised) + await self._switch_on()
@@ -226,7 +226,7 @@ class MissionFence:
         self._switched_at = self._autopilot.now
         return ("the fence was disabled and is enabled again",)
 
-    async def _offered(self) -> bool:
+    async def _is_supported(self) -> bool:
         """Return True if the autopilot supports fences."""
         if await self._parameters.read([(self._stack.fence_switch,)]):
             self.missing = ""
@@ -247,9 +247,9 @@ class MissionFence:
         kept = owned.items if owned.parameters.get(switch, 0.0) else ()
         if self._autopilot.vehicle.armed:
             raise AutopilotError("the motors are running; the fence cannot be changed")
-        if self._standing == (bounds, retraces) and await self._stands(owned):
+        if self._raised_bounds == (bounds, retraces) and await self._is_raised(owned):
             return
-        self._standing = None
+        self._raised_bounds = None
         # ArduPilot reads the fence types only when the fence is enabled, so disable it first.
         try:
             await self._set({switch: 0.0})
@@ -260,7 +260,7 @@ class MissionFence:
             await self._set(values)
             total = await self._parameters.read([(self._stack.fence_total,)])
             await asyncio.to_thread(self._store, replace(owned, raised=values | total, mission_items=mission_items))
-            self._standing = bounds, retraces
+            self._raised_bounds = bounds, retraces
             self._compared_at = self._switched_at = self._autopilot.now
         except (AutopilotError, asyncio.CancelledError):
             await self._recover(owned)
@@ -291,18 +291,18 @@ class MissionFence:
                 return (*kept, *items)
         raise refused
 
-    async def _stands(self, owned: Owned) -> bool:
+    async def _is_raised(self, owned: OwnerFence) -> bool:
         """Return True if the fence is still raised as before. A repeated arming attempt then does not load it again."""
         try:
             self._compared_at = -math.inf
-            await self._keep(owned)
+            await self._revert_changes(owned)
         except AutopilotError as error:
             if error.link:
                 raise
             return False
         return True
 
-    async def _recover(self, owned: Owned) -> None:
+    async def _recover(self, owned: OwnerFence) -> None:
         """Try to restore the owner's fence after a failure. If that fails, `lower` tries again later."""
         try:
             async with asyncio.timeout(_RESTORE_TIMEOUT_S):
@@ -310,17 +310,17 @@ class MissionFence:
         except (AutopilotError, OSError) as error:
             log.warning("fence: owner's fence not restored yet (error=%s)", str(error) or "timeout")
 
-    async def _restore(self, owned: Owned) -> None:
-        self._standing = None
+    async def _restore(self, owned: OwnerFence) -> None:
+        self._raised_bounds = None
         await self._set({self._stack.fence_switch: 0.0})
         await self._write(owned.items)
         await self._set(owned.parameters)
         await asyncio.to_thread(self._path.unlink, True)
         log.info("fence: owner's fence restored")
 
-    async def _read(self) -> Owned:
+    async def _read(self) -> OwnerFence:
         parameters = await self._parameters.read([(name,) for name in self._stack.fence_parameters])
-        return Owned(parameters, await download(self._autopilot))
+        return OwnerFence(parameters, await download(self._autopilot))
 
     async def _write(self, items: Sequence[MissionItem]) -> None:
         await upload(self._autopilot, items)
@@ -349,7 +349,7 @@ class MissionFence:
             changed.append(f"{name} was {current.get(name, math.nan):g} and is {after:g}")
         return tuple(changed)
 
-    def _load(self) -> Owned | None:
+    def _load(self) -> OwnerFence | None:
         remove_temporary(self._path)
         try:
             stored = json.loads(self._path.read_bytes())
@@ -357,7 +357,7 @@ class MissionFence:
             mission_items = None
             if stored.get("mission_items") is not None:
                 mission_items = tuple(MissionItem(**item) for item in stored["mission_items"])
-            return Owned(dict(stored["parameters"]), items, stored.get("raised", {}), mission_items)
+            return OwnerFence(dict(stored["parameters"]), items, stored.get("raised", {}), mission_items)
         except FileNotFoundError:
             return None
         except (ValueError, KeyError, TypeError) as error:
@@ -366,7 +366,7 @@ class MissionFence:
             )
             return None
 
-    def _store(self, owned: Owned) -> None:
+    def _store(self, owned: OwnerFence) -> None:
         write_file(self._path, json.dumps(asdict(owned)).encode())
 
 

@@ -67,7 +67,7 @@ def attitude_of(status: Message, heading_deg: float) -> Attitude | None:
     pitch = math.asin(min(max(2 * (w * y - z * x) / norm**2, -1.0), 1.0))
     yaw = math.atan2(2 * (w * z + x * y), norm**2 - 2 * (y * y + z * z))
     if abs(math.degrees(pitch)) > 89.9:
-        # Pointing straight down or up, roll and yaw are the same angle.
+        # If the camera points straight up or down, roll and yaw are rotations about the same axis.
         roll = 0.0
         yaw = 2 * math.atan2(z, w)
     yaw_reference_deg = 0.0 if frames == mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_EARTH_FRAME else heading_deg

@@ -108,7 +108,7 @@ class Acknowledgements:
         answer_s = max(self._timing.answer_s, min(self._timing.silence_s(now), MAX_ACK_TIMEOUT_S))
         return max(ACK_TIMEOUT_S, answer_s + ACK_SLACK_S)
 
-    def sent(self, command: int, answer: Answer, now: float) -> None:
+    def add_transmission(self, command: int, answer: Answer, now: float) -> None:
         """Record that a command is being sent, for the first time or again.
 
         Args:
@@ -119,7 +119,7 @@ class Acknowledgements:
         self._sent.setdefault(command, deque(maxlen=MAX_UNACKNOWLEDGED)).append((now, answer))
         self._latest[command] = answer
 
-    def overtaken(self, command: int, answer: Answer) -> bool:
+    def is_overtaken(self, command: int, answer: Answer) -> bool:
         """Return True if a later command with the same id was sent."""
         return self._latest.get(command, answer) is not answer
 
@@ -138,7 +138,7 @@ class Acknowledgements:
             return
         sent_at, answer = transmissions.popleft()
         # The acknowledgement of an abandoned command measures the link as well.
-        self._timing.acknowledged(sent_at, now)
+        self._timing.take_acknowledgement(sent_at, now)
         if result == mavlink.MAV_RESULT_IN_PROGRESS:
             transmissions.appendleft((now, answer))  # the final acknowledgement follows
         elif answer.done():
@@ -163,12 +163,12 @@ class RecentSetpoints:
     def __init__(self) -> None:
         self._sent: deque[tuple[float, float, Velocity]] = deque(maxlen=MAX_SETPOINTS)
 
-    def fly(self, velocity: Velocity, now: float) -> None:
+    def add_velocity(self, velocity: Velocity, now: float) -> None:
         """Add a velocity setpoint that is being sent."""
         first = self._sent.pop()[0] if self._sent and self._sent[-1][2] == velocity else now
         self._sent.append((first, now, velocity))
 
-    def go_to(self, lat: float, lon: float, altitude_m: float, vehicle: VehicleState, now: float) -> None:
+    def add_leg(self, lat: float, lon: float, altitude_m: float, vehicle: VehicleState, now: float) -> None:
         """Add a leg from the vehicle's position to a point. The leg counts as a velocity of `LEG_MPS` towards the point."""
         if vehicle.lat is None or vehicle.lon is None:
             return
@@ -176,9 +176,9 @@ class RecentSetpoints:
         share = LEG_MPS / max(math.hypot(east, north), 1e-3)
         sink = vehicle.altitude_m - altitude_m
         down = math.copysign(LEG_MPS, sink) if abs(sink) > LEVEL_M else 0.0
-        self.fly((north * share, east * share, down), now)
+        self.add_velocity((north * share, east * share, down), now)
 
-    def since(self, earliest: float, measured: Velocity) -> tuple[Velocity, ...]:
+    def pending_since(self, earliest: float, measured: Velocity) -> tuple[Velocity, ...]:
         """Return the setpoints that the vehicle may still be reacting to, the latest last. Older ones are dropped.
 
         Setpoints sent after `earliest` always count. The setpoint that was in force at `earliest` counts if the vehicle still
@@ -186,7 +186,7 @@ class RecentSetpoints:
         does not continue in its measured direction.
 
         Args:
-            earliest: Time on the clock of `fly`.
+            earliest: Time on the clock of `add_velocity`.
             measured: The vehicle's measured velocity.
         """
         while len(self._sent) > 1 and self._sent[1][0] < earliest:
@@ -282,7 +282,7 @@ class MavlinkAutopilot(AutopilotLink):
         """
         vehicle = self.vehicle
         earliest = self.now - (self.latency_s + VELOCITY_HISTORY_S) / self.pace
-        return self._setpoints.since(earliest, (vehicle.north_mps, vehicle.east_mps, vehicle.down_mps))
+        return self._setpoints.pending_since(earliest, (vehicle.north_mps, vehicle.east_mps, vehicle.down_mps))
 
     @property
     def at_rest(self) -> bool:
@@ -348,7 +348,7 @@ class MavlinkAutopilot(AutopilotLink):
                 answer = Answer()
                 for attempt in range(attempts):
                     permit()
-                    if attempt and self._acknowledgements.overtaken(command, answer):
+                    if attempt and self._acknowledgements.is_overtaken(command, answer):
                         raise AutopilotError(
                             f"a later command {enum_name('MAV_CMD', command)} has overtaken an unanswered one",
                             link=True,
@@ -384,7 +384,7 @@ class MavlinkAutopilot(AutopilotLink):
             # COMMAND_INT has degrees times 1e7. The 32-bit floats of COMMAND_LONG would be off by metres.
             values |= {"frame": frame, "x": round(place[0] * 1e7), "y": round(place[1] * 1e7), "z": place[2]}
             outgoing = message("COMMAND_INT", **values)
-        self._acknowledgements.sent(command, answer, self.now)
+        self._acknowledgements.add_transmission(command, answer, self.now)
         self.send(outgoing)
         if not answer.done():
             await asyncio.wait([answer], timeout=self._acknowledgements.timeout_s)
@@ -453,7 +453,7 @@ class MavlinkAutopilot(AutopilotLink):
 
         def record_setpoint() -> None:
             permit()
-            self._setpoints.go_to(lat, lon, altitude_m, self.vehicle, self.now)
+            self._setpoints.add_leg(lat, lon, altitude_m, self.vehicle, self.now)
 
         await self.command(
             mavlink.MAV_CMD_DO_REPOSITION, -1, 0, 0, yaw, place=(lat, lon, altitude_m), permit=record_setpoint
@@ -482,7 +482,7 @@ class MavlinkAutopilot(AutopilotLink):
         if not self.found:
             return
         with tracing.child_span("autopilot.SET_POSITION_TARGET_LOCAL_NED"):
-            self._setpoints.fly((north_mps, east_mps, down_mps), self.now)
+            self._setpoints.add_velocity((north_mps, east_mps, down_mps), self.now)
             self.send(
                 message(
                     "SET_POSITION_TARGET_LOCAL_NED",

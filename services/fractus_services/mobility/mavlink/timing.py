@@ -85,7 +85,7 @@ class Timing:
         self.restarted = False
         self._restart_boot_ms: int | None = None
 
-    def sampled(self, boot_ms: int, now: float) -> float | None:
+    def take_position(self, boot_ms: int, now: float) -> float | None:
         """Process the time stamp of a position.
 
         Args:
@@ -182,7 +182,7 @@ class Timing:
         self._unanswered += 1
         return number
 
-    def replied(self, tc1_ns: int, ts1: int, now: float) -> None:
+    def take_reply(self, tc1_ns: int, ts1: int, now: float) -> None:
         """Process a TIMESYNC message. Only the first reply to a request of this station counts."""
         request = self._open_requests.pop(ts1, None) if tc1_ns != 0 else None
         if request is None or not self._samples:
@@ -195,9 +195,9 @@ class Timing:
         if -_SLACK_S <= delay_s <= self.pace * (now - sent) + _SLACK_S:
             self._unanswered = 0
             self._latest_answered_sent = max(self._latest_answered_sent, sent)
-            self._take(max(delay_s, 0.0), sent, now)
+            self._add_delay(max(delay_s, 0.0), sent, now)
 
-    def acknowledged(self, sent: float, now: float) -> None:
+    def take_acknowledgement(self, sent: float, now: float) -> None:
         """Process the acknowledgement of a command.
 
         If the vehicle does not answer TIMESYNC, the round trip of the command is the bound. A command that was repeated until the link
@@ -205,14 +205,14 @@ class Timing:
         """
         resumed = sent >= self._resumed_at and now - self._arrived_at <= MAX_POSITION_AGE_S
         if self.unanswering and resumed:
-            self._take(self.pace * (now - sent), sent, now)
+            self._add_delay(self.pace * (now - sent), sent, now)
 
     @property
     def unanswering(self) -> bool:
         """True if the vehicle does not answer TIMESYNC."""
         return self._unanswered >= UNANSWERED
 
-    def _take(self, delay_s: float, sent: float, now: float) -> None:
+    def _add_delay(self, delay_s: float, sent: float, now: float) -> None:
         self._measured_at = now
         self._delays.append((now, delay_s, now - sent))
         while self._delays[0][0] < now - WINDOW_S:

@@ -14,7 +14,7 @@ from fractus_services.service_metrics import telemetry_age
 
 
 def flight_metrics(control: ControlStore, supervisor: Supervisor) -> Iterator[Metric]:
-    """Yield the present metrics of the drone."""
+    """Yield the current metrics of the drone."""
     autopilot = control.autopilot
     vehicle = autopilot.vehicle
     yield telemetry_age(max(autopilot.now - vehicle.position_at, 0.0))

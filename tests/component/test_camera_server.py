@@ -47,7 +47,7 @@ async def test_image_store_is_kept_when_the_node_description_changes(
     manifest = '{"apiVersion": "fractus.dev/v1alpha1", "kind": "EdgeNode", "metadata": {"name": "n"}, "spec": {"location": %s}}'
     async with asyncio.timeout(30):
         for lat in (50.0, 51.0):
-            await logged(caplog, "field of view not described")
+            await logged(caplog, "field of view unknown")
             caplog.clear()
             node.write_text(manifest % f'{{"lat": {lat}, "lon": 8.0}}')
         await logged(caplog, "described=True")

@@ -13,7 +13,7 @@ from fractus_services.errors import InvalidRequest
 MIN_PX = 16
 MAX_PX = 8192
 MIN_ALLOWED_PIXELS = 8_300_000
-"""Number of pixels that any camera may be asked for, even if its own resolution is lower."""
+"""Number of pixels before cropping that every request may have, even if the resolution of the camera is lower."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,7 +25,7 @@ class CameraProperties:
         model: Make and model, or an empty string.
         sensor: Spectral band.
         fixed: True if the camera does not move.
-        pinhole: True if the description has a pinhole lens, so that the field of view gives the focal length.
+        pinhole: True if the description has a pinhole lens. The focal length then follows from the field of view.
     """
 
     resolution: tuple[int, int] = (1280, 720)
@@ -62,7 +62,7 @@ class CameraProperties:
         native = self.resolution
         source = self.source_size(width, height)
         limit = max(native[0] * native[1], MIN_ALLOWED_PIXELS)
-        # Allow one per cent more, because sizes are rounded up to whole pixels.
+        # Allow 1 % more, because sizes are rounded to whole pixels.
         if source[0] * source[1] > limit * 1.01:
             raise InvalidRequest(
                 "InvalidArgument",

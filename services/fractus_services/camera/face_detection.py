@@ -24,18 +24,18 @@ Box = tuple[int, int, int, int]
 FACE_WIDTH_M = 0.13
 """Width of a child's face, the narrowest face that must be detected."""
 DEFAULT_MIN_PX = 48
-"""Face width from which the cascades are as reliable as `bench/faces.py` shows."""
+"""Face width, in pixels, from which the cascades are reliable. `bench/faces.py` measures it."""
 _REDUCED_FACE_PX = 28
-"""Images are reduced until the smallest relevant face has this width. The cascades were trained with 20 pixels, and more
-pixels only take more time."""
+"""Images are reduced until the smallest face that they may show has this width. The cascades were trained with faces of 20 pixels,
+so larger images only take more time."""
 _MIN_WINDOW_PX = 20
 _SCALE_STEP = 1.1
 _PROFILE_SCALE_STEP = 1.2
 """Ratio between consecutive face sizes of the search. It is larger for the profile cascade, which is slow."""
 _ANGLES_DEG = tuple(range(0, 360, 30))
 _EQUALISED_ANGLES_DEG = tuple(range(15, 360, 30))
-"""Rotations at which faces are searched. The first are applied to the original image, those in between to an image with
-equalised contrast, so that each face is searched under two conditions."""
+"""Rotations at which faces are searched, in the original image and in an image with equalised contrast. The angles alternate, so
+that each face is searched in both images."""
 _UPRIGHT_ANGLES_DEG = (0, -30, 30)
 _EQUALISED_UPRIGHT_ANGLES_DEG = (0, -15, 15)
 
@@ -86,7 +86,7 @@ class CascadeDetector:
     """Viola-Jones cascades that OpenCV 4 ships: frontal and profile faces, also rotated and mirrored.
 
     Args:
-        min_px: Face width from which the user trusts the cascades, in pixels.
+        min_px: Face width from which detection counts as reliable, in pixels.
     """
 
     name = "cascades"
@@ -144,7 +144,7 @@ class ModelDetector:
 
     Args:
         path: File of the model.
-        min_px: Face width from which the user trusts the model, in pixels.
+        min_px: Face width from which detection counts as reliable, in pixels.
         score: Minimum score of a detection.
 
     Raises:

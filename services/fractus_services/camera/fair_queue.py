@@ -1,4 +1,4 @@
-"""Round-robin lock: requests of one owner do not delay the requests of others."""
+"""Lock that is granted round-robin, so that many requests of one owner do not delay the requests of others."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ class FairQueue:
         try:
             await turn
         except asyncio.CancelledError:
-            # The turn may have been granted just before the cancellation. Pass it on, because it would be lost otherwise.
+            # If the turn was granted just before the cancellation, grant it to the next request. Otherwise the queue would stop.
             if turn.done() and not turn.cancelled():
                 self._release(owner)
             raise

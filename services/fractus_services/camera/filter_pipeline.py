@@ -1,4 +1,4 @@
-"""Filter pipeline: selects the filters that are reliable for an image, and applies them irreversibly."""
+"""Filter pipeline: selects the filters that are reliable for an image, and applies them. Filtered images cannot be restored."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from fractus_services.camera.motion_detection import Mask, detect_motion
 from fractus_services.camera.pixels import Pixels, resize
 
 BLUR_CELLS = 16
-"""Number of averages along the longer side of a blurred image. A face that fills its height is nine cells wide, too few for
-people or programs to recognise anyone."""
+"""Number of averages along the longer side of a blurred image. A face that fills the height of
+the image is nine cells wide, which is too few to recognise a person."""
 FACE_CELLS = 4
 """Number of colours across a hidden face."""
 FACE_MARGIN = 0.35
@@ -37,7 +37,7 @@ class FilterPlan:
 
     Attributes:
         filters: Filters in order of application. None of them relies on an unreliable face detector.
-        note: Reason why a fallback filter is among them, or an empty string.
+        note: Reason why a fallback filter is used, or an empty string.
     """
 
     filters: tuple[Filter, ...]
@@ -45,10 +45,10 @@ class FilterPlan:
 
 
 def plan_filters(required: tuple[Filter, ...], face_px: float, detector: FaceDetector) -> FilterPlan:
-    """Select the filters that reliably do what policies require.
+    """Select filters that reliably fulfil the requirements of policies.
 
-    A detector misses faces that are too small for it, and each missed face is a failure of privacy. If the image may show
-    faces below the reliable size, the detector is not used. The policy's fallback filter hides everything instead.
+    A detector misses faces that are too small, and each missed face violates privacy. If the image may show faces below the
+    reliable size, the fallback filter of the policy replaces face detection.
 
     Args:
         required: Filters that policies require.

@@ -40,7 +40,7 @@ class ImageAuthorizer:
             call: Method and arguments.
             grant: Grant of the caller.
             situation: Situation of the camera.
-            record: True to record a verdict that permits, False if the call was recorded before. Denials are always recorded.
+            record: False if the call was recorded before. A verdict that permits is then not recorded. Denials are always recorded.
 
         Raises:
             Refused: The call is denied, or the engine failed.
@@ -55,7 +55,7 @@ class ImageAuthorizer:
         return self.enforce(call, grant, verdict, situation, record=record)
 
     def authorize_view(self, call: Call, grant: ActiveGrant, seen: Situation) -> Verdict:
-        """Judge the view of the camera in a situation by privacy policies and by policies that deny the method.
+        """Judge the view of the camera by privacy policies and by policies that deny the method.
 
         Raises:
             Refused: No image of this view may be taken or returned.

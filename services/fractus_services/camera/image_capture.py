@@ -31,7 +31,7 @@ from fractus_services.camera.shutter import Shutter
 from fractus_services.grant_files import ActiveGrant
 
 _ROUNDING_PX = 2
-"""Maximum difference between the full view and the requested size that is due to rounding, in pixels."""
+"""Maximum difference, in pixels, between the full view and a requested size of the same aspect ratio, caused by rounding."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +42,7 @@ class _Exposure:
         name: Name of the image.
         grant: Grant by which the exposure was authorized.
         verdict: Verdict with the required filters.
-        recorded: Verdict before the exposure, which the audit log contains.
+        recorded: Verdict before the exposure. The audit log contains it.
         after: Situation at the end of the exposure, with all situations during the exposure.
         frames: Frames of the camera.
         view_width_px: Width of the full view, in pixels that the camera returned.
@@ -67,12 +67,12 @@ class ImageCapture:
         shutter: Camera thread.
         camera: Properties of the camera.
         detector: Face detector.
-        filter_queue: Turns for filtering, shared with `StoredImages`.
-        capture_queue: Turns for the camera.
+        filter_queue: Queue of requests that filter an image, shared with `StoredImages`.
+        capture_queue: Queue of requests that use the camera.
         store: Image store.
         authorizer: Policy decisions.
         clock: Returns Unix time.
-        motion_frame_interval_s: Interval between the frames that motion detection compares, in seconds.
+        motion_frame_interval_s: Interval between the three frames for motion detection, in seconds.
     """
 
     def __init__(
@@ -107,13 +107,13 @@ class ImageCapture:
     ) -> tuple[Verdict, ImageRecord]:
         """Take an image and store it.
 
-        The call is authorized when the camera is free, and again after the exposure with everything that the camera may have
-        seen, because the drone moves and Grants change in the meantime.
+        The call is authorized when the camera is free. It is authorized again after the exposure with everything that the camera
+        may have seen, because the drone moves and Grants may change in the meantime.
 
         Args:
             grant: Grant of the caller.
             args: Size in pixels. 0 means the camera's own size.
-            current_grant: Returns the caller's current Grant, or raises if the caller has none any more.
+            current_grant: Returns the current Grant of the caller, or raises an exception if the Grant was removed.
 
         Raises:
             Refused: The call is invalid or denied, or no image could be taken.
@@ -134,7 +134,7 @@ class ImageCapture:
                 return await self._filter_and_store(args, exposure)
             async with self._filter_queue.turn(owner):
                 return await self._filter_and_store(args, exposure)
-        # Wait for the filter turn before the exposure, so that no image waits in memory for its filters.
+        # Wait for the filter queue before the exposure, so that no image waits in memory for its filters.
         async with self._filter_queue.turn(owner):
             return await self._filter_and_store(args, await self._expose(owner, args, current_grant))
 
@@ -152,7 +152,7 @@ class ImageCapture:
             with tracing.child_span("camera.capture"):
                 frames = await self._take_frames(args, grant, before, recorded)
             if before.lens is not None:
-                # Policies judge a view of the described aspect ratio, so crop frames of another one.
+                # Crop frames to the described aspect ratio, because policies judge the view with this ratio.
                 frames = [crop_to_aspect_ratio(frame, *self._camera.resolution) for frame in frames]
             situations = self._poses.situations_since(start_s, self._clock())
             grant = current_grant()
@@ -175,8 +175,8 @@ class ImageCapture:
     def _authorize_exposure(self, call: Call, grant: ActiveGrant, before: Situation, after: Situation) -> list[Verdict]:
         """Return the verdicts on everything that the camera may have seen, at each possible time of the exposure.
 
-        Policies have schedules. A zone counts if it was active at the start of the call, or is active now, or was active when a
-        camera with latency may have taken the image.
+        Zones have schedules. A zone applies if it was active at the start of the call, is active now, or was active when a camera
+        with latency may have taken the image.
         """
         verdicts = [
             self._authorizer.authorize(call, grant, situation, record=False)
@@ -206,7 +206,7 @@ class ImageCapture:
         full_size = camera.source_size(args.width, args.height)
 
         def render() -> bytes:
-            # Filter the full view: callers could request parts of it that cut each face in two, which no detector detects.
+            # Filter the full view before cropping. Otherwise callers could request parts that show half faces, which are not detected.
             sized = _resize_frames(frames, *(full_size if plan.filters else requested_size))
             frames.clear()
             upright = is_upright(poses)
@@ -215,14 +215,14 @@ class ImageCapture:
             if verdict.filters:
                 # The metadata of a filtered image would disclose where it was taken.
                 return data
-            # For lenses other than a pinhole, the pose contains an upper bound of the field of view.
+            # For other lenses than a pinhole, the pose contains an upper bound of the field of view, which gives no focal length.
             view_px = full_size[0] if camera.pinhole else None
             return with_metadata(data, poses[-1], time_s=time_s, camera=camera.model, view_width_px=view_px)
 
         with tracing.child_span("camera.filters") as span:
             span.set_attribute("fractus.filters", [planned.action for planned in plan.filters])
             data = await asyncio.to_thread(render)
-        # A part of the view may show cut faces, which are not detected if they have to be hidden later.
+        # A part of the view may show cut faces, which could not be detected if a later policy requires filtering.
         uncut = max(full_size[0] - requested_size[0], full_size[1] - requested_size[1]) <= _ROUNDING_PX
         record = ImageRecord(
             exposure.name,

@@ -1,4 +1,4 @@
-"""Images on disk, one directory for each component instance, with the records by which they are authorized again."""
+"""Images on disk with their records. Each component instance has a directory. A record suffices to authorize its image later."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ log = logging.getLogger(__name__)
 
 DIRECTORY_MODE = 0o700
 FILE_MODE = 0o600
-"""Modes without access for other users of the node. Images and records, filtered or not, disclose where someone was."""
+"""Modes that deny access to other users of the node, because images and records disclose where someone was."""
 
 _NAME = re.compile(r"[0-9]{17}-[0-9]{4}\.jpg")
 _DIRECTORY = re.compile(r"[0-9a-f]{32}")
@@ -64,7 +64,7 @@ class ImageRecord:
         poses: Poses of the camera from the start to the end of the exposure.
         face_px: Width of the smallest face that the image may show, in pixels, or 0 if it is unknown.
         filters: Filters that were applied.
-        whole: True if the image shows the full view of the camera. A part may show cut faces, so their size is unknown.
+        whole: True if the image shows the full view of the camera. A part of the view may show cut faces, so `face_px` is then 0.
     """
 
     name: str
@@ -83,7 +83,7 @@ class ImageRecord:
 
     @classmethod
     def from_json(cls, body: dict[str, Any]) -> ImageRecord:
-        """Parse a record. The position of a record without poses, of an earlier release, is unknown.
+        """Parse a record. Records of an earlier release may have no poses. Their position is unknown.
 
         Raises:
             ValueError: The record is invalid.
@@ -109,7 +109,7 @@ class ImageRecord:
 
 
 def owner_of(grant: ActiveGrant) -> str:
-    """Return the owner of a Grant's images: a component instance of this application, not of a later one of the same name."""
+    """Return the owner of the images taken under a Grant. The uid distinguishes applications that use the same name in turn."""
     return f"{grant.spec.application.uid}/{grant.identity}"
 
 
@@ -121,7 +121,7 @@ class ImageStore:
         keep: Maximum number of images of an owner.
         keep_bytes: Maximum size of the images of an owner, in bytes.
         keep_total_bytes: Maximum size of all images, in bytes. Images of owners without a Grant are removed to stay below it.
-        owners: Returns the owners that currently have a Grant.
+        owners: Returns the owners that have a Grant now.
         on_added: Callback invoked with the time (Unix seconds) and the data of each new image, from any thread.
     """
 
@@ -201,8 +201,7 @@ class ImageStore:
         """Return the record of an image.
 
         Raises:
-            NoSuchImage: The image does not exist, or its record is damaged. It is then unknown what the image shows, so that no
-                policy can be applied.
+            NoSuchImage: The image does not exist, or its record is damaged. Without a record, policies cannot be applied.
         """
         path = self._record_path(owner, name)
         try:
@@ -232,7 +231,7 @@ class ImageStore:
         """
         record_path = self._record_path(owner, name)
         try:
-            # Delete the record first: an image without a record is never returned, even if the process ends in between.
+            # Delete the record first. If the process ends now, the image has no record and is never returned.
             record_path.unlink()
         except FileNotFoundError:
             raise _not_found(name) from None
@@ -256,15 +255,15 @@ class ImageStore:
 
     def _restrict_modes(self) -> None:
         """Remove access for other users from directories and files of an earlier release."""
-        # The state directory may contain other directories than those of owners.
+        # The state directory may also contain directories that do not belong to owners.
         directories = [path for path in self._directory.glob("*") if _DIRECTORY.fullmatch(path.name)]
         for path in (entry for directory in directories for entry in (directory, *directory.glob("*"))):
             try:
                 mode = path.lstat().st_mode
-                wanted = DIRECTORY_MODE if stat.S_ISDIR(mode) else FILE_MODE
+                required = DIRECTORY_MODE if stat.S_ISDIR(mode) else FILE_MODE
                 # Skip symbolic links, because chmod would follow them to other files.
-                if not stat.S_ISLNK(mode) and stat.S_IMODE(mode) != wanted:
-                    path.chmod(wanted)
+                if not stat.S_ISLNK(mode) and stat.S_IMODE(mode) != required:
+                    path.chmod(required)
             except OSError as error:
                 log.critical(
                     "images: cannot restrict access, other users may read this file; run chmod (path=%s error=%s)",

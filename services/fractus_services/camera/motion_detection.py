@@ -14,14 +14,14 @@ Mask = npt.NDArray[np.bool_]
 MAX_MOTION_WIDTH_PX = 1280
 """Images are reduced to this width before motion is detected."""
 MOTION_THRESHOLD = 25
-"""Difference between two frames, of 255 levels, that counts as motion."""
+"""Difference between two frames that counts as motion. Pixel values are 0 to 255."""
 MAX_MOTION_SHARE = 0.5
 """Maximum share of the image that may move. A larger share means that the estimate of the camera's own motion is wrong."""
 _MIN_LEVEL = 16
 _MAX_LEVEL = 250
-"""Range of pixel values that show a change of exposure. Darker pixels are noise, and brighter pixels may be saturated."""
+"""Range of pixel values from which the exposure ratio is estimated. Darker pixels are noisy, and brighter pixels may be saturated."""
 _MAX_EXPOSURE_RATIO = 2.0
-"""Maximum change of exposure between frames. Beyond it, the camera's response curve looks like motion."""
+"""Maximum ratio of exposure between frames. With a larger ratio, the nonlinear response of the camera would appear as motion."""
 _FEATURES = 1500
 _MIN_MATCHES = 25
 
@@ -73,7 +73,7 @@ def _align_and_compare(other: Pixels, picture: Pixels, fixed: bool) -> Mask | No
         aligned = _compare(cv2.warpPerspective(other, matrix, size), visible, picture)
     if not fixed:
         return aligned
-    # A mast sways in the wind, which moves the edges of standing objects by some pixels. An object counts as moving only if
+    # A mast that sways in the wind moves the edges of still objects by some pixels. An object counts as moving only if
     # the frames differ both with and without alignment.
     unaligned = _compare(other, everywhere, picture)
     if aligned is None or unaligned is None:
@@ -95,7 +95,7 @@ def _compare(other: Pixels, visible: npt.NDArray[np.uint8], picture: Pixels) -> 
 def _match_exposure(first: Pixels, second: Pixels, visible: Mask) -> tuple[Pixels, Pixels] | None:
     """Reduce two aligned frames to the exposure of the darker one, for each colour channel.
 
-    A camera that adapts its exposure or white balance between two frames changes all pixels, also those of standing
+    A camera that adapts its exposure or white balance between two frames changes all pixels, including pixels of still
     objects. If the brighter frame is saturated, the darker frame is clipped at the same level.
 
     Returns:

@@ -17,7 +17,7 @@ JPEG_QUALITY = 90
 MAX_PIXELS = 50_000_000
 MAX_BYTES = 64_000_000
 FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP")
-"""Formats that are decoded. Pillow's other decoders stay unreachable, because untrusted data could exploit them."""
+"""Formats that are decoded. Other decoders of Pillow are excluded, because untrusted data could exploit them."""
 
 
 class InvalidImage(PreconditionFailed):

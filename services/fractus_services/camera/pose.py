@@ -16,8 +16,9 @@ SURVEY_ERROR_M = 0.5
 """Error of a position that was surveyed when the camera was mounted."""
 _MIN_UPRIGHT_PITCH_DEG = -45.0
 _MAX_UPRIGHT_ROLL_DEG = 15.0
-"""Limits within which people count as upright in an image. Faces are then searched at rotations of up to 30 degrees: 15 for the
-camera's roll, and the rest for the tilt of heads. A camera that looks down more steeply shows people in any direction."""
+"""Limits of the camera's attitude within which people count as upright in an image. Faces are then searched at rotations of up to
+30 degrees: 15 degrees for the camera's roll, and 15 degrees for tilted heads. If the camera looks down more steeply, people may
+appear in any direction."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,12 +63,12 @@ def camera_orientation(pose: Pose) -> tuple[float | None, float | None, float | 
     if lens is None:
         return None, None, None
     if attitude is None:
-        # A gimbal keeps roll and pitch at any attitude of the airframe. Only its yaw is unknown.
+        # A gimbal keeps roll and pitch constant. Only the yaw depends on the unknown attitude of the airframe.
         return (0.0, lens.pitch_deg, None) if lens.stabilised else (None, None, None)
     axis, right, up = camera_axes(lens, attitude)
     pitch = math.asin(max(-1.0, min(1.0, -axis[2])))
     if abs(pitch) > math.radians(89.9):
-        # The top of the image shows ahead if the camera looks straight down, and behind if it looks straight up.
+        # If the camera looks straight down, the top of the image is ahead. If it looks straight up, the top is behind.
         sign = -1.0 if pitch > 0 else 1.0
         return 0.0, math.degrees(pitch), math.degrees(math.atan2(sign * up[1], sign * up[0])) % 360
     roll = math.atan2(right[2], -up[2])

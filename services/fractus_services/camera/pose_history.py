@@ -1,7 +1,7 @@
 """Poses of a drone's camera during the last seconds, with errors that cover all motion between two measurements.
 
-An image is judged by everything that the camera may have seen while the image was taken. The error of each pose is a budget:
-the error of the autopilot's estimate, plus the distance and angle that the airframe can move between measurements.
+Policies judge an image by everything that the camera may have seen while the image was taken. The error of each pose is the error
+of the autopilot's estimate, plus the distance and angle by which the airframe can move between measurements.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ HISTORY_S = 30.0
 ALTITUDE_ERROR_M = 1.0
 TILT_ERROR_DEG = 5.0
 YAW_ERROR_DEG = 15.0
-"""Bounds of an autopilot's attitude errors: roll and pitch together, and the compass."""
+"""Bounds of the autopilot's errors: altitude, roll and pitch together, and yaw."""
 MAX_TURN_DEG_S = 60.0
 MAX_ACCELERATION_MPS2 = 5.0
 """Maximum turn rate and acceleration of a multicopter between two measurements."""
 MAX_GIMBAL_TURN_DEG_S = 120.0
-"""Maximum turn rate of a gimbal beyond the rotation between two measurements. The yaw of the airframe is added."""
+"""Maximum turn rate of a gimbal beyond the measured rotation between two measurements. The yaw rate of the airframe is added."""
 
 _LEVEL = Attitude(0.0, 0.0, 0.0)
 _FORWARD_CAMERA = Lens(1.0, 1.0, pitch_deg=0.0)
@@ -39,9 +39,9 @@ class Measurement:
     Attributes:
         received_at: Time of arrival.
         position_at: Time at which the position was measured.
-        attitude_at: Time at which the attitude was measured: of the airframe, or of the gimbal that turns the camera.
-        situation: Measured state. `position_error_m` is the error of the position alone, the attitude has no errors yet, and
-            `lat` is None if the position is unknown.
+        attitude_at: Time at which the attitude of the airframe, or of the gimbal that turns the camera, was measured.
+        situation: Measured state. `position_error_m` is the error that the mobility service reports. The attitude errors are
+            not set yet. `lat` is None if the position is unknown.
     """
 
     received_at: float
@@ -79,7 +79,7 @@ class _Gap:
         attitude = measurement.situation.attitude or _LEVEL
         other = neighbour.situation.attitude or _LEVEL
         if gimbal:
-            # Gimbals point nearly straight down, where roll and yaw are not well-defined separately.
+            # Use the entire rotation, because roll and yaw of a gimbal that points nearly straight down are not well-defined.
             tilt_deg = _rotation_deg(attitude, other)
             yaw_deg = 0.0
         else:
@@ -147,13 +147,13 @@ class PoseHistory:
     def situations_since(self, start_s: float, time_s: float) -> tuple[Situation, ...]:
         """See `PoseProvider`.
 
-        The errors of each pose cover half of the time to the neighbouring measurements. The drone had this pose at most that
-        long before or after, and was rotated from it by at most half of the difference between the two poses plus the rotation
-        that `MAX_TURN_DEG_S` allows. The poses together cover all motion between measurements.
+        The errors of each pose cover the motion during half of the time to the neighbouring measurements. In this time, the
+        rotation from the pose is at most half of the difference between the two poses, plus the rotation that `MAX_TURN_DEG_S`
+        allows. The poses together cover all motion between measurements.
         """
         measurements = list(self._measurements)
         first = next((i for i in reversed(range(len(measurements))) if measurements[i].received_at <= start_s), None)
-        # The view before the first measurement is unknown, and counts as seeing everything.
+        # The view before the first measurement is unknown. Policies assume that the camera sees everything.
         situations = [self._unknown(time_s)] if first is None else []
         measurements = measurements[first or 0 :]
         for i, measurement in enumerate(measurements):

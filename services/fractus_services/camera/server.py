@@ -63,7 +63,7 @@ def create_detector(settings: CameraSettings) -> FaceDetector:
 
 @dataclass(slots=True)
 class _PoseMetrics:
-    """Telemetry age of a drone's camera. It has no value for a camera that does not move."""
+    """Metric of the telemetry age. It has no value for a camera that does not move."""
 
     history: PoseHistory | None = None
 
@@ -74,9 +74,9 @@ class _PoseMetrics:
 
 @dataclass(frozen=True, slots=True)
 class _Components:
-    """Components that stay when the node description changes.
+    """Components that are not created again when the node description changes.
 
-    The image store must not be created twice: a second one would remove files that the first one is still writing.
+    A second image store would remove files that the first one is still writing.
     """
 
     settings: CameraSettings
@@ -146,7 +146,9 @@ async def _serve(components: _Components, description: NodeDescription, stop: as
     fixed = isinstance(description.value, EdgeNode)
     missing = camera.unknown_view(fixed) if camera is not None else "services.camera"
     if missing:
-        log.warning("camera: field of view not described, the camera counts as seeing everything (missing=%s)", missing)
+        log.warning(
+            "camera: field of view unknown, policies assume that the camera sees everything (missing=%s)", missing
+        )
     connection = settings.camera or (camera.connection if camera is not None else "test:")
     shutter = Shutter(create_driver(connection), settings.capture_timeout_s)
     ended = asyncio.Event()

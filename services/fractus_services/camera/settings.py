@@ -17,16 +17,16 @@ class CameraSettings(ServiceOptions):
         keep: Maximum number of images stored for each component instance.
         keep_mb: Maximum size of the images stored for each component instance, in megabytes.
         keep_total_mb: Maximum size of all stored images, in megabytes.
-        camera: Camera connection, such as `v4l2:/dev/video0`. None uses the node description.
+        camera: Camera connection, such as `v4l2:/dev/video0`. None uses the connection in the node description.
         face_model: YuNet face detection model (ONNX). None uses OpenCV's cascades.
         face_px: Width from which faces are detected reliably, in pixels.
-        relief: Maximum depth of the surrounding ground below home, in metres.
+        relief: Maximum depth of the surrounding ground below home, in metres. It limits the area that an image may show.
         capture_timeout_s: Time after which a camera that has returned no image counts as failed, in seconds.
-        motion_frame_interval_s: Interval between the frames that motion detection compares, in seconds.
+        motion_frame_interval_s: Interval between the three frames for motion detection, in seconds.
         max_requests_per_instance: Requests of one component instance that may wait or be served, in each queue.
-        max_captures: Captures of all component instances that may wait or be under way.
+        max_captures: Captures of all component instances that may wait or run.
         max_filtering: Filter jobs of all component instances that may wait or run. Each takes tens of megabytes of memory.
-        max_unrecorded_images: Images that may wait for the recorder, each of about a megabyte.
+        max_unrecorded_images: Images that may wait for the recorder. Each takes about a megabyte of memory.
         telemetry_interval_s: Requested interval between telemetry messages, in seconds.
         telemetry_retry_s: Delay before the telemetry subscription is renewed after a failure, in seconds.
     """

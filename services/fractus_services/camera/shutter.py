@@ -39,7 +39,7 @@ class Shutter:
         """Take one or several frames. All but the middle frame are reduced to the width that motion detection needs.
 
         Args:
-            request: Size and circumstances of the image.
+            request: Request for the image.
             count: Number of frames.
             interval_s: Interval between frames, in seconds.
 
@@ -89,7 +89,7 @@ class Shutter:
                     time.sleep(interval_s)
                 picture = self._driver.capture(request)
                 pictures.append(picture if i == count // 2 else limit_width(picture, MAX_MOTION_WIDTH_PX))
-        except Exception as error:  # A driver may raise anything. The caller of `expose` receives it.
+        except Exception as error:  # A driver may raise any exception. The caller of `expose` receives it.
             failure = error
         self._busy_since_s = None
         if not loop.is_closed():

@@ -30,7 +30,7 @@ class StoredImages:
         poses: Poses of the camera.
         store: Image store.
         detector: Face detector.
-        filter_queue: Turns for filtering, shared with `ImageCapture`.
+        filter_queue: Queue of requests that filter an image, shared with `ImageCapture`.
         authorizer: Policy decisions.
         clock: Returns Unix time.
     """
@@ -58,15 +58,15 @@ class StoredImages:
     ) -> tuple[Verdict, ImageRecord, bytes | Path]:
         """Return an image under the policies that apply where it was taken and where the camera is now.
 
-        The image is authorized again after filtering, because it may wait for other images.
+        The image is authorized again after filtering, because filtering may wait for other images.
 
         Args:
             grant: Grant of the caller.
             name: Name of the image.
-            current_grant: Returns the caller's current Grant, or raises if the caller has none any more.
+            current_grant: Returns the current Grant of the caller, or raises an exception if the Grant was removed.
 
         Returns:
-            The verdict, the record, and the image: the file, or the bytes if filters were applied.
+            The verdict, the record and the image. The image is a file, or bytes if filters were applied now.
 
         Raises:
             Refused: The call is denied, or the image does not exist.
@@ -81,7 +81,7 @@ class StoredImages:
         path = self._store.path(owner, name)
         if not missing:
             return verdict, record, path
-        # It is unknown which faces are still detectable in an image that was filtered before.
+        # Earlier filters may have made faces undetectable, so the face size of a filtered image counts as unknown.
         face_px = 0.0 if record.filters else record.face_px
         plan, noted = self._authorizer.plan_filters(
             call, grant, replace(verdict, filters=missing), situation_of(record.poses, now),

@@ -71,7 +71,7 @@ async def follow_telemetry(
         node: Name of the node, which is in its certificate.
         tls: Certificate of the node.
         add: Callback invoked with each measurement.
-        clock: Returns Unix time as the mobility service uses it, also while the clock is uncertain.
+        clock: Returns Unix time. If the clock is uncertain, the later reading, as in the mobility service.
         gimbal: True if a gimbal turns the camera.
         interval_s: Requested interval between messages, in seconds.
         retry_s: Delay before a new subscription after a failure, in seconds.
@@ -99,9 +99,9 @@ def to_measurement(
 ) -> Measurement:
     """Convert a telemetry message with the attitude of the airframe or of the gimbal.
 
-    Ages are counted from the message's timestamp, because messages that wait while a process is stalled arrive together. Both
-    processes read the same clock. If the clock is stepped in between, the message counts as older, never as younger. The age of
-    a message whose timestamp is after its arrival is unknown.
+    Ages are computed from the timestamp of the message, because messages that wait while a process is stalled arrive together.
+    Both processes read the same clock. After a clock step, a message may appear older, but never younger. If the timestamp is
+    after the arrival, the age is unknown.
 
     Args:
         message: Message of the mobility service of this node.
@@ -109,22 +109,22 @@ def to_measurement(
         time_s: Unix time of arrival in seconds, from `ArrivalClock`.
         gimbal: True if a gimbal turns the camera.
     """
-    turned = "gimbal" if gimbal else "attitude"
+    attitude_field = "gimbal" if gimbal else "attitude"
     delay_s = 0.0
     if message.HasField("time"):
         delay_s = time_s - message.time.ToNanoseconds() / 1e9
         delay_s = max(delay_s, 0.0) if delay_s >= -MAX_AHEAD_S else math.inf
     position_age_s, attitude_age_s = (
         delay_s + (getattr(message, name) if message.HasField(name) else DEFAULT_AGE_S)
-        for name in ("position_age_s", f"{turned}_age_s")
+        for name in ("position_age_s", f"{attitude_field}_age_s")
     )
     # Without a link to the autopilot, the message contains an old position.
     position = message.position if message.HasField("position") and message.autopilot_connected else None
     velocity = message.velocity
     home = message.home
     attitude = None
-    if message.HasField(turned):
-        angles = getattr(message, turned)
+    if message.HasField(attitude_field):
+        angles = getattr(message, attitude_field)
         attitude = Attitude(angles.roll_deg, angles.pitch_deg, angles.yaw_deg)
     return Measurement(
         received_at=now_s,

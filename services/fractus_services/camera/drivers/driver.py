@@ -12,7 +12,7 @@ from fractus_services.errors import Unavailable
 from fractus_services.options import CannotServe
 
 TIMEOUT_S = 5.0
-"""Time for one image, in seconds, within drivers that wait for a network."""
+"""Time for one image, in seconds, for drivers that use the network."""
 
 
 class CameraFailed(Unavailable):
@@ -33,7 +33,7 @@ class CaptureRequest:
     Attributes:
         width: Width in pixels, in the camera's own aspect ratio. The camera may return another size.
         height: Height in pixels, as `width`.
-        native: Width and height of the camera, in pixels.
+        native: Native width and height of the camera, in pixels.
         sensor: Spectral band.
         situation: Current position and attitude of the camera.
         label: Text that the test pattern shows.
@@ -48,9 +48,9 @@ class CaptureRequest:
 
 
 def check_native_size(picture: Pixels, request: CaptureRequest) -> Pixels:
-    """Return the image of a camera that was set to its native size, after checking that it has this size.
+    """Check that an image has the native size of the camera, and return it.
 
-    An image of another size may show another part of the sensor. The described field of view does not apply to it.
+    An image of another size may show another part of the sensor, to which the described field of view does not apply.
 
     Raises:
         CameraFailed: The image has another size, and policies depend on the described field of view.

@@ -1,4 +1,4 @@
-"""Camera driver that returns geotagged images of a directory: the image taken nearest to the camera's position."""
+"""Camera driver that returns the geotagged image of a directory that was taken nearest to the camera's position."""
 
 from __future__ import annotations
 

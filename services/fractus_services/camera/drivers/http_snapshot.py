@@ -17,8 +17,9 @@ _READ_BYTES = 256 * 1024
 class HttpSnapshot:
     """A camera with a snapshot URL.
 
-    The requested size replaces {width} and {height} in the URL, or becomes its query if the URL has none. User name and
-    password may precede the host (basic and digest authentication). Error messages never contain them.
+    The requested size replaces {width} and {height} in the URL. If the URL has neither these placeholders nor a query, the size is
+    added as a query. User name and password may precede the host, for basic and digest authentication. Error messages never contain
+    them.
 
     Args:
         url: URL of the scheme http or https.
@@ -28,7 +29,7 @@ class HttpSnapshot:
     """
 
     latency_s = 2.0
-    """IP cameras return the image that they encoded last."""
+    """IP cameras return the latest encoded image, which may be this old."""
 
     def __init__(self, url: str) -> None:
         parts = urllib.parse.urlsplit(url)
@@ -39,7 +40,9 @@ class HttpSnapshot:
             raise InvalidCameraConnection(f"{parts.scheme}: URL of the camera: {error}") from None
         if parts.scheme not in {"http", "https"} or not host:
             raise InvalidCameraConnection("the camera's URL must be http://HOST[:PORT]/PATH")
-        netloc = (f"[{host}]" if ":" in host else host) + (f":{port}" if port else "")
+        netloc = f"[{host}]" if ":" in host else host
+        if port:
+            netloc += f":{port}"
         self._url = urllib.parse.urlunsplit((parts.scheme, netloc, parts.path or "/", parts.query, ""))
         handlers: list[urllib.request.BaseHandler] = [urllib.request.ProxyHandler({}), _NoRedirect()]
         if parts.username:
@@ -83,7 +86,7 @@ class HttpSnapshot:
         return f"{self._url}?width={request.width}&height={request.height}{band}"
 
     def _fetch(self, url: str) -> bytes:
-        """Read the body, with one timeout for all of it, because a slow camera could send it byte by byte."""
+        """Read the body. The timeout applies to the entire body, because a slow camera could send it byte by byte."""
         deadline_s = time.monotonic() + TIMEOUT_S
         chunks = []
         size = 0

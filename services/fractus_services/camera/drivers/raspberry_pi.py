@@ -18,7 +18,7 @@ class RaspberryPiCamera:
     """
 
     latency_s = 0.3
-    """In low light the sensor may return the frame that it was already exposing."""
+    """In low light, the sensor may return a frame whose exposure began this long before the request."""
 
     def __init__(self, number: int) -> None:
         self._number = number
@@ -29,7 +29,7 @@ class RaspberryPiCamera:
         if self._camera is None:
             self._camera = self._start(request)
         try:
-            # The format that picamera2 calls RGB888 has blue first in memory, as OpenCV expects it.
+            # In memory, the format RGB888 of picamera2 has blue first, as OpenCV expects.
             picture = self._camera.capture_array("main")
         except (RuntimeError, OSError) as error:
             self.close()

@@ -1,6 +1,6 @@
-"""Control plane without nodes on loopback ports (etcd, API server, controller manager), and a client for tests.
+"""Control plane without nodes (etcd, API server, controller manager) on loopback ports, with clients.
 
-There are no kubelets, so pods do not run. Tests write the status of pods in place of kubelets.
+There are no kubelets, so pods do not run. Tests write the status of pods instead of kubelets.
 """
 
 from __future__ import annotations
@@ -35,22 +35,21 @@ _CONTROLLERS = (
 
 
 def programs() -> dict[str, Path]:
-    """Return the programs of a control plane. Build those that the machine lacks, as `fractus cluster binaries` does."""
-    found = ensure_binaries(PROGRAMS, report=print)
-    return {name: found[name] for name in PROGRAMS}
+    """Return the programs of a control plane. Build missing programs like `fractus cluster binaries`."""
+    paths = ensure_binaries(PROGRAMS, report=print)
+    return {name: paths[name] for name in PROGRAMS}
 
 
-def wait_for(question: Callable[[], T | None], what: str | Callable[[], str], timeout_s: float = 60.0) -> T:
-    """Poll until the function returns a true value and return it. Fail with a description after the timeout."""
+def wait_for(poll: Callable[[], T | None], description: str | Callable[[], str], timeout_s: float = 60.0) -> T:
+    """Poll a function until it returns a true value, and return this value. Fail with a description after the timeout."""
     end = time.monotonic() + timeout_s
     while True:
-        answer = question()
-        if answer:
-            return answer
+        result = poll()
+        if result:
+            return result
         if time.monotonic() > end:
-            raise AssertionError(
-                f"waited {timeout_s:.0f} s without success: {what if isinstance(what, str) else what()}"
-            )
+            text = description if isinstance(description, str) else description()
+            raise AssertionError(f"waited {timeout_s:.0f} s without success: {text}")
         select_pause(0.05)
 
 
@@ -98,7 +97,7 @@ class ControlPlane:
         return path
 
     def as_user(self, name: str, user: str, groups: tuple[str, ...]) -> BlockingClient:
-        """Return a client with the certificate of a user who is in groups."""
+        """Return a client with a certificate of a user and the user's groups."""
         credential = self.authority.issue(name, common_name=user, organizations=groups)
         return BlockingClient(
             with_certificate(self.server, self.ca, (credential.certificate, credential.key)), "kubectl"
@@ -149,7 +148,7 @@ class ControlPlane:
         )
         wait_for(self.admin.ready, "the API server", timeout_s=60)
         if kinds:
-            # Before the garbage collector starts: it learns of new kinds only every 30 s.
+            # The garbage collector looks for new kinds only every 30 s, so install them before it starts.
             self._install_crds()
         self._run(
             "kube-controller-manager",
@@ -170,15 +169,19 @@ class ControlPlane:
             process.wait(10)
 
     def stop_storage(self) -> Callable[[], None]:
-        """Stop etcd and the API server, which caches its data. Return a function that starts both on the content of `data`."""
-        ended = [(program, self._started[program]) for program in ("etcd", "kube-apiserver")]
-        for program, _ in reversed(ended):
+        """Stop etcd and the API server, which caches the data of etcd.
+
+        Returns:
+            Function that starts both of them on the current content of `data`.
+        """
+        stopped = [(program, self._started[program]) for program in ("etcd", "kube-apiserver")]
+        for program, _ in reversed(stopped):
             process = self._processes.pop(program)
             process.kill()
             process.wait(10)
 
         def start() -> None:
-            for program, arguments in ended:
+            for program, arguments in stopped:
                 self._run(program, *arguments)
             wait_for(self.admin.ready, "the API server", timeout_s=60)
 

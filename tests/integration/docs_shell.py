@@ -18,23 +18,23 @@ class Shell:
 
     Args:
         folder: The working directory.
-        plane: The control plane that KUBECONFIG names; unset for none.
+        plane: Control plane for KUBECONFIG. None: KUBECONFIG is not set.
     """
 
     def __init__(self, folder: Path, plane: ControlPlane | None = None) -> None:
         self._folder = folder
         programs = ensure_binaries(("kubectl", "helm"), report=print)
-        places = [Path(sys.executable).parent, *{programs[name].parent for name in ("kubectl", "helm")}]
-        self.environment = {**os.environ, "PATH": ":".join([*map(str, places), os.environ["PATH"]])}
+        folders = [Path(sys.executable).parent, *{programs[name].parent for name in ("kubectl", "helm")}]
+        self.environment = {**os.environ, "PATH": ":".join([*map(str, folders), os.environ["PATH"]])}
         self.environment.pop("KUBECONFIG", None)
         if plane is not None:
             self.environment["KUBECONFIG"] = str(plane.kubeconfig)
 
     def type(self, line: str, code: int = 0) -> str:
-        """Return the standard output of a line. Fail unless it ends with the exit code; a failure inside a pipe counts too."""
-        done = subprocess.run(
+        """Run a line and return its standard output. Fail if its exit code, or that of a part of a pipe, is not as expected."""
+        result = subprocess.run(
             ["bash", "-o", "pipefail", "-c", line], cwd=self._folder, env=self.environment, capture_output=True, text=True,
             timeout=TIMEOUT_S, check=False,
         )  # fmt: skip
-        assert done.returncode == code, f"{line}: exit code {done.returncode}\n{done.stdout}{done.stderr}"
-        return done.stdout
+        assert result.returncode == code, f"{line}: exit code {result.returncode}\n{result.stdout}{result.stderr}"
+        return result.stdout

@@ -1,4 +1,4 @@
-"""Pictures with a GPS position, as cameras write them."""
+"""Pictures with a GPS position in their EXIF metadata."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from PIL import Image
 def save(
     path: Path, lat: float, lon: float, amsl_m: float | None, colour: tuple[int, int, int] = (10, 200, 30)
 ) -> None:
-    """Write a picture with a GPS position as cameras do."""
+    """Write a picture with a GPS position like a camera."""
     path.parent.mkdir(parents=True, exist_ok=True)
     exif = Image.Exif()
 
-    exif[0x010F] = "Fractus"  # without a plain tag Pillow writes none into a PNG
+    exif[0x010F] = "Fractus"  # Pillow writes no EXIF to a PNG if the main directory has no tag
 
     def parts(angle: float) -> tuple[float, float, float]:
         minutes, seconds = divmod(round(angle * 3600, 4), 60)

@@ -1,4 +1,4 @@
-"""Runs inside an image: imports modules and uses the libraries with native code that the image has.
+"""Program that runs inside an image. It imports all modules of packages, and uses installed libraries with native code.
 
 Usage: python3 - PACKAGE... < image_program.py
 """
@@ -15,7 +15,7 @@ from pathlib import Path
 
 
 def modules(package: str) -> Iterator[str]:
-    """Names of all modules of a package, except programs."""
+    """Yield the names of all modules of a package, except programs."""
     yield package
     for module in pkgutil.walk_packages(importlib.import_module(package).__path__, package + "."):
         if not module.name.endswith("__main__"):
@@ -23,7 +23,7 @@ def modules(package: str) -> Iterator[str]:
 
 
 def check_bytecode() -> None:
-    """Fail if a module was compiled at import, because a read-only image would do so at every start."""
+    """Fail if the bytecode of a module is checked against the time stamp of its source, because images reset time stamps."""
     for name, module in list(sys.modules.items()):
         source = getattr(module, "__file__", None) or ""
         if source.endswith(".py"):

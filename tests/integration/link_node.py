@@ -56,11 +56,11 @@ async def main(node: str, files: Path, max_peers: int) -> None:
     await loop.connect_read_pipe(lambda: asyncio.StreamReaderProtocol(commands), sys.stdin)
     emit("ready")
     while line := (await commands.readline()).decode().strip():
-        verb, _, rest = line.partition(" ")
+        verb, _, argument = line.partition(" ")
         if verb == "want":
-            await connector.set_peer(rest)
+            await connector.set_peer(argument)
         elif verb == "refuse":
-            refusal = rest
+            refusal = argument
     await connector.close()
     for task in tasks:
         task.cancel()

@@ -1,11 +1,10 @@
-"""Network namespaces of drones, edge nodes, their pods and a cloud, with a simulated radio, in which agents run links."""
+"""Network namespaces of drones, edge nodes, their pods and a cloud, in which agents run direct links over a simulated radio."""
 
 from __future__ import annotations
 
 import base64
 import json
 import os
-import queue
 import re
 import subprocess
 import sys
@@ -40,7 +39,7 @@ _FRAME = LocalFrame(*ORIGIN)
 
 
 def place(east: float, north: float, up: float = 0.0) -> dict[str, Any]:
-    """Return a position of a manifest."""
+    """Return a position for a manifest, from an offset in metres."""
     lat, lon = _FRAME.latlon(east, north)
     return {"lat": lat, "lon": lon, "alt": up, "altitudeReference": "home"}
 
@@ -53,23 +52,23 @@ call = channel.stream_stream("/test/Stream")
 print("ready", flush=True)
 number = 0
 while True:
-    asked = queue.Queue()
-    replies = call(iter(asked.get, None))
+    requests = queue.Queue()
+    replies = call(iter(requests.get, None))
     try:
-        while True:  # one at a time: what was not answered is sent again on the next stream
-            asked.put(f"{number:08d}".encode())
+        while True:  # one request at a time; a request without a reply is sent again on the next stream
+            requests.put(f"{number:08d}".encode())
             print(number, next(replies).decode().split()[0], f"{time.monotonic():.3f}", flush=True)
             number += 1
             time.sleep(0.02)
     except grpc.RpcError as error:
         print(number, "REOPENED", error.code().name, flush=True)
 """
-"""Client with one endless stream that is rarely idle."""
+"""Program of a client with one endless stream that is rarely idle."""
 
 FOREIGN = """table ip kube-proxy {
     chain pre { type nat hook prerouting priority -100; ip daddr 10.97.0.9 tcp dport 80 dnat to 10.88.0.2:8080; }
 }"""
-"""Rules of another program."""
+"""nftables rules of another program, which agents must not change."""
 
 
 class Agent:
@@ -93,15 +92,15 @@ class Agent:
         self.add_radio()
         self.run("nft", "-f", "-", text=FOREIGN)
         self.certify(name)
-        # So slow that a link is better even on a busy machine.
+        # With this uplink, a direct link is faster even on a busy machine.
         self.describe(uplink_mbps=1)
         self._process: subprocess.Popen[str] | None = None
         self._reading: threading.Thread | None = None
-        self._said: queue.Queue[str] = queue.Queue()
+
         self.statuses: dict[str, dict[str, Any]] = {}
 
     def add_pod(self) -> None:
-        """Create the namespace of its pod, as the container runtime does."""
+        """Create the namespace of the node's pod like a container runtime."""
         name = f"{self.name}p"
         net = f"10.88.{self.number}"
         self.world.namespace(name)
@@ -151,8 +150,8 @@ class Agent:
         """Take the uplink to the cloud down, or bring it up."""
         run(*self.world.inside(self.name), "ip", "link", "set", "lte0", "up" if up else "down")
         if up:
-            way = f"10.90.{self.number}.2"
-            run(*self.world.inside(self.name), "ip", "route", "replace", "default", "via", way)
+            gateway = f"10.90.{self.number}.2"
+            run(*self.world.inside(self.name), "ip", "route", "replace", "default", "via", gateway)
 
     def api(self, *, up: bool) -> None:
         """Make the API server reachable or unreachable for the agent."""
@@ -178,10 +177,10 @@ class Agent:
     def reaches(self, address: str, port: int) -> bool:
         """Return True if a TCP connection can be opened from the node."""
         program = f"import socket; socket.create_connection(({address!r}, {port}), 2).close()"
-        done = subprocess.run(
+        result = subprocess.run(
             [*self.world.inside(self.name), sys.executable, "-c", program], capture_output=True, timeout=30, check=False
         )
-        return done.returncode == 0
+        return result.returncode == 0
 
     def metrics(self) -> dict[str, float]:
         """Return the Prometheus metrics of the agent."""
@@ -210,13 +209,15 @@ class Agent:
 
     def fly(self, east: float, north: float = 0.0, velocity: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> None:
         """Set the position of the drone's radio and its telemetry."""
-        self.see(east, north, velocity)
+        self.set_telemetry(east, north, velocity)
         self.world.command(station=self.name, position=[east, north, 0.0])
 
-    def see(self, east: float, north: float = 0.0, velocity: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> None:
-        """Set the telemetry only."""
-        where = place(east, north)
-        self._write("telemetry.json", {"lat": where["lat"], "lon": where["lon"], "up": 0.0, "velocity": velocity})
+    def set_telemetry(
+        self, east: float, north: float = 0.0, velocity: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    ) -> None:
+        """Set the telemetry of the drone, but not the position of its radio."""
+        position = place(east, north)
+        self._write("telemetry.json", {"lat": position["lat"], "lon": position["lon"], "up": 0.0, "velocity": velocity})
 
     def start(self) -> None:
         log = (self.folder / "agent.log").open("a")
@@ -232,8 +233,8 @@ class Agent:
 
     def _read(self, output: Any) -> None:
         for line in output:
-            said = json.loads(line)
-            self.statuses[said["link"]] = said["status"]
+            report = json.loads(line)
+            self.statuses[report["link"]] = report["status"]
         output.close()
 
     @property
@@ -248,7 +249,7 @@ class Agent:
         self._end()
 
     def stop(self) -> None:
-        """Stop the agent, as an upgrade does."""
+        """Stop the agent gracefully, like an upgrade."""
         assert self._process is not None
         assert self._process.stdin is not None
         self._process.stdin.close()
@@ -292,12 +293,12 @@ class Agent:
         ).stdout
 
     def cut_at(self) -> list[float]:
-        """Return the Unix times of its abrupt switches, in seconds."""
+        """Return the Unix times of the agent's abrupt switches, in seconds."""
         lines = (line.split(" ", 1) for line in self.log().splitlines() if "redirector: switched" in line)
         return [float(at) for at, text in lines if "planned=False" in text]
 
     def redirects(self) -> set[str]:
-        """Return the elements of the map, such as `10.96.0.5 . tcp . 8080`."""
+        """Return the keys of the redirection map, such as `10.96.0.5 . tcp . 8080`."""
         return set(
             re.findall(r"([\d.]+ \. \w+ \. \d+) timeout", self._show("nft", "list", "map", "ip", "fractus", "targets"))
         )
@@ -313,29 +314,29 @@ class Agent:
         return sorted(self._show("ip", "route").splitlines())
 
     def run(self, *words: str, text: str = "") -> str:
-        """Run a command in its namespace with some input, and return its output."""
+        """Run a command in the node's namespace with some input, and return its output."""
         inside = [*self.world.inside(self.name), *words]
         return subprocess.run(inside, input=text, capture_output=True, text=True, timeout=30, check=True).stdout
 
     def state(self) -> dict[str, Any]:
-        """Return all state of a node that links may change: packet filter, routes, addresses, device and connections."""
+        """Return all state of a node that direct links may change: packet filter, routes, addresses, device and connections."""
         addresses = re.sub(r"(?m)^\d+: | valid_lft.*", "", self._show("ip", "-o", "-4", "address"))
         return {
             "ruleset": self._show("nft", "list", "ruleset"),
             "rules": self._show("ip", "rule"),
-            # A cable's carrier comes up a moment after its ends.
+            # The carrier of a cable comes up a moment after its ends.
             "routes": sorted(
                 self._show("ip", "-4", "route", "show", "table", "all").replace("linkdown ", "").splitlines()
             ),
             "addresses": sorted(addresses.splitlines()),
-            # A device gets a queue when it is up for the first time, and keeps it.
+            # A device gets a queue when it is brought up for the first time, and keeps the queue.
             "device": re.sub(r" qdisc \w+", "", self._show("ip", "address", "show", "dev", "wlan0")),
             "connections": self.world.conntrack(self),
         }
 
 
 class World:
-    """All namespaces, the radio in a thread, and a certificate authority."""
+    """All network namespaces, the simulated radio in a thread, and a certificate authority."""
 
     def __init__(self, directory: Path) -> None:
         self.directory = directory
@@ -346,14 +347,14 @@ class World:
         self.agents: dict[str, Agent] = {}
         self._namespaces: list[str] = []
         self._processes: list[tuple[str, subprocess.Popen[str]]] = []
-        self._over = threading.Event()
-        self._thread = threading.Thread(target=self._carry)
+        self._closed = threading.Event()
+        self._thread = threading.Thread(target=self._run_radio)
         self._thread.start()
         self.namespace("cloud")
         run(*self.inside("cloud"), "ip", "addr", "add", f"{VIP.address}/32", "dev", "lo")
 
-    def _carry(self) -> None:
-        while not self._over.is_set():
+    def _run_radio(self) -> None:
+        while not self._closed.is_set():
             with self.turn:
                 self.radio.turn(0.01)
             time.sleep(0)
@@ -377,26 +378,28 @@ class World:
         run(*self.inside(node), "ip", "link", "set", "lo", "up")
         run(*self.inside(node), "sysctl", "-qw", "net.ipv4.ip_forward=1")
 
-    def cable(self, left: str, device: str, address: str, right: str, other: str, peer: str) -> None:
+    def cable(self, node: str, device: str, address: str, peer: str, peer_device: str, peer_address: str) -> None:
+        """Connect two namespaces by a pair of devices with addresses."""
         run(
-            *self.inside(left), "ip", "link", "add", device, "type", "veth",
-            "peer", "name", other, "netns", self.name(right),
+            *self.inside(node), "ip", "link", "add", device, "type", "veth",
+            "peer", "name", peer_device, "netns", self.name(peer),
         )  # fmt: skip
-        for node, link, ip in ((left, device, address), (right, other, peer)):
-            run(*self.inside(node), "ip", "addr", "add", ip, "dev", link)
-            run(*self.inside(node), "ip", "link", "set", link, "up")
+        for end, link, ip in ((node, device, address), (peer, peer_device, peer_address)):
+            run(*self.inside(end), "ip", "addr", "add", ip, "dev", link)
+            run(*self.inside(end), "ip", "link", "set", link, "up")
 
     def drone(self, name: str = "d1") -> Agent:
-        self.agents[name] = found = Agent(self, name, "Drone", (0.0, 0.0))
-        found.fly(0.0)
-        return found
+        drone = Agent(self, name, "Drone", (0.0, 0.0))
+        self.agents[name] = drone
+        drone.fly(0.0)
+        return drone
 
     def edge(self, name: str, east: float, north: float = 0.0) -> Agent:
         self.agents[name] = Agent(self, name, "EdgeNode", (east, north))
         return self.agents[name]
 
     def link(self, drone: Agent, edge: Agent, **spec: Any) -> dict[str, Any]:
-        """A DirectLink, as the operator writes it."""
+        """Return a DirectLink like the operator's."""
         service = {
             "component": "Server", "instance": f"server-{edge.name}",
             "virtual": {"address": str(VIP.address), "port": VIP.port},
@@ -415,7 +418,7 @@ class World:
         }  # fmt: skip
 
     def states(self) -> dict[str, dict[str, Any]]:
-        """All that links may change, by node."""
+        """Return the state of each node that direct links may change, by node."""
         return {name: agent.state() for name, agent in self.agents.items()}
 
     def python(self, node: str, program: str, *arguments: object) -> subprocess.Popen[str]:
@@ -428,13 +431,14 @@ class World:
         return process
 
     def end(self, node: str) -> None:
-        """End the programs that run in a namespace."""
-        for _, process in (each for each in self._processes if each[0] == node):
-            process.kill()
-            process.wait()
+        """End the programs that run in the namespace of a node."""
+        for name, process in self._processes:
+            if name == node:
+                process.kill()
+                process.wait()
 
     def serve(self, work_s: float = 0.005) -> None:
-        """Start the base instance in the cloud, and one on each edge node."""
+        """Start the base instance in the cloud, and an instance on each edge node."""
         self.python("cloud", SERVER, "cloud", f"{VIP.address}:{VIP.port}", work_s)
         for agent in self.agents.values():
             if agent.kind == "EdgeNode":
@@ -448,10 +452,10 @@ class World:
         return Client(self.python(f"{drone.name}p", CLIENT, f"{VIP.address}:{VIP.port}", calls, pause_s, size))
 
     def conntrack(self, agent: Agent) -> int:
-        """Connections of a node that carry a mark of ours."""
+        """Return the number of a node's connections with a mark of the redirector."""
         listed = in_namespace(self.path(agent.name), lambda: Path("/proc/thread-self/net/nf_conntrack"))
         text = in_namespace(self.path(agent.name), lambda: listed.read_text() if listed.exists() else "")
-        marks = [int(found) for found in re.findall(r"mark=(\d+)", text)]
+        marks = [int(mark) for mark in re.findall(r"mark=(\d+)", text)]
         return len([mark for mark in marks if mark & 0xFFF00000 == 0xF6A00000])
 
     def close(self) -> None:
@@ -462,7 +466,7 @@ class World:
                 process.stdout.close()
         for agent in self.agents.values():
             agent.clear()
-        self._over.set()
+        self._closed.set()
         self._thread.join()
         self.radio.close()
         for name in self._namespaces:
@@ -481,10 +485,13 @@ def _forget_connections() -> None:
 
 
 class Client:
-    """Client that calls the virtual address, with the replies that it received."""
+    """Client that calls the virtual address, and the responses that it received.
+
+    A response consists of the words that the program CLIENT prints: number, server and time, or number, FAILED and error.
+    """
 
     def __init__(self, process: subprocess.Popen[str]) -> None:
-        self.answers: list[list[str]] = []
+        self.responses: list[list[str]] = []
         self._process = process
         self._thread = threading.Thread(target=self._read)
         self._thread.start()
@@ -492,34 +499,37 @@ class Client:
     def _read(self) -> None:
         assert self._process.stdout is not None
         for line in self._process.stdout:
-            self.answers.append(line.split())
+            self.responses.append(line.split())
 
     def all(self) -> list[list[str]]:
+        """Wait for the end of the client, and return all responses."""
         self._thread.join(120)
-        return self.answers
+        return self.responses
 
     @property
-    def by(self) -> str:
-        """Who answered last."""
-        return self.answers[-1][1] if self.answers else ""
+    def last_server(self) -> str:
+        """Name of the server that sent the last response, or an empty string."""
+        return self.responses[-1][1] if self.responses else ""
 
     @property
     def failed(self) -> list[list[str]]:
-        return [answer for answer in self.answers if answer[1] == "FAILED"]
+        return [response for response in self.responses if response[1] == "FAILED"]
 
 
-def until(holds: Callable[[], object], what: str, world: World | None = None, timeout_s: float = TIMEOUT_S) -> float:
-    """Wait for a condition, and return the elapsed time."""
+def until(
+    condition: Callable[[], object], description: str, world: World | None = None, timeout_s: float = TIMEOUT_S
+) -> float:
+    """Wait for a condition, and return the elapsed time in seconds."""
     begun = time.monotonic()
     while time.monotonic() - begun < timeout_s:
-        if holds():
+        if condition():
             return time.monotonic() - begun
         time.sleep(0.02)
     logs = "".join(f"\n--- {a.name}\n{a.log()[-3000:]}\n{a.statuses}" for a in world.agents.values()) if world else ""
-    raise AssertionError(f"not in {timeout_s:g} s: {what}{logs}")
+    raise AssertionError(f"not within {timeout_s:g} s: {description}{logs}")
 
 
-def flying(world: World, *edges: Agent) -> Agent:
+def start_drone(world: World, *edges: Agent) -> Agent:
     """Start a drone with a DirectLink to each edge node, and all agents and servers."""
     drone = world.agents.get("d1") or world.drone()
     links = [world.link(drone, edge) for edge in edges]
@@ -532,34 +542,34 @@ def flying(world: World, *edges: Agent) -> Agent:
     return drone
 
 
-def unchanged(world: World, before: Mapping[str, Mapping[str, Any]]) -> None:
-    """Delete all DirectLinks, and check that every node is in its previous state."""
+def check_restored(world: World, before: Mapping[str, Mapping[str, Any]]) -> None:
+    """Delete all DirectLinks, and check that every node returns to its previous state."""
 
     def changes() -> list[tuple[str, str, Any, Any]]:
         now = world.states()
         return [
-            (name, what, was, now[name][what])
-            for name, all_ in before.items()
-            for what, was in all_.items()
-            if now[name][what] != was
+            (node, part, value, now[node][part])
+            for node, state in before.items()
+            for part, value in state.items()
+            if now[node][part] != value
         ]
 
     for agent in world.agents.values():
         agent.plan()
     with suppress(AssertionError):
-        until(lambda: not changes(), "nodes as they were")
-    left = changes()
-    assert not left, left
+        until(lambda: not changes(), "the previous state of all nodes")
+    differences = changes()
+    assert not differences, differences
 
 
 @contextmanager
 def linked_world(directory: Path) -> Iterator[World]:
     """Create a world, and remove it at the end."""
-    found = World(directory)
+    world = World(directory)
     try:
-        yield found
+        yield world
     finally:
-        found.close()
+        world.close()
 
 
 __all__ = [
@@ -568,10 +578,10 @@ __all__ = [
     "Agent",
     "Client",
     "World",
-    "flying",
+    "check_restored",
     "link_address",
     "linked_world",
     "place",
-    "unchanged",
+    "start_drone",
     "until",
 ]

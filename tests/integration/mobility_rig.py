@@ -1,4 +1,4 @@
-"""A simulated vehicle, a mobility service and certificates, for tests that fly."""
+"""Simulated vehicle, mobility service, camera service and certificates of a drone, for tests that fly."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ PASSENGER = component_identity("default", "app", "AerialViewer", "app-aerial-vie
 
 
 def area(x0: float, y0: float, x1: float, y1: float) -> dict[str, Any]:
-    """A rectangle in metres east and north of home."""
+    """Return a rectangle from offsets in metres east and north of home."""
     corners = ((x0, y0), (x1, y0), (x1, y1), (x0, y1))
     return {"polygon": {"exterior": [dict(zip(("lat", "lon"), FRAME.latlon(x, y), strict=True)) for x, y in corners]}}
 
@@ -67,7 +67,7 @@ ALL = [
 
 
 def grant(*policies: dict[str, Any], **changes: Any) -> dict[str, Any]:
-    """A driver's grant: operation area 200 m around home, with these policies."""
+    """Return a driver's Grant with policies. The operation area extends 100 m from home in each direction."""
     path = [dict(zip(("lat", "lon", "alt"), (*FRAME.latlon(x, y), 10.0), strict=True)) for x, y in ((0, 40), (40, 40))]
     spec = {
         "node": NODE,
@@ -136,7 +136,7 @@ class Authority:
     def issue(
         self, identity: str, *, dns: str | None = None, seconds: float = 3600.0, begun: float = -60.0
     ) -> tuple[bytes, bytes]:
-        """Key and certificate, PEM."""
+        """Return key and certificate in PEM."""
         key = ec.generate_private_key(ec.SECP256R1())
         now = datetime.datetime.now(datetime.UTC)
         names: list[x509.GeneralName] = [x509.UniformResourceIdentifier(identity)]
@@ -159,7 +159,7 @@ class Authority:
         return pem, certificate.public_bytes(serialization.Encoding.PEM)
 
     def sign(self, body: dict[str, Any]) -> dict[str, Any]:
-        """A grant as the operator signs it, later than all before."""
+        """Sign a Grant like the operator, with a later time of issue than all Grants before."""
         if self._signer is None:
             self._signer = issue_signer(self.certificate, self._key)
         now = datetime.datetime.now(datetime.UTC)
@@ -171,7 +171,7 @@ class Authority:
 def issue_signer(
     authority: x509.Certificate, authority_key: ec.EllipticCurvePrivateKey, identity: str = OPERATOR_IDENTITY
 ) -> tuple[ec.EllipticCurvePrivateKey, x509.Certificate]:
-    """A key and a certificate for signing grants."""
+    """Return a key and a certificate for signing Grants."""
     key = ec.generate_private_key(ec.SECP256R1())
     now = datetime.datetime.now(datetime.UTC)
     usage = dict.fromkeys(
@@ -199,7 +199,7 @@ def issue_signer(
 
 
 class Rig:
-    """Everything on a drone, in one directory."""
+    """Processes, certificates, Grants and logs of a drone, in one directory."""
 
     def __init__(self, directory: Path) -> None:
         self.directory = directory
@@ -215,8 +215,8 @@ class Rig:
         self._channels: list[grpc.aio.Channel] = []
         self.write_tls()
 
-    def write_tls(self, **how: Any) -> None:
-        key, certificate = self.authority.issue(node_identity(NODE), dns=node_server_name(NODE), **how)
+    def write_tls(self, **validity: Any) -> None:
+        key, certificate = self.authority.issue(node_identity(NODE), dns=node_server_name(NODE), **validity)
         for name, data in (("tls.key", key), ("tls.crt", certificate), ("ca.crt", self.authority.pem)):
             fresh = self.tls / f".{name}"
             fresh.write_bytes(data)
@@ -244,7 +244,7 @@ class Rig:
         )  # fmt: skip
 
     def start(self, name: str, *arguments: str) -> None:
-        """Another program of Python's."""
+        """Start another Python program."""
         self._start(name, *arguments)
 
     def _start(self, name: str, *arguments: str) -> None:
@@ -257,7 +257,7 @@ class Rig:
             )
 
     def start_camera(self, *more: str, description: str = "", name: str = "camera") -> str:
-        """The camera service; returns its address."""
+        """Start the camera service, and return its address."""
         address = f"127.0.0.1:{free_port()}"
         path = self.directory / "node.yaml"
         if description:
@@ -276,16 +276,16 @@ class Rig:
             (self.directory / f"driver.{name}").write_bytes(data)
         self._start("driver", __file__, self.address, str(self.directory / "driver"))
 
-    def tell(self, name: str, number: signal.Signals) -> None:
+    def send_signal(self, name: str, number: signal.Signals) -> None:
         self._processes[name].send_signal(number)
 
-    def kill(self, name: str, how: signal.Signals = signal.SIGKILL) -> None:
+    def kill(self, name: str, number: signal.Signals = signal.SIGKILL) -> None:
         process = self._processes[name]
-        process.send_signal(how)
+        process.send_signal(number)
         process.wait(10)
 
     async def ended(self, name: str, timeout_s: float = 20.0) -> int:
-        """Wait for a process to end and return its exit status."""
+        """Wait for the end of a process, and return its exit code."""
         return await asyncio.to_thread(self._processes[name].wait, timeout_s)
 
     async def until_logged(self, name: str, text: str, timeout_s: float = 20.0) -> None:
@@ -304,9 +304,9 @@ class Rig:
         authority: Authority | None = None,
         address: str = "",
         options: tuple[tuple[str, Any], ...] = (),
-        **how: Any,
+        **validity: Any,
     ) -> grpc.aio.Channel:
-        key, certificate = (authority or self.authority).issue(identity, **how)
+        key, certificate = (authority or self.authority).issue(identity, **validity)
         credentials = grpc.ssl_channel_credentials(self.authority.pem, key, certificate)
         channel = grpc.aio.secure_channel(
             address or self.address,
@@ -322,8 +322,8 @@ class Rig:
         self._channels.append(channel)
         return channel
 
-    def stub(self, identity: str = DRIVER, **how: Any) -> mobility_pb2_grpc.MobilityServiceStub:
-        return mobility_pb2_grpc.MobilityServiceStub(self.channel(identity, **how))
+    def stub(self, identity: str = DRIVER, **options: Any) -> mobility_pb2_grpc.MobilityServiceStub:
+        return mobility_pb2_grpc.MobilityServiceStub(self.channel(identity, **options))
 
     async def close(self) -> None:
         for channel in self._channels:
@@ -335,10 +335,8 @@ class Rig:
 
     def entries(self, kind: str | None = None) -> list[dict[str, Any]]:
         lines = self.audit.read_text().splitlines() if self.audit.exists() else []
-        found = [json.loads(line) for line in lines if line.endswith("}")]
-        return [entry for entry in found if kind is None or entry["kind"] == kind]
-
-    # Waiting for states
+        entries = [json.loads(line) for line in lines if line.endswith("}")]
+        return [entry for entry in entries if kind is None or entry["kind"] == kind]
 
     async def telemetry(self) -> pb.Telemetry:
         async for message in self.stub(node_identity(NODE)).SubscribeTelemetry(
@@ -348,9 +346,9 @@ class Rig:
         raise AssertionError("no telemetry")
 
     async def until(
-        self, condition: Callable[[pb.Telemetry], bool], timeout_s: float = 30.0, what: str = "state"
+        self, condition: Callable[[pb.Telemetry], bool], timeout_s: float = 30.0, description: str = "state"
     ) -> pb.Telemetry:
-        """Wait for a state of the drone; survives restarts of the service."""
+        """Wait for a state of the drone, also across restarts of the service, and return its telemetry."""
         deadline = time.monotonic() + timeout_s
         last: Any = None
         stub = self.stub(node_identity(NODE))
@@ -365,7 +363,7 @@ class Rig:
                         return last
             except grpc.aio.AioRpcError:
                 await asyncio.sleep(0.05)
-        raise AssertionError(f"{what} was not reached in {timeout_s} s; last: {last}\n{self.log('service')}")
+        raise AssertionError(f"{description} was not reached in {timeout_s} s; last: {last}\n{self.log('service')}")
 
     def log(self, name: str) -> str:
         path = self.directory / f"{name}.log"
@@ -373,7 +371,7 @@ class Rig:
 
 
 class Driver:
-    """A driver's stream and calls."""
+    """Control stream and calls of a driver."""
 
     def __init__(self, rig: Rig, identity: str = DRIVER) -> None:
         self.rig = rig
@@ -410,11 +408,12 @@ class Driver:
         await self.arm()
         return await self.take_off(altitude_m)
 
-    def going(self, x: float, y: float, alt: float = 10.0, **more: Any) -> Any:
+    def start_goto(self, x: float, y: float, alt: float = 10.0, **more: Any) -> Any:
+        """Call Goto, and return the call without waiting for the flight."""
         return self.stub.Goto(pb.GotoRequest(target=place(x, y, alt), **more), timeout=90)
 
     async def goto(self, x: float, y: float, alt: float = 10.0) -> pb.MotionProgress:
-        return await flown(self.going(x, y, alt))
+        return await flown(self.start_goto(x, y, alt))
 
 
 def place(x: float, y: float, alt: float = 10.0) -> types_pb2.Position:
@@ -423,7 +422,7 @@ def place(x: float, y: float, alt: float = 10.0) -> types_pb2.Position:
 
 
 async def flown(call: Any) -> pb.MotionProgress:
-    """The first message of a motion that completes, with the last one's position."""
+    """Wait until a motion is complete. Return its first message, with the position of the last message."""
     first: Any = None
     last: Any = None
     async for last in call:
@@ -434,17 +433,17 @@ async def flown(call: Any) -> pb.MotionProgress:
 
 
 async def denied(call: Awaitable[Any]) -> tuple[grpc.StatusCode, types_pb2.Decision]:
-    """Status and decision of a call that must fail."""
+    """Return status and decision of a call that must fail."""
     try:
         reply = await call
     except grpc.aio.AioRpcError as error:
         status = rpc_status.from_call(error)
-        found = types_pb2.Decision()
+        decision = types_pb2.Decision()
         if status is not None:
             for detail in status.details:
                 if detail.Is(types_pb2.Decision.DESCRIPTOR):
-                    detail.Unpack(found)
-        return error.code(), found
+                    detail.Unpack(decision)
+        return error.code(), decision
     raise AssertionError(f"the call was not refused: {reply}")
 
 
@@ -453,7 +452,7 @@ def xy(position: types_pb2.Position) -> tuple[float, float]:
 
 
 def _drive(address: str, files: str) -> None:
-    """The driver process: take off, then hover indefinitely."""
+    """Run a driver that takes off and then hovers indefinitely."""
     ca, key, certificate = (Path(f"{files}.{name}").read_bytes() for name in ("ca", "key", "crt"))
     credentials = grpc.ssl_channel_credentials(ca, key, certificate)
     options = [("grpc.ssl_target_name_override", node_server_name(NODE))]

@@ -26,7 +26,7 @@ NODE_OBJECTS = (
     f"/apis/rbac.authorization.k8s.io/v1/namespaces/{NODES}/roles",
     f"/api/v1/namespaces/{NODES}/serviceaccounts",
 )
-"""Collections of the objects that the operator keeps for each node."""
+"""Paths of the collections that contain an object of the operator for each node."""
 LAT = 39.3606
 LON = 22.9307
 MOBILITY = [
@@ -45,11 +45,11 @@ CAMERA = ["CaptureImage", "RetrieveImage", "ListImages"]
 
 
 def at(north_m: float, east_m: float, **more: float) -> Body:
-    """A place at an offset in metres from the depot (flat, good to a centimetre here)."""
+    """Return a position at an offset in metres from the depot (flat Earth, accurate to a centimetre)."""
     return {"lat": LAT + north_m / 111_030, "lon": LON + east_m / 86_200, **more}
 
 
-def ours(kind: str, name: str, spec: Body, namespace: str | None = None) -> Body:
+def fractus_object(kind: str, name: str, spec: Body, namespace: str | None = None) -> Body:
     metadata: Body = {"name": name, **({"namespace": namespace} if namespace else {})}
     return {"apiVersion": "fractus.dev/v1alpha1", "kind": kind, "metadata": metadata, "spec": spec}
 
@@ -90,11 +90,11 @@ def traffic(namespace: str, name: str = "traffic", *components: Body) -> Body:
         component("ImageChecker", "hybrid", hybridTo=["AerialViewer"], egress=["DataStore"]),
         component("DataStore", "cloud"),
     )
-    return ours("Application", name, {"components": list(parts)}, namespace)
+    return fractus_object("Application", name, {"components": list(parts)}, namespace)
 
 
 class World:
-    """The inventory on the control plane, and short ways to look at it."""
+    """Objects of drones, edge nodes and applications at the API server, with shortcuts for reading and writing them."""
 
     def __init__(self, plane: ControlPlane) -> None:
         self.plane = plane
@@ -104,7 +104,7 @@ class World:
         self.clear()
         for name in (SYSTEM, NODES):
             self.api.apply(f"/api/v1/namespaces/{name}", _namespace(name))
-        self.put(ours("Depot", "base", {"location": at(0, 0), "radius": 30}))
+        self.put(fractus_object("Depot", "base", {"location": at(0, 0), "radius": 30}))
         for i in range(1, drones + 1):
             self.add_drone(f"drone-{i}")
         for i in range(1, edges + 1):
@@ -131,7 +131,7 @@ class World:
         mobility = {"maxAltitude": 80, "maxFlightTime": 20, "maxSpeed": 15, "methods": MOBILITY}
         services = {"mobility": mobility, "camera": {"methods": CAMERA}}
         spec = {"depot": "base", "home": at(0, 0, alt=12), "interfaces": interfaces, "services": services}
-        self.put(ours("Drone", name, spec))
+        self.put(fractus_object("Drone", name, spec))
         self.drone_status(name, "inactive")
 
     def drone_status(self, name: str, state: str, ready: str = "True") -> None:
@@ -143,7 +143,7 @@ class World:
         self.add_node(name, "edge")
         interfaces = [{"technology": "WiFi", "device": "wlan0", "range": 80, "pairing": {"networkId": name}}]
         spec = {"location": place, "interfaces": interfaces, "services": {"camera": {"methods": CAMERA}}}
-        self.put(ours("EdgeNode", name, spec))
+        self.put(fractus_object("EdgeNode", name, spec))
 
     def path(self, body: Body) -> str:
         plural = "policies" if body["kind"] == "Policy" else f"{body['kind'].lower()}s"
@@ -157,11 +157,11 @@ class World:
     def bound_pod(
         self, namespace: str, name: str, node: str, labels: dict[str, str] | None = None, **spec: Any
     ) -> Body:
-        """Make a pod, and bind it to a node as the scheduler would."""
+        """Create a pod, and bind it to a node like the scheduler."""
         path = f"/api/v1/namespaces/{namespace}/pods"
-        given = {"containers": [{"name": "main", "image": "a"}], **spec}
+        pod_spec = {"containers": [{"name": "main", "image": "a"}], **spec}
         metadata = {"name": name, "namespace": namespace, "labels": labels or {}}
-        pod = self.api.call("POST", path, {"apiVersion": "v1", "kind": "Pod", "metadata": metadata, "spec": given})
+        pod = self.api.call("POST", path, {"apiVersion": "v1", "kind": "Pod", "metadata": metadata, "spec": pod_spec})
         target = {"apiVersion": "v1", "kind": "Node", "name": node}
         binding = {"apiVersion": "v1", "kind": "Binding", "metadata": {"name": name}, "target": target}
         self.api.call("POST", f"{path}/{name}/binding", binding)
@@ -189,8 +189,8 @@ class World:
         return self.api.list(f"{FRACTUS}/grants", labelSelector=selector)
 
     def children(self, namespace: str) -> dict[str, Body]:
-        """Everything in the namespace that Fractus made, by kind and name, without what Kubernetes adds."""
-        found = {}
+        """Return the objects of the operator in a namespace by `PLURAL/NAME`, without objects that Kubernetes creates."""
+        objects = {}
         for path in (
             f"{FRACTUS}/namespaces/{namespace}/deploymentplans",
             f"/api/v1/namespaces/{namespace}/secrets",
@@ -200,12 +200,12 @@ class World:
             f"/apis/networking.k8s.io/v1/namespaces/{namespace}/networkpolicies",
         ):
             for item in self.api.list(path, labelSelector="app.kubernetes.io/managed-by=fractus"):
-                found[f"{path.rsplit('/', 1)[1]}/{item['metadata']['name']}"] = item
+                objects[f"{path.rsplit('/', 1)[1]}/{item['metadata']['name']}"] = item
         for item in self.grants(namespace):
-            found[f"grants/{item['metadata']['name']}"] = item
+            objects[f"grants/{item['metadata']['name']}"] = item
         for item in self.links(namespace).values():
-            found[f"directlinks/{item['metadata']['name']}"] = item
-        return found
+            objects[f"directlinks/{item['metadata']['name']}"] = item
+        return objects
 
     def links(self, namespace: str, name: str = "traffic") -> dict[str, Body]:
         """Return the DirectLinks of an application by node."""
@@ -213,12 +213,12 @@ class World:
         return {body["spec"]["node"]: body for body in self.api.list(f"{FRACTUS}/directlinks", labelSelector=selector)}
 
     def pods(self, namespace: str) -> list[Body]:
-        """Pods that are not on their way out (no kubelet ends them here)."""
-        found = self.api.list(f"/api/v1/namespaces/{namespace}/pods")
-        return [pod for pod in found if "deletionTimestamp" not in pod["metadata"]]
+        """Return the pods that are not being deleted. Deleted pods stay, because there is no kubelet."""
+        pods = self.api.list(f"/api/v1/namespaces/{namespace}/pods")
+        return [pod for pod in pods if "deletionTimestamp" not in pod["metadata"]]
 
     def run_pods(self, namespace: str) -> None:
-        """Bind every pod and mark it as ready, as scheduler and kubelet would."""
+        """Bind every pod and mark it as ready like scheduler and kubelet."""
         for number, pod in enumerate(self.pods(namespace)):
             name = pod["metadata"]["name"]
             if not pod["spec"].get("nodeName"):
@@ -236,7 +236,7 @@ class World:
             self.api.merge(f"/api/v1/namespaces/{namespace}/pods/{name}/status", {"status": status})
 
     def clear(self) -> None:
-        """Remove what tests leave that is not in a namespace, and pods, which no kubelet ends here."""
+        """Remove cluster-scoped objects of tests, and all pods, because there is no kubelet that removes them."""
         for drone in self.api.list(f"{FRACTUS}/drones"):
             state = {"status": {"flightState": "inactive", "conditions": []}}
             self.api.merge(f"{FRACTUS}/drones/{drone['metadata']['name']}/status", state)
@@ -253,9 +253,9 @@ class World:
             self._delete(f"/api/v1/nodes/{node['metadata']['name']}")
 
     def _delete(self, path: str, grace_s: int | None = None) -> None:
-        """Delete an object; what flew a moment ago is refused until admission knows of the landing."""
+        """Delete an object. Retry because the deletion is refused until admission has received the landing of a drone."""
 
-        def done() -> bool:
+        def deleted() -> bool:
             try:
                 self.api.delete(path, grace_s)
             except KubeError as error:
@@ -264,7 +264,7 @@ class World:
                 return False
             return True
 
-        wait_for(done, f"{path} to be deleted")
+        wait_for(deleted, f"{path} to be deleted")
 
 
 def _namespace(name: str) -> Body:
@@ -280,7 +280,7 @@ class OperatorProcess:
 
     def __init__(self, kubeconfig: Path, log: Path, identity: str = "operator", **settings: str) -> None:
         self._kubeconfig = kubeconfig
-        # Like a pod, it keeps its identity when it is restarted.
+        # The process keeps its identity when it is restarted, like a pod.
         self._settings = {"FRACTUS_IDENTITY": identity, **settings}
         self._log = log
         self.health = f"http://127.0.0.1:{free_port()}/healthz"
@@ -298,15 +298,15 @@ class OperatorProcess:
                 [sys.executable, "-m", "fractus_operator"], env=env, stdout=log, stderr=log
             )
 
-    def stop(self, how: int = signal.SIGTERM) -> int:
+    def stop(self, number: int = signal.SIGTERM) -> int:
         assert self._process is not None
-        self._process.send_signal(how)
+        self._process.send_signal(number)
         code = self._process.wait(20)
         self._process = None
         return code
 
     def kill(self) -> None:
-        """End it at once, from whatever thread."""
+        """Kill the process. This may be called from any thread."""
         if self._process is not None:
             self._process.kill()
 
@@ -314,9 +314,9 @@ class OperatorProcess:
     def running(self) -> bool:
         return self._process is not None and self._process.poll() is None
 
-    def signal(self, how: int) -> None:
+    def signal(self, number: int) -> None:
         assert self._process is not None
-        self._process.send_signal(how)
+        self._process.send_signal(number)
 
     def log(self) -> str:
         return self._log.read_text()
@@ -324,9 +324,9 @@ class OperatorProcess:
 
 @contextmanager
 def fresh_namespace(world: World, name: str) -> Iterator[str]:
-    """A namespace for one test, deleted with its Applications afterwards."""
+    """Create a namespace for one test, and delete it with its Applications at the end."""
     world.api.apply(f"/api/v1/namespaces/{name}", _namespace(name))
-    # Until the controller manager has made it, no pod is admitted.
+    # Pods are refused until the controller manager has created this account.
     account = f"/api/v1/namespaces/{name}/serviceaccounts/default"
     wait_for(lambda: world.api.get(account), "the namespace's service account")
     try:

@@ -1,4 +1,4 @@
-"""Acceptor on the loopback: many peers, stalled peers, repeated pairing and renewed certificates."""
+"""Acceptor of pairings on the loopback address: many peers, stalled peers, repeated pairing and renewed certificates."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ LOOPBACK = IPv4Address("127.0.0.1")
 
 
 class Site:
-    """Edge node that accepts sessions, and the certificates of the peers."""
+    """Edge node that accepts sessions, and certificates of its peers."""
 
     def __init__(self, directory: Path) -> None:
         self.directory = directory
@@ -80,7 +80,7 @@ def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Site:
 
 async def until(condition: Callable[[], bool]) -> None:
     async with asyncio.timeout(10):
-        while not condition():  # noqa: ASYNC110 - sockets tell no one
+        while not condition():  # noqa: ASYNC110 - sockets have no event for this
             await asyncio.sleep(0.01)
 
 

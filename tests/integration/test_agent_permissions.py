@@ -19,7 +19,7 @@ from fractus_core.api.grants import pack
 from fractus_operator.kinds import NODE_GRANTS, ROLE, ROLE_BINDING, SERVICE_ACCOUNT
 from fractus_operator.node_objects import ACCOUNT_KINDS, account_object, header
 from fractus_runtime.kubernetes import BlockingClient, ContentType, Kind, KubeError
-from operator_world import FRACTUS, NODES, SYSTEM, Body, OperatorProcess, World, at, denied, ours
+from operator_world import FRACTUS, NODES, SYSTEM, Body, OperatorProcess, World, at, denied, fractus_object
 
 REQUESTS = "/apis/certificates.k8s.io/v1/certificatesigningrequests"
 
@@ -76,7 +76,7 @@ def test_agent_writes_status_of_its_own_drone_only(world: World, agents: dict[st
 def test_agent_registers_its_own_node_only(world: World, agents: dict[str, BlockingClient]) -> None:
     body = copy.deepcopy(world.api.get(f"{FRACTUS}/edgenodes/edge-1"))
     assert body is not None
-    fresh = ours("EdgeNode", "edge-1", body["spec"])
+    fresh = fractus_object("EdgeNode", "edge-1", body["spec"])
     world.api.delete(f"{FRACTUS}/edgenodes/edge-1")
     denied(
         lambda: agents["drone-1"].call("POST", f"{FRACTUS}/edgenodes", fresh), "only the Drone or EdgeNode of drone-1"
@@ -98,8 +98,8 @@ def test_agent_registers_only_the_kind_of_its_node_label(world: World, agents: d
             return error.status == 403 and f"has the label fractus.dev/class={label}; its agent" in str(error)
         return False
 
-    drone = ours("Drone", "edge-1", {"services": {}})
-    edge = ours("EdgeNode", "drone-1", {"location": at(0, 0)})
+    drone = fractus_object("Drone", "edge-1", {"services": {}})
+    edge = fractus_object("EdgeNode", "drone-1", {"location": at(0, 0)})
     wait_for(lambda: refused("edge-1", drone, "edge"), "the refusal of a drone")
     wait_for(lambda: refused("drone-1", edge, "drone"), "the refusal of an edge node")
     world.api.call("POST", f"{FRACTUS}/drones?dryRun=All", drone)
@@ -108,7 +108,7 @@ def test_agent_registers_only_the_kind_of_its_node_label(world: World, agents: d
 def _grant(world: World, node: str) -> str:
     name = f"t.{uuid.uuid4().hex[:8]}"
     owner = {"namespace": "t", "name": "a", "uid": "u"}
-    world.put(ours("Grant", name, {"node": node, "application": owner, "component": "A", "instance": "a"}))
+    world.put(fractus_object("Grant", name, {"node": node, "application": owner, "component": "A", "instance": "a"}))
     return f"{FRACTUS}/grants/{name}"
 
 
@@ -315,7 +315,7 @@ def _direct_link(world: World, drone: str, node: str) -> str:
         "pairing": {"networkId": "n"}, "range": 120, "bandwidth": 12, "position": at(0, 0),
         "heuristic": {"kind": "preferDirect"},
     }  # fmt: skip
-    world.put(ours("DirectLink", name, spec))
+    world.put(fractus_object("DirectLink", name, spec))
     return f"{FRACTUS}/directlinks/{name}"
 
 

@@ -446,7 +446,7 @@ async def test_attack_with_older_grant_in_flight_returns_drone(rig: Rig) -> None
     await rig.until(lambda t: t.mode == "LAND" and t.controller == "system", 30)
     refused = [e for e in rig.entries("grant") if e["change"] == "refused"]
     assert "not after the Grant of" in refused[-1]["reason"]
-    code, why = await denied(flown(driver.going(0, 20)))
+    code, why = await denied(flown(driver.start_goto(0, 20)))
     assert (code, why.code) == (Status.PERMISSION_DENIED, "NoGrant")
 
 
@@ -456,7 +456,7 @@ async def test_full_disk_ends_no_flight_but_prevents_arming(rig: Rig) -> None:
     full = (0, resource.RLIM_INFINITY)
     resource.prlimit(rig.pid("service"), resource.RLIMIT_FSIZE, full)
     await driver.goto(0, 30)
-    code, why = await denied(flown(driver.going(0, 150)))
+    code, why = await denied(flown(driver.start_goto(0, 150)))
     assert (code, why.code) == (Status.PERMISSION_DENIED, "OutsideOperationArea"), "judged as before"
     await driver.stub.Hover(pb.HoverRequest(), timeout=5)
     await flown(driver.stub.Land(pb.LandRequest(), timeout=60))

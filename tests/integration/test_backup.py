@@ -16,7 +16,7 @@ from docs_pages import ROOT, shell_lines
 from docs_shell import Shell
 from fractus_core.api import Grant
 from fractus_core.policy.grant_signatures import verify
-from operator_world import FRACTUS, SYSTEM, Body, OperatorProcess, World, at, ours, traffic
+from operator_world import FRACTUS, SYSTEM, Body, OperatorProcess, World, at, fractus_object, traffic
 
 pytestmark = pytest.mark.slow
 
@@ -79,9 +79,9 @@ def authority(world: World) -> bytes:
 def test_backup_is_restored_into_another_cluster_and_uninstalled(
     world: World, operator: OperatorProcess, found: World, namespace: str, folder: Path
 ) -> None:
-    world.put(ours("Zone", "school", {"area": {"circle": {"center": at(40, 180), "radius": 30}}}))
+    world.put(fractus_object("Zone", "school", {"area": {"circle": {"center": at(40, 180), "radius": 30}}}))
     no_school = {"type": "GeofenceControl", "kind": "exclusion", "selector": {"zones": ["school"]}}
-    world.put(ours("Policy", "no-school", no_school))
+    world.put(fractus_object("Policy", "no-school", no_school))
     (folder / "application.yaml").write_text(json.dumps(traffic(namespace)))
     lost = Shell(folder, world.plane)
     shell = Shell(folder, found.plane)

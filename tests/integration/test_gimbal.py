@@ -110,7 +110,7 @@ class Stage:
             turned = abs((state.gimbal.yaw_deg - yaw_deg + 180) % 360 - 180)
             return state.HasField("gimbal") and abs(state.gimbal.pitch_deg - pitch_deg) < 3 and turned < 10
 
-        return await self.rig.until(there, what=f"gimbal at {pitch_deg:g}, {yaw_deg:g}")
+        return await self.rig.until(there, description=f"gimbal at {pitch_deg:g}, {yaw_deg:g}")
 
 
 async def take_off(driver: Driver) -> None:
@@ -204,7 +204,7 @@ async def test_gimbal_picture_is_judged_by_measured_attitude(stage: Stage) -> No
 
     # Straight down, but nothing measures that any more.
     stage.station.set_type(SERVOS)
-    await stage.rig.until(lambda state: not state.HasField("gimbal"), what="a gimbal that is not measured")
+    await stage.rig.until(lambda state: not state.HasField("gimbal"), description="a gimbal that is not measured")
     decision, hidden = await stage.until(CORRECT)
     assert decision.code == "PrivacyFilter"
     assert brightness(hidden) < 1

@@ -198,7 +198,7 @@ async def test_goto_call_path_stays_within_its_number_of_files_and_functions(rig
     async with serving(rig), Mobility(endpoint(rig)) as drone, drone.control():
         await drone.arm()
         await drone.takeoff(8)
-        await rig.until(lambda drone: abs(drone.velocity.down_mps) < 0.05, what="hover")
+        await rig.until(lambda drone: abs(drone.velocity.down_mps) < 0.05, description="hover")
         lat, lon = FRAME.latlon(0, 8)
         path = await record(lambda: drone.goto(lat, lon, 8))
     for file, function in path.functions:

@@ -6,7 +6,18 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from linked_world import FOREIGN, STREAM, VIP, Client, World, flying, link_address, linked_world, unchanged, until
+from linked_world import (
+    FOREIGN,
+    STREAM,
+    VIP,
+    Client,
+    World,
+    check_restored,
+    link_address,
+    linked_world,
+    start_drone,
+    until,
+)
 from redirect_rig import SERVER
 
 pytestmark = [pytest.mark.root, pytest.mark.timeout(300)]
@@ -23,9 +34,9 @@ def test_nodes_recover_after_power_loss_during_a_link(world: World, left: str) -
     edge = world.edge("e1", 20.0)
     drone = world.drone()
     before = world.states()
-    flying(world, edge)
+    start_drone(world, edge)
     client = world.client(drone, 100_000, 0.1)
-    until(lambda: client.by == "e1", "an answer over the link", world)
+    until(lambda: client.last_server == "e1", "an answer over the link", world)
     for agent in (drone, edge):
         rules = agent.run("nft", "list", "ruleset")
         agent.lose_power()
@@ -43,7 +54,7 @@ def test_nodes_recover_after_power_loss_during_a_link(world: World, left: str) -
     client = world.client(drone, 100_000, 0.1)
     for agent in (edge, drone):
         agent.start()
-    until(lambda: client.by == "e1", "an answer over the link again", world)
+    until(lambda: client.last_server == "e1", "an answer over the link again", world)
     if left == "nothing":
         assert not client.failed
     assert "restored from disk" in drone.log()
@@ -55,7 +66,7 @@ def test_nodes_recover_after_power_loss_during_a_link(world: World, left: str) -
             agent.plan()
             until(lambda agent=agent: not agent.tables(), "no table of ours", world)
             agent.run("ip", "link", "set", "wlan0", "down")
-    unchanged(world, before)
+    check_restored(world, before)
 
 
 BAD_PEER = """
@@ -99,13 +110,13 @@ def test_peer_that_stops_after_pairing_is_left(world: World, fault: str) -> None
     peer = Client(world.python("e1", BAD_PEER, "e1", link_address("e1"), bad.folder / "tls", fault))
     drone.plan(*links)
     drone.start()
-    until(lambda: ["paired"] in peer.answers, "that the bad one paired", world)
+    until(lambda: ["paired"] in peer.responses, "that the bad one paired", world)
     other.plan(links[1])
     other.start()
-    until(lambda: client.by == "e2", "an answer over the link to the honest node", world)
-    assert "e1" not in {answer[1] for answer in client.answers}
+    until(lambda: client.last_server == "e2", "an answer over the link to the honest node", world)
+    assert "e1" not in {answer[1] for answer in client.responses}
     assert not client.failed
-    unchanged(world, before)
+    check_restored(world, before)
 
 
 STRANGER = """
@@ -127,9 +138,9 @@ def test_node_with_the_address_of_the_peer_gets_no_traffic(world: World) -> None
     drone = world.drone()
     stranger = world.edge("e9", 5.0)
     before = {name: state for name, state in world.states().items() if name != "e9"}
-    flying(world, edge)
+    start_drone(world, edge)
     client = world.client(drone, 100_000, 0.05)
-    until(lambda: client.by == "e1", "an answer over the link", world)
+    until(lambda: client.last_server == "e1", "an answer over the link", world)
     address = str(link_address("e1"))
     port = int(next(iter(edge.redirects())).split(" . ")[2])
     # It takes calls where the edge node does, and pairs with the certificate that it has.
@@ -139,17 +150,17 @@ def test_node_with_the_address_of_the_peer_gets_no_traffic(world: World) -> None
     paired = Client(world.python("e9", BAD_PEER, "e1", address, stranger.folder / "tls", "no routes"))
     world.python("e9", STRANGER, "wlan0", address, stranger.hardware.hex())
     until(lambda: drone.log().count("does not have its certificate") > 3, "refusals", world)
-    until(lambda: client.by == "cloud", "an answer of the cloud", world)
-    led = len(client.answers)
-    until(lambda: len(client.answers) > led + 60, "more answers", world)
-    assert "stranger" not in {answer[1] for answer in client.answers[led:]}
-    assert not paired.answers
+    until(lambda: client.last_server == "cloud", "an answer of the cloud", world)
+    led = len(client.responses)
+    until(lambda: len(client.responses) > led + 60, "more answers", world)
+    assert "stranger" not in {answer[1] for answer in client.responses[led:]}
+    assert not paired.responses
     # Gone, it is not asked any more, though the drone was told that the address is there.
     world.end("e9")
     stranger.run("ip", "link", "set", "wlan0", "down")
-    took_s = until(lambda: client.by == "e1", "an answer over the link", world, timeout_s=20.0)
+    took_s = until(lambda: client.last_server == "e1", "an answer over the link", world, timeout_s=20.0)
     print("from the stranger's end to the first answer:", took_s)
-    unchanged(world, before)
+    check_restored(world, before)
 
 
 @pytest.mark.parametrize("loss", ["planned", "abrupt"])
@@ -157,21 +168,21 @@ def test_long_stream_is_reopened_without_lost_or_repeated_replies(world: World, 
     edge = world.edge("e1", 20.0)
     drone = world.drone()
     before = world.states()
-    flying(world, edge)
+    start_drone(world, edge)
     stream = Client(world.python("d1p", STREAM, f"{VIP.address}:{VIP.port}"))
-    until(lambda: stream.by == "e1", "an answer over the link", world)
+    until(lambda: stream.last_server == "e1", "an answer over the link", world)
     for _ in range(2):
         if loss == "planned":
             drone.fly(-57.0, velocity=(-3.0, 0.0, 0.0))
         else:
             world.command(station="d1", off=True)
-        until(lambda: stream.by == "cloud", "an answer of the cloud", world)
+        until(lambda: stream.last_server == "cloud", "an answer of the cloud", world)
         drone.fly(0.0)
         world.command(station="d1", off=False)
-        until(lambda: stream.by == "e1", "an answer over the link again", world)
-    answered = [int(answer[0]) for answer in stream.answers if answer[1] in {"cloud", "e1"}]
+        until(lambda: stream.last_server == "e1", "an answer over the link again", world)
+    answered = [int(answer[0]) for answer in stream.responses if answer[1] in {"cloud", "e1"}]
     assert answered == list(range(len(answered)))
-    ends = [answer[2] for answer in stream.answers if answer[1] == "REOPENED"]
+    ends = [answer[2] for answer in stream.responses if answer[1] == "REOPENED"]
     assert ends
     assert set(ends) <= {"UNAVAILABLE"}, "a status after which gRPC's clients try again"
-    unchanged(world, before)
+    check_restored(world, before)

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from linked_world import STREAM, VIP, World, flying, link_address, linked_world, unchanged, until
+from linked_world import STREAM, VIP, World, check_restored, link_address, linked_world, start_drone, until
 
 pytestmark = [pytest.mark.root, pytest.mark.timeout(300)]
 
@@ -20,9 +20,9 @@ def world(tmp_path: Path) -> Iterator[World]:
 
 def test_traffic_moves_to_the_link_and_back_before_the_link_ends(world: World) -> None:
     edge = world.edge("e1", 20.0)
-    drone = flying(world, edge)
+    drone = start_drone(world, edge)
     client = world.client(drone, 100_000, 0.1)
-    until(lambda: client.by == "e1", "a reply over the link", world)
+    until(lambda: client.last_server == "e1", "a reply over the link", world)
     name = "app-d1-e1"
     until(lambda: drone.status(name).get("traffic") == "direct", "the status", world)
     status = drone.status(name)
@@ -43,7 +43,7 @@ def test_traffic_moves_to_the_link_and_back_before_the_link_ends(world: World) -
     # The drone flies away: traffic moves back while the link still works, so that no call is lost.
     drone.fly(70.0, velocity=(3.0, 0.0, 0.0))
     drone.fly(-57.0, velocity=(-3.0, 0.0, 0.0))
-    until(lambda: client.by == "cloud", "a reply of the cloud", world)
+    until(lambda: client.last_server == "cloud", "a reply of the cloud", world)
     assert not client.failed
     until(lambda: drone.status(name).get("traffic") == "cloud", "the status", world)
 
@@ -51,13 +51,13 @@ def test_traffic_moves_to_the_link_and_back_before_the_link_ends(world: World) -
 def test_link_manager_cleans_up_when_links_are_no_longer_planned(world: World) -> None:
     edge = world.edge("e1", 20.0)
     before = edge.routes()
-    drone = flying(world, edge)
+    drone = start_drone(world, edge)
     client = world.client(drone, 100_000, 0.1)
-    until(lambda: client.by == "e1", "a reply over the link", world)
+    until(lambda: client.last_server == "e1", "a reply over the link", world)
     assert drone.addresses() == [f"{link_address('d1')}/16"]
     assert len(edge.redirects()) == 1
     drone.plan()
-    until(lambda: client.by == "cloud", "a reply of the cloud", world)
+    until(lambda: client.last_server == "cloud", "a reply of the cloud", world)
     until(lambda: not drone.tables() and not drone.addresses(), "a clean drone", world)
     until(lambda: not edge.redirects(), "no redirect on the edge", world)
     edge.plan()
@@ -76,21 +76,21 @@ def test_link_manager_cleans_up_when_links_are_no_longer_planned(world: World) -
 
 def test_traffic_returns_to_the_cloud_within_a_second_after_link_loss(world: World) -> None:
     edge = world.edge("e1", 20.0)
-    drone = flying(world, edge)
+    drone = start_drone(world, edge)
     client = world.client(drone, 100_000, 0.02)
-    until(lambda: client.by == "e1", "a reply over the link", world)
-    who = [answer[1] for answer in client.answers]
+    until(lambda: client.last_server == "e1", "a reply over the link", world)
+    who = [answer[1] for answer in client.responses]
     assert "FAILED" not in who, "the planned switch to the link loses no call"
     switched = []
     gaps = []
     # The loss is detected after 0.6 s, and the switch takes a millisecond. Several losses, because the machine may be busy.
     while len(gaps) < 5 and not (gaps and min(switched) < 1.0 and min(gaps) < 1.0):
-        begun = len(client.answers) - 1
+        begun = len(client.responses) - 1
         lost_at = time.time()
         world.command(station="d1", off=True)
-        until(lambda: client.by == "cloud", "a reply of the cloud", world)
+        until(lambda: client.last_server == "cloud", "a reply of the cloud", world)
         assert not drone.redirects()
-        answers = client.answers[begun:]
+        answers = client.responses[begun:]
         led = next(number for number, answer in enumerate(answers) if answer[1] == "cloud")
         gaps.append(float(answers[led][2]) - max(float(a[2]) for a in answers[:led] if a[1] == "e1"))
         # This client does not repeat calls: the call that was cut fails.
@@ -99,7 +99,7 @@ def test_traffic_returns_to_the_cloud_within_a_second_after_link_loss(world: Wor
         until(lambda: drone.status("app-d1-e1").get("traffic") == "cloud", "the status", world)
         # Traffic returns to the link when the radio works again.
         world.command(station="d1", off=False)
-        until(lambda: client.by == "e1", "a reply over the link again", world)
+        until(lambda: client.last_server == "e1", "a reply over the link again", world)
     print("from the loss to the switch, and from reply to reply:", switched, gaps)
     assert min(switched) < 1.0, switched
     assert min(gaps) < 1.0, gaps
@@ -107,16 +107,16 @@ def test_traffic_returns_to_the_cloud_within_a_second_after_link_loss(world: Wor
 
 def test_killed_agent_leaves_the_cloud_path_and_restarts_cleanly(world: World) -> None:
     edge = world.edge("e1", 20.0)
-    drone = flying(world, edge)
+    drone = start_drone(world, edge)
     client = world.client(drone, 100_000, 0.1)
-    until(lambda: client.by == "e1", "a reply over the link", world)
+    until(lambda: client.last_server == "e1", "a reply over the link", world)
     drone.kill()
-    until(lambda: client.by == "cloud", "a reply of the cloud without an agent", world)
+    until(lambda: client.last_server == "cloud", "a reply of the cloud without an agent", world)
     until(lambda: not drone.redirects() and not edge.redirects(), "redirects that ended by themselves", world)
     # The new agent restores its links from disk, because the API server may be unreachable.
     (drone.folder / "links.json").unlink()
     drone.start()
-    until(lambda: client.by == "e1", "a reply over the link again", world)
+    until(lambda: client.last_server == "e1", "a reply over the link again", world)
     assert "restored from disk" in drone.log()
     assert len(drone.redirects()) == 1
     assert drone.addresses() == [f"{link_address('d1')}/16"]
@@ -124,9 +124,9 @@ def test_killed_agent_leaves_the_cloud_path_and_restarts_cleanly(world: World) -
 
 def test_state_of_killed_agents_is_removed_without_planned_links(world: World) -> None:
     edge = world.edge("e1", 20.0)
-    drone = flying(world, edge)
+    drone = start_drone(world, edge)
     client = world.client(drone, 100_000, 0.1)
-    until(lambda: client.by == "e1", "a reply over the link", world)
+    until(lambda: client.last_server == "e1", "a reply over the link", world)
     for agent in (drone, edge):  # the mission ends while no agent is running
         agent.kill()
         agent.plan()
@@ -137,7 +137,7 @@ def test_state_of_killed_agents_is_removed_without_planned_links(world: World) -
     until(lambda: not drone.tables() and not edge.tables(), "no table", world)
     until(lambda: not drone.addresses() and not edge.addresses(), "no address", world)
     assert world.conntrack(drone) == world.conntrack(edge) == 0
-    until(lambda: client.by == "cloud", "a reply of the cloud", world)
+    until(lambda: client.last_server == "cloud", "a reply of the cloud", world)
 
 
 def test_instances_are_isolated_without_a_radio(world: World) -> None:
@@ -158,19 +158,19 @@ def test_instances_are_isolated_without_a_radio(world: World) -> None:
     drone.plan(link)
     drone.start()
     client = world.client(drone, 100_000, 0.1)
-    until(lambda: client.by == "e1", "a reply over the link", world)
+    until(lambda: client.last_server == "e1", "a reply over the link", world)
     assert not drone.reaches(edge.pod, VIP.port)
 
 
 def test_link_is_restored_after_the_edge_agent_is_killed(world: World) -> None:
     edge = world.edge("e1", 20.0)
-    drone = flying(world, edge)
+    drone = start_drone(world, edge)
     client = world.client(drone, 100_000, 0.05)
-    until(lambda: client.by == "e1", "a reply over the link", world)
+    until(lambda: client.last_server == "e1", "a reply over the link", world)
     edge.kill()
-    until(lambda: client.by == "cloud", "a reply of the cloud", world)
+    until(lambda: client.last_server == "cloud", "a reply of the cloud", world)
     edge.start()
-    until(lambda: client.by == "e1", "a reply over the link again", world)
+    until(lambda: client.last_server == "e1", "a reply over the link again", world)
 
 
 def test_second_drone_waits_for_a_busy_edge_node(world: World) -> None:
@@ -185,18 +185,18 @@ def test_second_drone_waits_for_a_busy_edge_node(world: World) -> None:
     first.plan(links[0])
     first.start()
     clients = [world.client(drone, 100_000, 0.1) for drone in (first, second)]
-    until(lambda: clients[0].by == "e1", "the first drone's answer over the link", world)
+    until(lambda: clients[0].last_server == "e1", "the first drone's answer over the link", world)
     second.plan(links[1])
     second.start()
     until(lambda: second.status("app-d2-e1").get("reason") == "PairingFailed", "a refusal", world)
-    assert clients[1].by == "cloud"
-    assert clients[0].by == "e1"
+    assert clients[1].last_server == "cloud"
+    assert clients[0].last_server == "e1"
     assert edge.condition("app-d2-e1", "PeerReady")["reason"] == "Busy"
     first.plan()
-    until(lambda: clients[1].by == "e1", "the second drone's answer over the link", world)
-    assert clients[0].by == "cloud"
+    until(lambda: clients[1].last_server == "e1", "the second drone's answer over the link", world)
+    assert clients[0].last_server == "cloud"
     assert not [client.failed for client in clients if client.failed]
-    unchanged(world, before)
+    check_restored(world, before)
 
 
 @pytest.mark.parametrize("fault", ["silent", "impostor"])
@@ -219,8 +219,8 @@ def test_peer_that_does_not_pair_costs_no_calls(world: World, fault: str) -> Non
     if fault == "silent":  # it was heard, and then answers no more
         until(lambda: "pairing" in drone.log(), "an attempt", world)
         world.command(station="e1", silent=True)
-    until(lambda: client.by == "e2", "an answer over the link to the honest node", world)
-    assert "e1" not in {answer[1] for answer in client.answers}
+    until(lambda: client.last_server == "e2", "an answer over the link to the honest node", world)
+    assert "e1" not in {answer[1] for answer in client.responses}
     assert len(client.failed) <= 1  # in the planned switch, by a client that repeats nothing
 
 
@@ -236,21 +236,21 @@ def test_missing_device_is_reported_and_used_when_it_appears(world: World) -> No
     drone.start()
     client = world.client(drone, 100_000, 0.1)
     until(lambda: drone.condition("app-d1-e1", "Linked").get("reason") == "DeviceMissing", "the condition", world)
-    until(lambda: client.by == "cloud", "a reply of the cloud", world)
+    until(lambda: client.last_server == "cloud", "a reply of the cloud", world)
     drone.regain_radio()
-    until(lambda: client.by == "e1", "a reply over the link", world)
+    until(lambda: client.last_server == "e1", "a reply over the link", world)
     drone.lose_radio()
-    until(lambda: client.by == "cloud", "a reply of the cloud", world)
+    until(lambda: client.last_server == "cloud", "a reply of the cloud", world)
     drone.regain_radio()
-    until(lambda: client.by == "e1", "a reply over the link again", world)
+    until(lambda: client.last_server == "e1", "a reply over the link again", world)
 
 
 def test_unpaired_node_reaches_nothing_over_the_link(world: World) -> None:
     edge = world.edge("e1", 20.0)
-    drone = flying(world, edge)
+    drone = start_drone(world, edge)
     stranger = world.drone("d9")
     client = world.client(drone, 100_000, 0.1)
-    until(lambda: client.by == "e1", "a reply over the link", world)
+    until(lambda: client.last_server == "e1", "a reply over the link", world)
     stranger.join(str(link_address("d9")))
     (route,) = edge.redirects()
     port = int(route.split(" . ")[2])
@@ -258,7 +258,7 @@ def test_unpaired_node_reaches_nothing_over_the_link(world: World) -> None:
     world.python("e1", LISTENER, 10250)
     assert not stranger.reaches(str(link_address("e1")), 10250)
     assert drone.reaches(f"10.90.{edge.number}.1", 10250)  # over the cloud: the node's own business
-    assert client.by == "e1"
+    assert client.last_server == "e1"
 
 
 LISTENER = """
@@ -274,62 +274,62 @@ def test_a_hundred_changes_in_a_minute_end_in_the_last_state(world: World) -> No
     edge = world.edge("e1", 20.0)
     drone = world.drone()
     before = world.states()
-    flying(world, edge)
+    start_drone(world, edge)
     client = world.client(drone, 100_000, 0.05)
-    until(lambda: client.by == "e1", "a reply over the link", world)
+    until(lambda: client.last_server == "e1", "a reply over the link", world)
     for number in range(100):
         world.command(station="d1", off=number % 2 == 0)
         time.sleep(0.2 if number % 7 else 1.5)
     world.command(station="d1", off=False)
-    until(lambda: client.by == "e1", "a reply over the link", world, timeout_s=120)
+    until(lambda: client.last_server == "e1", "a reply over the link", world, timeout_s=120)
     assert len(drone.redirects()) == 1
     assert len(edge.redirects()) == 1
     assert drone.addresses() == [f"{link_address('d1')}/16"]
-    unchanged(world, before)
-    until(lambda: client.by == "cloud", "a reply of the cloud", world)
+    check_restored(world, before)
+    until(lambda: client.last_server == "cloud", "a reply of the cloud", world)
 
 
 def test_uplink_loss_does_not_affect_direct_traffic(world: World) -> None:
     edge = world.edge("e1", 20.0)
-    drone = flying(world, edge)
+    drone = start_drone(world, edge)
     client = world.client(drone, 100_000, 0.05)
-    until(lambda: client.by == "e1", "a reply over the link", world)
+    until(lambda: client.last_server == "e1", "a reply over the link", world)
     until(lambda: drone.status("app-d1-e1").get("traffic") == "direct", "the status", world)
     drone.uplink(up=False)
     for agent in (drone, edge):
         agent.api(up=False)
-    before = len(client.answers)
-    until(lambda: len(client.answers) > before + 200, "answers", world)
-    assert {answer[1] for answer in client.answers[before + 1 :]} == {"e1"}
+    before = len(client.responses)
+    until(lambda: len(client.responses) > before + 200, "answers", world)
+    assert {answer[1] for answer in client.responses[before + 1 :]} == {"e1"}
     assert drone.addresses() == [f"{link_address('d1')}/16"]
     drone.uplink(up=True)
     for agent in (drone, edge):
         agent.api(up=True)
     drone.fly(-57.0, velocity=(-3.0, 0.0, 0.0))
-    until(lambda: client.by == "cloud", "a reply of the cloud", world)
+    until(lambda: client.last_server == "cloud", "a reply of the cloud", world)
     until(lambda: drone.status("app-d1-e1").get("traffic") == "cloud", "the status", world)
     assert not client.failed
 
 
 def test_unreachable_cloud_path_is_left_even_if_it_was_better(world: World) -> None:
     edge = world.edge("e1", 20.0)
-    drone = flying(world, edge)
+    drone = start_drone(world, edge)
     client = world.client(drone, 100_000, 0.05)
-    until(lambda: client.by == "e1", "a reply over the link", world)
+    until(lambda: client.last_server == "e1", "a reply over the link", world)
     drone.describe(uplink_mbps=900)
-    until(lambda: client.by == "cloud", "a reply of the cloud", world)
+    until(lambda: client.last_server == "cloud", "a reply of the cloud", world)
     drone.uplink(up=False)
     for agent in (drone, edge):
         agent.api(up=False)
-    until(lambda: client.by == "e1", "an answer over the link, though the cloud path declares more", world)
-    cut = len(client.answers)
-    until(lambda: len(client.answers) > cut + 100, "more of them", world)
-    assert {answer[1] for answer in client.answers[cut:]} == {"e1"}
+    until(lambda: client.last_server == "e1", "an answer over the link, though the cloud path declares more", world)
+    cut = len(client.responses)
+    until(lambda: len(client.responses) > cut + 100, "more of them", world)
+    assert {answer[1] for answer in client.responses[cut:]} == {"e1"}
     drone.uplink(up=True)
     for agent in (drone, edge):
         agent.api(up=True)
-    until(lambda: client.by == "cloud", "an answer of the cloud, which is the better path again", world)
-    assert "FAILED" not in {answer[1] for answer in client.answers[cut:]}
+    until(lambda: client.last_server == "cloud", "an answer of the cloud, which is the better path again", world)
+    assert "FAILED" not in {answer[1] for answer in client.responses[cut:]}
     until(lambda: drone.status("app-d1-e1").get("traffic") == "cloud", "the status", world)
 
 
@@ -337,16 +337,16 @@ def test_agent_killed_during_a_switch_recovers(world: World) -> None:
     edge = world.edge("e1", 20.0)
     drone = world.drone()
     before = world.states()
-    flying(world, edge)
+    start_drone(world, edge)
     world.python("d1p", STREAM, f"{VIP.address}:{VIP.port}")  # never idle, so that a switch takes all its time
     client = world.client(drone, 100_000, 0.1)
-    until(lambda: client.by == "e1", "a reply over the link", world)
+    until(lambda: client.last_server == "e1", "a reply over the link", world)
     drone.fly(-57.0, velocity=(-3.0, 0.0, 0.0))
     until(lambda: not drone.redirects(), "the switch", world)
     drone.kill()  # its old connections are being drained
     drone.fly(0.0)
     drone.start()
-    until(lambda: client.by == "e1", "a reply over the link again", world)
+    until(lambda: client.last_server == "e1", "a reply over the link again", world)
     assert len(drone.redirects()) == 1
-    unchanged(world, before)
-    until(lambda: client.by == "cloud", "a reply of the cloud", world)
+    check_restored(world, before)
+    until(lambda: client.last_server == "cloud", "a reply of the cloud", world)

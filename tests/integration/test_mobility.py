@@ -59,15 +59,15 @@ async def test_mobility_mission_applies_corrections_and_denials(rig: Rig) -> Non
     assert first.position.altitude_m == pytest.approx(15.0, abs=1.0)
     assert math.dist(xy(first.position), (0, 40)) < 1.5
 
-    code, why = await denied(flown(driver.going(-50, 0)))
+    code, why = await denied(flown(driver.start_goto(-50, 0)))
     assert (code, why.code) == (grpc.StatusCode.PERMISSION_DENIED, "InsideExclusionZone")
     assert why.action == Decision.ACTION_DENY
     assert list(why.policies) == ["no-fly"]
-    code, why = await denied(flown(driver.going(-80, -20)))
+    code, why = await denied(flown(driver.start_goto(-80, -20)))
     assert why.code == "LegThroughExclusionZone"
-    code, why = await denied(flown(driver.going(0, 150)))
+    code, why = await denied(flown(driver.start_goto(0, 150)))
     assert (code, why.code) == (grpc.StatusCode.PERMISSION_DENIED, "OutsideOperationArea")
-    code, why = await denied(flown(driver.going(0, 20, math.nan)))
+    code, why = await denied(flown(driver.start_goto(0, 20, math.nan)))
     assert code == grpc.StatusCode.INVALID_ARGUMENT
     assert why.code == "InvalidArgument"
 
@@ -230,7 +230,7 @@ async def test_cancelled_goto_stops_drone(rig: Rig) -> None:
     rig.start_vehicle(1.0)
     driver = Driver(rig)
     await driver.up()
-    going = driver.going(0, 90)
+    going = driver.start_goto(0, 90)
     await going.read()
     await rig.until(lambda t: t.velocity.north_mps > 3)
     going.cancel()

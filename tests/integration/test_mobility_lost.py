@@ -39,7 +39,7 @@ def speed(telemetry: pb.Telemetry) -> float:
 
 async def test_lost_driver_causes_hover_then_return(rig: Rig) -> None:
     driver = await flying(rig)
-    going = driver.going(0, 90)
+    going = driver.start_goto(0, 90)
     await rig.until(lambda t: t.velocity.north_mps > 3)
     await driver.channel.close()
     del going
@@ -69,7 +69,7 @@ async def test_driver_resumes_control_within_grace(rig: Rig) -> None:
 
 async def test_killed_service_resumes_flight_after_restart(rig: Rig) -> None:
     driver = await flying(rig, speedup=1.0)
-    going = driver.going(0, 90)
+    going = driver.start_goto(0, 90)
     await rig.until(lambda t: t.velocity.north_mps > 3)
     del going
     rig.kill("service")
@@ -135,7 +135,7 @@ async def first(driver: Driver) -> None:
 
 async def test_zone_added_in_flight_stops_drone(rig: Rig) -> None:
     driver = await flying(rig, speedup=1.0)
-    going = driver.going(0, 90)
+    going = driver.start_goto(0, 90)
     await rig.until(lambda t: xy(t.position)[1] > 5)
     rig.write_grant(grant(fence("new", "exclusion", "ignore", -30, 50, 30, 70)))
     code, why = await denied(flown(going))
@@ -163,7 +163,7 @@ async def test_zone_added_around_drone_revokes_control_and_lands(rig: Rig) -> No
 @pytest.mark.parametrize("action", ["land", "returnToLaunch", "revoke"])
 async def test_goto_into_zone_with_takeover_action_ends_mission(rig: Rig, action: str) -> None:
     driver = await flying(rig, fence("no-fly", "exclusion", action, -60, -10, -40, 10))
-    code, why = await denied(flown(driver.going(-50, 0)))
+    code, why = await denied(flown(driver.start_goto(-50, 0)))
     assert code == grpc.StatusCode.PERMISSION_DENIED
     assert why.action == why.ACTION_TAKEOVER
     await driver.next(LOST, 15)
@@ -175,7 +175,7 @@ async def test_goto_into_zone_with_takeover_action_ends_mission(rig: Rig, action
 
 async def test_grant_removed_in_flight_returns_drone_home(rig: Rig) -> None:
     driver = await flying(rig)
-    going = driver.going(0, 90)
+    going = driver.start_goto(0, 90)
     await rig.until(lambda t: t.velocity.north_mps > 3)
     (rig.grants / "app-navigator.json").unlink()
     code, why = await denied(flown(going))
@@ -198,7 +198,7 @@ async def test_corrupt_grant_file_revokes_control(rig: Rig) -> None:
 
 async def test_pilot_mode_change_ends_control_of_driver(rig: Rig) -> None:
     driver = await flying(rig)
-    going = driver.going(0, 90)
+    going = driver.start_goto(0, 90)
     await rig.until(lambda t: t.velocity.north_mps > 3)
     pilot = MavlinkAutopilot(rig.link, ARDUCOPTER)
     task = asyncio.create_task(pilot.run())
@@ -229,9 +229,9 @@ async def test_suspended_driver_process_is_detected_as_lost(rig: Rig) -> None:
     await rig.until(lambda t: t.ready and t.HasField("position"), 20)
     rig.start_driver()
     await rig.until(lambda t: t.controller == DRIVER and t.position.altitude_m > 8, 30, "flight of the other process")
-    rig.tell("driver", signal.SIGSTOP)
+    rig.send_signal("driver", signal.SIGSTOP)
     await rig.until(lambda t: t.controller == "system", 20, "loss of the driver")
-    rig.tell("driver", signal.SIGCONT)
+    rig.send_signal("driver", signal.SIGCONT)
 
 
 async def test_partial_control_begins_at_control_point_after_transit(rig: Rig) -> None:

@@ -48,12 +48,12 @@ def endpoint(rig: Rig, identity: str = DRIVER, **how: float) -> Endpoint:
 
 async def restart(rig: Rig) -> None:
     """Kill the service and start it again, out of the vehicle's time: five of its seconds later it would fly home."""
-    rig.tell("vehicle", signal.SIGSTOP)
+    rig.send_signal("vehicle", signal.SIGSTOP)
     rig.kill("service")
     rig.start_service("--driver-grace", "15")
     async with asyncio.timeout(60):
         await rig.channel(DRIVER).channel_ready()
-    rig.tell("vehicle", signal.SIGCONT)
+    rig.send_signal("vehicle", signal.SIGCONT)
 
 
 async def test_sdk_mission_survives_service_restart_and_takeover(rig: Rig) -> None:

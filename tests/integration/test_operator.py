@@ -12,7 +12,7 @@ from control_plane import wait_for
 from cryptography import x509
 from fractus_core.api import Grant
 from fractus_core.policy.grant_signatures import SIGNATURE_ANNOTATION, BadSignature, read_authorities, verify
-from operator_world import FRACTUS, OperatorProcess, World, at, component, navigator, ours, traffic, viewer
+from operator_world import FRACTUS, OperatorProcess, World, at, component, fractus_object, navigator, traffic, viewer
 
 INSTANCES = {
     "traffic-navigator": "drone-1",
@@ -152,9 +152,9 @@ def test_restarted_operator_changes_nothing(world: World, operator: OperatorProc
     operator.stop(how)
     operator.start()
     # A new zone's condition tells that the new operator is at work; then it has long seen the application.
-    world.put(ours("Zone", "beacon", {"area": {"circle": {"center": at(0, 0), "radius": 10}}}))
+    world.put(fractus_object("Zone", "beacon", {"area": {"circle": {"center": at(0, 0), "radius": 10}}}))
     wait_for(lambda: _ready(world, "zones", "beacon") == "True", "the restarted operator")
-    world.put(ours("Application", "second", traffic(namespace)["spec"], namespace))
+    world.put(fractus_object("Application", "second", traffic(namespace)["spec"], namespace))
     world.phase(namespace, "Queued", "second")
     assert versions(world, namespace) == before
 
@@ -583,13 +583,13 @@ def test_object_of_another_owner_is_not_taken_over(world: World, operator: Opera
 
 def test_policy_with_missing_zone_grants_nothing(world: World, operator: OperatorProcess, namespace: str) -> None:
     spec = {"type": "GeofenceControl", "kind": "exclusion", "selector": {"zones": ["school"]}}
-    world.put(ours("Policy", "no-school", spec))
+    world.put(fractus_object("Policy", "no-school", spec))
     wait_for(lambda: _ready(world, "policies", "no-school") == "False", "the policy's condition")
     world.put(traffic(namespace))
     wait_for(lambda: world.condition(namespace, "Granted").get("status") == "False", "the refusal")
     assert "school" in world.condition(namespace, "Granted")["message"]
     assert world.children(namespace) == {}
-    world.put(ours("Zone", "school", {"area": {"circle": {"center": at(30, 30), "radius": 5}}}))
+    world.put(fractus_object("Zone", "school", {"area": {"circle": {"center": at(30, 30), "radius": 5}}}))
     world.phase(namespace, "Deploying")
     wait_for(lambda: _ready(world, "policies", "no-school") == "True", "the policy's condition")
     policies = [p["name"] for g in world.grants(namespace) for p in g["spec"].get("policies", [])]
@@ -600,7 +600,7 @@ def test_new_policy_updates_grants_of_running_application(
     world: World, operator: OperatorProcess, namespace: str
 ) -> None:
     running(world, namespace)
-    world.put(ours("Policy", "low", {"type": "LimitControl", "kind": "altitude", "upperLimit": 15}))
+    world.put(fractus_object("Policy", "low", {"type": "LimitControl", "kind": "altitude", "upperLimit": 15}))
     wait_for(
         lambda: all("low" in [p["name"] for p in g["spec"].get("policies", [])] for g in world.grants(namespace)),
         "the policy",
@@ -701,7 +701,7 @@ def test_change_in_flight_waits_for_landing(world: World, operator: OperatorProc
     assert (waits["status"], waits["reason"]) == ("False", "WaitsForLanding")
     assert "when drone-1 has landed" in waits["message"]
     assert world.status(namespace)["phase"] == "Flying"
-    world.put(ours("Policy", "low", {"type": "LimitControl", "kind": "altitude", "upperLimit": 15}))
+    world.put(fractus_object("Policy", "low", {"type": "LimitControl", "kind": "altitude", "upperLimit": 15}))
     wait_for(
         lambda: all("low" in [p["name"] for p in g["spec"].get("policies", [])] for g in world.grants(namespace)),
         "the policy, which waits for nothing",

@@ -25,7 +25,6 @@ from operator_world import (
     component,
     denied,
     navigator,
-    ours,
     traffic,
 )
 
@@ -110,19 +109,25 @@ def test_bad_application_is_refused_without_child_objects(
 
 def test_policy_with_invalid_or_unknown_zone_is_not_ready(world: World, operator: OperatorProcess) -> None:
     ring = [at(0, 0), at(50, 50), at(0, 50), at(50, 0)]
-    world.put(ours("Zone", "bowtie", {"area": {"polygon": {"exterior": ring}}}))
+    world.put(fractus_object("Zone", "bowtie", {"area": {"polygon": {"exterior": ring}}}))
     world.put(
-        ours("Policy", "nowhere", {"type": "GeofenceControl", "kind": "exclusion", "selector": {"zones": ["nowhere"]}})
+        fractus_object(
+            "Policy", "nowhere", {"type": "GeofenceControl", "kind": "exclusion", "selector": {"zones": ["nowhere"]}}
+        )
     )
     world.put(
-        ours("Policy", "knot", {"type": "GeofenceControl", "kind": "exclusion", "selector": {"zones": ["bowtie"]}})
+        fractus_object(
+            "Policy", "knot", {"type": "GeofenceControl", "kind": "exclusion", "selector": {"zones": ["bowtie"]}}
+        )
     )
 
     teeth = [*((0.02 * i, 100.0 * (i % 2)) for i in range(400)), (9.0, 101.0), (-1.0, 101.0)]
     for name, corners in (("north", teeth), ("east", [(y, x) for x, y in teeth])):
-        world.put(ours("Zone", name, {"area": {"polygon": {"exterior": [at(*corner) for corner in corners]}}}))
+        world.put(
+            fractus_object("Zone", name, {"area": {"polygon": {"exterior": [at(*corner) for corner in corners]}}})
+        )
     both = {"type": "GeofenceControl", "kind": "inclusion", "selector": {"zones": ["north", "east"]}}
-    world.put(ours("Policy", "both", both))
+    world.put(fractus_object("Policy", "both", both))
 
     def ready(plural: str, name: str) -> Body | None:
         conditions = ((world.api.get(f"{FRACTUS}/{plural}/{name}") or {}).get("status") or {}).get("conditions") or ()
@@ -146,7 +151,7 @@ def test_corrected_application_is_deployed(world: World, operator: OperatorProce
     manifest["spec"]["components"][0]["controlPoints"][0]["point"] = {"depot": "late"}
     world.put(manifest)
     world.phase(namespace, "Invalid")
-    world.put(ours("Depot", "late", {"location": at(0, 0), "radius": 30}))
+    world.put(fractus_object("Depot", "late", {"location": at(0, 0), "radius": 30}))
     world.phase(namespace, "Deploying")
 
 

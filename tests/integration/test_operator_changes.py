@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 from control_plane import ControlPlane, wait_for
-from operator_world import FRACTUS, OperatorProcess, World, at, component, ours, traffic
+from operator_world import FRACTUS, OperatorProcess, World, at, component, fractus_object, traffic
 from test_operator import deployed, end_mission, events, running
 
 Body = dict[str, Any]
@@ -22,7 +22,7 @@ def guest(namespace: str, name: str = "guest", points: list[Body] | None = None)
     services = [{"service": "camera", "methods": ["CaptureImage"]}]
     camera = component("Camera", "drone", **{"class": "passenger"}, services=services)
     camera["pointsOfInterest"] = {"points": points or VISITS}
-    return ours("Application", name, {"components": [camera]}, namespace)
+    return fractus_object("Application", name, {"components": [camera]}, namespace)
 
 
 def instances(world: World, namespace: str, prefix: str) -> set[str]:
@@ -167,8 +167,8 @@ def test_policy_conflict_is_reported_before_takeoff_until_policy_is_deleted(
 ) -> None:
     running(world, namespace)
     fence = {"type": "GeofenceControl", "kind": "exclusion", "selector": {"zones": ["across"]}}
-    world.put(ours("Zone", "across", {"area": {"circle": {"center": at(30, 30), "radius": 5}}}))
-    policy = ours("Policy", "across", fence)
+    world.put(fractus_object("Zone", "across", {"area": {"circle": {"center": at(30, 30), "radius": 5}}}))
+    policy = fractus_object("Policy", "across", fence)
     world.put(policy)
     told = wait_for(lambda: world.condition(namespace, "PolicyConflict"), "the condition PolicyConflict")
     assert told["status"] == "True"

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from control_plane import wait_for
 from fractus_runtime.kubernetes import KubeError
-from operator_world import FRACTUS, OperatorProcess, World, at, navigator, ours, traffic
+from operator_world import FRACTUS, OperatorProcess, World, at, fractus_object, navigator, traffic
 from test_operator import deployed, end_mission, gone, running
 
 Body = dict[str, Any]
@@ -158,7 +158,7 @@ def test_policy_change_reaches_grant_of_application_in_trouble(
     world: World, operator: OperatorProcess, namespace: str, trouble: Any
 ) -> None:
     _in_trouble(world, namespace, trouble)
-    world.put(ours("Policy", "low", LOW))
+    world.put(fractus_object("Policy", "low", LOW))
     wait_for(lambda: granted(world, namespace) == ["low"], lambda: f"the policy: {operator.log()[-3000:]}")
     world.api.delete(f"{FRACTUS}/policies/low")
     wait_for(lambda: granted(world, namespace) == [], "the policy to go")
@@ -185,21 +185,21 @@ def test_certificate_is_renewed_for_application_in_trouble(
 def test_refreshed_grant_keeps_previous_version_of_broken_policy(
     world: World, operator: OperatorProcess, namespace: str
 ) -> None:
-    school = ours("Zone", "school", {"area": {"circle": {"center": at(30, 30), "radius": 5}}})
+    school = fractus_object("Zone", "school", {"area": {"circle": {"center": at(30, 30), "radius": 5}}})
     world.put(school)
     fence = {"type": "GeofenceControl", "kind": "exclusion", "selector": {"zones": ["school"]}}
-    world.put(ours("Policy", "fence", fence))
-    world.put(ours("Policy", "odd", LOW))
+    world.put(fractus_object("Policy", "fence", fence))
+    world.put(fractus_object("Policy", "odd", LOW))
     running(world, namespace)
     assert granted(world, namespace) == ["fence", "odd"]
     world.api.delete(f"{FRACTUS}/zones/school")
     with older_policies(world):
-        wait_for(lambda: let_in(world, ours("Policy", "odd", UNREADABLE)), "the API server to let it in")
+        wait_for(lambda: let_in(world, fractus_object("Policy", "odd", UNREADABLE)), "the API server to let it in")
     condition = wait_for(
         lambda: policy_ready(world, "odd").get("status") == "False" and policy_ready(world, "odd"), "it"
     )
     assert (condition["reason"], "validFrom" in condition["message"]) == ("Invalid", True)
-    world.put(ours("Policy", "slow", {"type": "LimitControl", "kind": "speed", "upperLimit": 3}))
+    world.put(fractus_object("Policy", "slow", {"type": "LimitControl", "kind": "speed", "upperLimit": 3}))
     wait_for(lambda: granted(world, namespace) == ["fence", "odd", "slow"], "the third policy beside the broken ones")
     assert world.status(namespace)["phase"] == "Waiting"
     # A new Application gets no grant while the scope of the unreadable policy is unknown.
@@ -208,7 +208,7 @@ def test_refreshed_grant_keeps_previous_version_of_broken_policy(
     assert "Policy odd" in reason(world, namespace, "PolicyInvalid", "second")["message"]
     assert not world.grants(namespace, "second")
     world.put(school)
-    world.put(ours("Policy", "odd", LOW))
+    world.put(fractus_object("Policy", "odd", LOW))
     world.phase(namespace, "Deploying", "second")
 
 
@@ -284,7 +284,7 @@ def test_deleted_drone_in_flight_keeps_its_grants(world: World, operator: Operat
     world.api.delete(f"{FRACTUS}/drones/drone-1")
     world.api.delete("/api/v1/nodes/drone-1")
     reconciled(world, namespace)
-    world.put(ours("Policy", "low", LOW))
+    world.put(fractus_object("Policy", "low", LOW))
     wait_for(lambda: granted(world, namespace) == ["low"], "the policy")
     assert {g["metadata"]["name"]: g["metadata"]["uid"] for g in world.grants(namespace)} == uids
     assert world.status(namespace)["drone"] == "drone-1"

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from control_plane import wait_for
 from fractus_runtime.kubernetes import ContentType
-from operator_world import FRACTUS, OperatorProcess, World, at, component, ours, traffic
+from operator_world import FRACTUS, OperatorProcess, World, at, component, fractus_object, traffic
 from test_operator import deployed, end_mission, events, gone, running
 
 Body = dict[str, Any]
@@ -132,7 +132,7 @@ def test_direct_links_of_another_release_are_corrected(world: World, operator: O
     old = copy.deepcopy(link["spec"])
     del old["path"]
     old["range"] = 5
-    left_over = ours("DirectLink", f"{namespace}.traffic-drone-1-long-ago", {**old, "node": "long-ago"})
+    left_over = fractus_object("DirectLink", f"{namespace}.traffic-drone-1-long-ago", {**old, "node": "long-ago"})
     left_over["metadata"]["labels"] = link["metadata"]["labels"]
     steps = [{"op": "replace", "path": "/spec", "value": old}, {"op": "remove", "path": "/metadata/annotations"}]
     world.api.call("PATCH", f"{FRACTUS}/directlinks/{name}", steps, content_type=ContentType.JSON_PATCH)
@@ -188,7 +188,7 @@ def test_direct_links_of_two_applications_on_one_drone_are_separate(
     camera = component("Camera", "drone", **{"class": "passenger"}, services=services, egress=["Sorter"])
     camera["pointsOfInterest"] = {"points": [at(15, 15, alt=12), at(45, 45, alt=17)]}
     sorter = component("Sorter", "hybrid", hybridTo=["Camera"], ingress=["Camera"])
-    world.put(ours("Application", "guest", {"components": [camera, sorter]}, namespace))
+    world.put(fractus_object("Application", "guest", {"components": [camera, sorter]}, namespace))
     wait_for(lambda: world.links(namespace, "guest"), lambda: f"links; {world.status(namespace, 'guest')}")
     deployed(world, namespace, "guest", 1)
     guests = world.links(namespace, "guest")

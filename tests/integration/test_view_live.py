@@ -13,7 +13,7 @@ import pytest
 from axe_playwright_python.sync_playwright import Axe
 from browser import CHROMIUM, SOFTWARE_GL, TIMEOUT_MS, launched, opened, serving
 from control_plane import ControlPlane
-from operator_world import FRACTUS, World, at, ours, traffic
+from operator_world import FRACTUS, World, at, fractus_object, traffic
 from playwright.sync_api import expect, sync_playwright
 
 pytestmark = [
@@ -84,9 +84,9 @@ def test_view_page_shows_cluster_live_and_stale_when_api_server_is_unreachable(
         control_plane.kubeconfig.read_text().replace(control_plane.server, f"https://127.0.0.1:{proxy.port}")
     )
     area = {"circle": {"center": at(40, 80), "radius": 30}}
-    world.put(ours("Zone", "school", {"area": area, "altitude": {"lower": 0, "upper": 30}}))
+    world.put(fractus_object("Zone", "school", {"area": area, "altitude": {"lower": 0, "upper": 30}}))
     fence = {"type": "GeofenceControl", "kind": "exclusion", "selector": {"zones": ["school"]}}
-    world.put(ours("Policy", "no-school", fence))
+    world.put(fractus_object("Policy", "no-school", fence))
     world.put(traffic(namespace))
     drone = f"{FRACTUS}/drones/drone-1/status"
     with (

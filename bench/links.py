@@ -36,7 +36,7 @@ def main() -> int:
         edge.plan(link)
         drone.plan(link)
         client = world.client(drone, 1_000_000, 0.1)
-        until(lambda: client.by == "e1", "a reply over the link", world)
+        until(lambda: client.last_server == "e1", "a reply over the link", world)
         time.sleep(5.0)
         report.add("drone_linked", cpu_percent(drone.pid, seconds))
         report.add("edge_linked", cpu_percent(edge.pid, seconds))

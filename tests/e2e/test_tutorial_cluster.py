@@ -17,7 +17,7 @@ ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "tutorial.md").read_text()
 NAME = "tutorial-e2e"
 BEGINS = "## 6. "
-ENDS = "## When it does not fly"
+ENDS = "## If it does not fly"
 TIMEOUT_S = 1500
 pytestmark = [
     pytest.mark.slow,

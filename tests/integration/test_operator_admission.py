@@ -24,6 +24,7 @@ from operator_world import (
     at,
     component,
     denied,
+    fractus_object,
     navigator,
     traffic,
 )

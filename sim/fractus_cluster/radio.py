@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from fractus_core.api.geometry import Home
+from fractus_core.api.geometry import VehicleHome
 
 from fractus_cluster import network
 from fractus_cluster.cgroups import cluster_branch
@@ -134,7 +134,7 @@ def _station(node: Node) -> dict[str, Any] | None:
     }
 
 
-def _place(home: Home) -> dict[str, float]:
+def _place(home: VehicleHome) -> dict[str, float]:
     return {"lat": home.lat, "lon": home.lon, "alt": home.alt}
 
 

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 from urllib.parse import urlsplit
 
 from fractus_core.api import API_VERSION, Drone, EdgeNode, InvalidObject, Resource
-from fractus_core.api.geometry import Home
+from fractus_core.api.geometry import VehicleHome
 from fractus_core.api.names import DNS_LABEL
 from fractus_core.documents import BadDocument, Documents, dump_documents, parse_document
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
@@ -64,7 +64,7 @@ class VehicleHardware(_Frozen):
         arguments: Additional arguments of `fractus-vehicle`.
     """
 
-    home: Home | None = None
+    home: VehicleHome | None = None
     listen: str | None = None
     arguments: tuple[str, ...] = ()
 
@@ -250,7 +250,7 @@ class NodeSpec(_Frozen):
         kind = "Drone" if self.node_class == "drone" else "EdgeNode"
         return {"apiVersion": API_VERSION, "kind": kind, "metadata": {"name": self.name}, "spec": self.description}
 
-    def vehicle(self) -> tuple[Home, str, tuple[str, ...]] | None:
+    def vehicle(self) -> tuple[VehicleHome, str, tuple[str, ...]] | None:
         """Return home, autopilot endpoint and additional arguments of the node's vehicle. Return None without vehicle.
 
         Raises:
@@ -286,18 +286,18 @@ class NodeSpec(_Frozen):
         url = _dig(self.description, "services", "camera", "connection")
         return url if isinstance(url, str) else "test:"
 
-    def place(self) -> Home | None:
+    def place(self) -> VehicleHome | None:
         """Return the start position of the node, or None if it is not specified."""
         vehicle = self.hardware.vehicle
         if vehicle is not None and vehicle.home is not None:
             return vehicle.home
         return self._location()
 
-    def _location(self) -> Home | None:
+    def _location(self) -> VehicleHome | None:
         location = _dig(self.description, "location")
         if not isinstance(location, dict) or "lat" not in location or "lon" not in location:
             return None
-        return Home(lat=location["lat"], lon=location["lon"], alt=location.get("alt") or 0.0)
+        return VehicleHome(lat=location["lat"], lon=location["lon"], alt=location.get("alt") or 0.0)
 
 
 class ClusterSpec(_Frozen):

@@ -24,7 +24,7 @@ class Point(Model):
     lon: Longitude
 
 
-class Home(Point):
+class VehicleHome(Point):
     """Home position of a vehicle."""
 
     alt: float = Field(

@@ -45,7 +45,7 @@ class LegLegality(Model):
     policies: tuple[str, ...] = Field(default=(), description="Names of the deciding policies, most restrictive first.")
 
 
-class Mission(Model):
+class PlannedMission(Model):
     """Estimated flight of the application, including the approach from and the return to the home position."""
 
     distance: float = Field(ge=0, description="Ground distance in metres.")
@@ -62,7 +62,7 @@ class DroneChoice(Model):
         default=None,
         description="namespace/name of the application that flies the drone, if this application shares its flight.",
     )
-    mission: Mission | None = Field(
+    mission: PlannedMission | None = Field(
         default=None, description="Estimated flight; unset if the application shares the flight of another application."
     )
     transit: tuple[TransitLeg, ...] = Field(default=(), description="Legs that the system flies, in order.")

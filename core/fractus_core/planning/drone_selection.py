@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from fractus_core.api.components import Component
 from fractus_core.api.geometry import Point
 from fractus_core.api.nodes import Drone
-from fractus_core.api.plans import Alternative, DroneChoice, Mission
+from fractus_core.api.plans import Alternative, DroneChoice, PlannedMission
 from fractus_core.geo import ground_point
 from fractus_core.planning.candidates import SUITABLE, Check, check_host, check_resources, check_services, readiness
 from fractus_core.planning.inventory import DroneFacts
@@ -296,9 +296,9 @@ def _too_long(drone: Drone, mission: Estimate, available_min: float, when: str) 
     )
 
 
-def _mission(estimate: Estimate, route: MissionRoute | None) -> Mission:
+def _mission(estimate: Estimate, route: MissionRoute | None) -> PlannedMission:
     flown = route if route is not None and route.legs and route.denied is None else estimate
-    return Mission(
+    return PlannedMission(
         distance=round(flown.distance_m, 1),
         duration=round(flown.needed_min, 3),
         available=round(estimate.available_min, 3),

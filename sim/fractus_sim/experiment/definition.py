@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
-from fractus_core.api.geometry import AltitudeBand, Area, Home
+from fractus_core.api.geometry import AltitudeBand, Area, VehicleHome
 from fractus_core.api.model import InvalidObject, Model
 from fractus_core.api.names import Name
 from fractus_core.documents import BadDocument, parse_document
@@ -57,7 +57,7 @@ class VehicleEntry(Model):
     count: int = Field(default=1, ge=1, le=MAX_VEHICLES)
     spacing: float = Field(default=10, gt=0, le=1000, description="Metres between the vehicles of a row.")
     bearing: float = Field(default=90, ge=0, lt=360, description="Direction in which the row extends, degrees.")
-    home: Home | None = None
+    home: VehicleHome | None = None
     heading: float = Field(default=0, ge=0, lt=360, description="Degrees.")
     parameters: dict[ParameterName, float] = Field(default_factory=dict, description="Autopilot parameters.")
     ready_after: float = Field(default=5, ge=1, le=120, description="Seconds until the autopilot is ready to arm.")
@@ -129,7 +129,7 @@ class VehicleSetup:
     name: str
     system_id: int
     entry: VehicleEntry
-    home: Home | None
+    home: VehicleHome | None
 
 
 class Experiment(Model):
@@ -244,13 +244,13 @@ def _unknown_tag(error: ValidationError) -> InvalidObject | None:
     return InvalidObject(f"{field}.{name}", f"unknown value {context['tag']}; {hint}")
 
 
-def _spread(entry: VehicleEntry, at: int) -> Home | None:
+def _spread(entry: VehicleEntry, at: int) -> VehicleHome | None:
     if entry.home is None or at == 0:
         return entry.home
     bearing = math.radians(entry.bearing)
     start = Place.from_degrees(entry.home.lat, entry.home.lon, entry.home.alt)
     there = start.offset(at * entry.spacing * math.cos(bearing), at * entry.spacing * math.sin(bearing))
-    return Home(lat=there.lat_e7 / 1e7, lon=there.lon_e7 / 1e7, alt=entry.home.alt)
+    return VehicleHome(lat=there.lat_e7 / 1e7, lon=there.lon_e7 / 1e7, alt=entry.home.alt)
 
 
 def _check_vehicles(experiment: Experiment) -> None:

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from fractus_agent.links.link_manager import LinkManager
-from fractus_agent.store import Event, KubeError, LinkEnd, Listed
+from fractus_agent.store import KubeError, LinkEnd, Listed, WatchEvent
 from fractus_core.api.nodes import Drone, EdgeNode
 from fractus_core.linking import TelemetrySample
 from fractus_runtime.metrics import serve_metrics
@@ -34,7 +34,7 @@ class FileStore:
         path = self._folder / name
         return json.loads(path.read_text()) if path.exists() else None
 
-    async def direct_links(self, _end: LinkEnd) -> AsyncGenerator[Event, None]:
+    async def direct_links(self, _end: LinkEnd) -> AsyncGenerator[WatchEvent, None]:
         before = None
         while True:
             links = self.read("links.json")

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from fractus_agent.links.device_addresses import link_address
-from fractus_agent.redirector.netlink import NETLINK_NETFILTER, NLM_F_ACK, Netlink, in_namespace, message
+from fractus_agent.redirector.netlink import NETLINK_NETFILTER, NLM_F_ACK, Netlink, encode_message, in_namespace
 from fractus_agent.redirector.nft_maps import Endpoint
 from fractus_core.identity.authority import Authority
 from fractus_core.local_frame import LocalFrame
@@ -478,7 +478,7 @@ def _forget_connections() -> None:
     netlink = Netlink(NETLINK_NETFILTER)
     try:
         sequence = netlink.sequence()
-        netlink.send(message(1 << 8 | 2, NLM_F_ACK, sequence, b"\x02\0\0\0"))
+        netlink.send(encode_message(1 << 8 | 2, NLM_F_ACK, sequence, b"\x02\0\0\0"))
         netlink.acknowledged({sequence})
     finally:
         netlink.close()

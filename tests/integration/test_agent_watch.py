@@ -16,13 +16,13 @@ from fractus_agent.store import (
     Changed,
     Conflict,
     Deleted,
-    Event,
     Expired,
     GrantList,
     Invalid,
     KubeError,
     Listed,
     Store,
+    WatchEvent,
     WatchTimes,
     connect,
 )
@@ -30,7 +30,7 @@ from fractus_core.api.grants import ReportedGrant
 
 pytestmark = [pytest.mark.timeout(300), pytest.mark.xdist_group("agent-watch")]  # they share an API server
 WAIT_TIMEOUT_S = 30.0
-WatchItem = TypeVar("WatchItem", Event, GrantList)
+WatchItem = TypeVar("WatchItem", WatchEvent, GrantList)
 
 
 @pytest.fixture(scope="module")
@@ -86,7 +86,7 @@ async def following(events: AsyncIterator[WatchItem]) -> WatchItem:
     return await asyncio.wait_for(anext(events), WAIT_TIMEOUT_S)
 
 
-async def until(events: AsyncIterator[Event], wanted: type[Event]) -> Event:
+async def until(events: AsyncIterator[WatchEvent], wanted: type[WatchEvent]) -> WatchEvent:
     async with asyncio.timeout(WAIT_TIMEOUT_S):
         async for event in events:
             if isinstance(event, wanted):
@@ -103,7 +103,7 @@ async def served(watched: Store) -> None:
     assert not done
 
 
-def names(event: Event) -> set[str]:
+def names(event: WatchEvent) -> set[str]:
     assert isinstance(event, Listed)
     return {g["metadata"]["name"] for g in event.objects}
 

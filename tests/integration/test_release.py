@@ -166,4 +166,4 @@ def test_notes_warn_about_another_image_tag(
     assert result.returncode == 0, result.stderr
     notes = result.stdout.partition("NOTES:")[2]
     assert f"from the images ghcr.io/some-one/fractus/NAME:{tag or VERSION}." in notes
-    assert (f"images with the tag {VERSION}; --set image.tag= takes them" in notes) is warned
+    assert (f"images with the tag {VERSION}. Select them with --set image.tag=" in notes) is warned

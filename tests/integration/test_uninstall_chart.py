@@ -105,7 +105,7 @@ def test_wipe_is_refused_if_directory_contains_node_descriptions(state: str, con
     assert render(*set_)
     with pytest.raises(subprocess.CalledProcessError) as refused:
         render(*WIPE, *set_)
-    assert f"host.config, {config}, with the nodes' descriptions, is in host.state, {state}" in refused.value.stderr
+    assert f"host.config, {config}, with the node descriptions, is inside host.state, {state}" in refused.value.stderr
     assert render(*WIPE, "--set=host.state=/data/fractus", "--set=host.config=/data/fractus-config")
 
 

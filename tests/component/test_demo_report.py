@@ -39,9 +39,9 @@ def written(record: FlightRecord, tmp_path_factory: pytest.TempPathFactory) -> P
 def test_flight_metrics_are_computed_from_the_record(record: FlightRecord) -> None:
     assert record.track.max_altitude_m == pytest.approx(50.0, abs=0.2)
     assert record.track.distance_m == pytest.approx(796, abs=5), "geodesic sum of the legs"
-    assert record.takeoff_s == pytest.approx(demo_flight.TAKEOFF_S)
-    assert record.landing_s is not None
-    assert 100 < record.landing_s - record.takeoff_s < 110
+    assert record.track.takeoff_s == pytest.approx(demo_flight.TAKEOFF_S)
+    assert record.track.landing_s is not None
+    assert 100 < record.track.landing_s - record.track.takeoff_s < 110
 
 
 def test_repeated_policy_decisions_are_merged(record: FlightRecord) -> None:
@@ -187,7 +187,7 @@ def test_report_of_a_mission_without_flight_is_written(tmp_path: Path) -> None:
 
 def test_landing_time_is_none_while_in_the_air(record: FlightRecord) -> None:
     flying = replace(record, samples=record.samples[:100])
-    assert flying.landing_s is None
+    assert flying.track.landing_s is None
     assert "is still in the air" in mission_page(flying)
 
 

@@ -14,9 +14,10 @@ import yaml
 from click.testing import CliRunner
 from fractus_services.recording import messages
 from fractus_services.recording.segment_writer import SegmentWriter
-from fractus_sim.demo import live_view, mission_data
+from fractus_sim.demo import mission_data
 from fractus_sim.demo.__main__ import demo
 from fractus_sim.demo.demo_clusters import assign_nodes
+from fractus_sim.demo.demo_run import live_view, replay_command
 from fractus_sim.demo.mission_data import extract_pictures, fetch_audit_logs, fetch_recordings, select_pictures
 from fractus_sim.errors import ExperimentError
 from fractus_sim.progress import Progress
@@ -256,7 +257,7 @@ def test_traffic_path_change_is_reported_once() -> None:
 def test_mission_recordings_are_kept_and_the_replay_command_is_printed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, began: str
 ) -> None:
-    assert live_view.replay_command(tmp_path) is None
+    assert replay_command(tmp_path) is None
     kubectl = tmp_path / "kubectl"
     kubectl.write_text('#!/bin/sh\nif [ "$1" = get ]; then echo fractus-mobility-x; else shift 5; exec "$@"; fi\n')
     kubectl.chmod(0o755)
@@ -270,7 +271,7 @@ def test_mission_recordings_are_kept_and_the_replay_command_is_printed(
     recordings = fetch_recordings(Kube(kubectl, kubectl, tmp_path), "drone-1", applied_s, tmp_path)
     assert [path.name for path in recordings] == [f"mobility-000002-{began}.mcap"]
     assert recordings[0].read_text() == f"000002-{began}"
-    assert live_view.replay_command(tmp_path) == f"fractus view {tmp_path}/recordings/*.mcap"
+    assert replay_command(tmp_path) == f"fractus view {tmp_path}/recordings/*.mcap"
 
 
 def test_demo_continues_without_live_view(tmp_path: Path) -> None:
@@ -282,7 +283,7 @@ def test_demo_continues_without_live_view(tmp_path: Path) -> None:
         lines.append(line)
         reported.set()
 
-    with live_view.live_view(tmp_path / "config", report):
+    with live_view(tmp_path / "config", report):
         assert reported.wait(200)
     assert len(lines) == 1
     assert lines[0].startswith("live view not available: fractus: the kubeconfig")

@@ -46,10 +46,8 @@ class EmptyTestbed(Testbed):
 
     begin = collect = set_up
 
-    def cut_link(self, vehicle: str) -> None:
+    def set_link(self, vehicle: str, *, connected: bool) -> None:
         """Ignore the call."""
-
-    heal_link = power_off = power_on = cut_link
 
 
 def disk_full() -> OSError:

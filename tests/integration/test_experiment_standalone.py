@@ -65,7 +65,7 @@ def test_program_flies_until_its_companion_computer_loses_power(tmp_path: Path) 
         (tmp_path / "hold").unlink()
         drones.power_on("drone-1")
         wait_for_output(drones, "began", 2)
-        assert drones.wait_program("pilot", 30) == 0
+        assert drones.processes.wait_end("pilot", 30) == 0
         drones.check()
         tlog = str(drone.tlog)
     assert not subprocess.run(["pgrep", "-f", str(tmp_path)], capture_output=True, check=False).stdout

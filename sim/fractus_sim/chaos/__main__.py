@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import click
 
 from fractus_sim.chaos.chaos_cluster import DRONE, VEHICLE_PORT, VehicleWatch, chaos_cluster
 from fractus_sim.chaos.chaos_faults import FAULTS
-from fractus_sim.chaos.chaos_report import chaos_page
 from fractus_sim.chaos.chaos_run import ChaosRun, RunConfig, execute_run
 from fractus_sim.command_line import command_errors
-from fractus_sim.report.report_files import PAGE, write_page
+from fractus_sim.report.report_files import PAGE, format_duration, table, write_page
 
 
 def report(line: str) -> None:
@@ -58,6 +58,40 @@ def chaos(*, seeds: int, first_seed: int, minutes: float, kinds: tuple[str, ...]
         click.echo(f"seed {seed}: {violation.invariant}: {violation.description}")
     click.echo(f"{len(runs)} runs, {len(violations)} invariant violations; report: {out / PAGE}")
     sys.exit(1 if violations else 0)
+
+
+def chaos_page(runs: Sequence[ChaosRun], fault_time_s: float) -> str:
+    """Return the page in Markdown.
+
+    Args:
+        runs: Completed runs.
+        fault_time_s: Duration of fault injection per run, seconds.
+    """
+    violations = sum(len(run.violations) for run in runs)
+    headline = f"{violations} invariant violations." if violations else "Every invariant held."
+    head = ("Seed", "In the air", "Missions", "Events", "Audit entries", "Violations")
+    rows = [
+        (
+            str(run.seed),
+            format_duration(run.flown_s),
+            _phase_counts(run),
+            str(sum(":" in text for _, text in run.timeline)),
+            str(run.audit_entries),
+            "; ".join(f"{violation.invariant}: {violation.description}" for violation in run.violations) or "none",
+        )
+        for run in runs
+    ]
+    parts = ["# Chaos", f"{len(runs)} runs of {format_duration(fault_time_s)}. {headline}", table(head, rows)]
+    for run in runs:
+        events = [f"- {time_s:.1f} s: {text}" for time_s, text in sorted(run.timeline)]
+        missions = [f"- {name}: {phase}: {message}" for name, (phase, message) in run.missions.items()]
+        parts += [f"## Seed {run.seed}", "\n".join(events), "Missions:", "\n".join(missions)]
+    return "\n\n".join(parts) + "\n"
+
+
+def _phase_counts(run: ChaosRun) -> str:
+    phases = [phase for phase, _ in run.missions.values()]
+    return ", ".join(f"{phases.count(phase)} {phase}" for phase in sorted(set(phases)))
 
 
 if __name__ == "__main__":

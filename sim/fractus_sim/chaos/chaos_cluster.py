@@ -110,7 +110,8 @@ class ChaosTarget:
         for pod in self.objects("pods", "-n", SYSTEM, "-l", f"app.kubernetes.io/component={component}"):
             if pod["status"].get("phase") == "Running" and node in {None, pod["spec"].get("nodeName")}:
                 return pod
-        raise ExperimentError(f"no pod of {component} is running{f' on {node}' if node else ''}")
+        place = f" on {node}" if node else ""
+        raise ExperimentError(f"no pod of {component} is running{place}")
 
     def leader(self) -> Object:
         """Return the pod of the leading operator.
@@ -123,7 +124,7 @@ class ChaosTarget:
         return dict(json.loads(self.kubectl("get", "pod", name, "-n", SYSTEM, "-o", "json")))
 
     def program(self, name: str, node: str | None = None) -> list[int]:
-        """Return the processes of a program on a node. Without a node, return those of the control plane."""
+        """Return the processes of a program on a node, or in the control plane if no node is given."""
         namespace = self.node.wiring.namespace_path(node) if node else self.control_plane
         return process_lookup.of_program(name, namespace)
 

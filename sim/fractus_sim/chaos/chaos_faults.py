@@ -21,7 +21,7 @@ from fractus_sim.chaos import api_server_faults, clock_faults, process_lookup
 from fractus_sim.chaos.api_server_faults import in_background
 from fractus_sim.chaos.chaos_cluster import BALLAST, ChaosTarget
 from fractus_sim.errors import ExperimentError
-from fractus_sim.testbeds.kube_commands import NAMESPACE, SYSTEM
+from fractus_sim.testbeds.kube_commands import NAMESPACE, SYSTEM, Object
 
 Injection = Generator[str, None, None]
 
@@ -71,18 +71,24 @@ def _send_signal(pids: Iterable[int], number: signal.Signals, owner: str) -> Non
         raise ExperimentError(f"{owner} has no process")
 
 
+def _kill_pod(pod: Object) -> str:
+    """Kill the processes of a pod. Return its name."""
+    name: str = pod["metadata"]["name"]
+    _send_signal(process_lookup.of_pod(pod["metadata"]["uid"]), signal.SIGKILL, name)
+    return name
+
+
 def _kill_operator(target: ChaosTarget, generator: random.Random) -> Injection:
     """Kill the leading operator, half of the time shortly after an Application was applied."""
     when = "at a random moment"
     if generator.random() < 0.5 and target.applied.wait(_APPLY_TIMEOUT_S):
         time.sleep(generator.uniform(0, _RECONCILE_S))
         when = "during reconciliation"
-    pod = target.leader()
-    _send_signal(process_lookup.of_pod(pod["metadata"]["uid"]), signal.SIGKILL, pod["metadata"]["name"])
-    yield f"killed {pod['metadata']['name']} {when}"
+    yield f"killed {_kill_pod(target.leader())} {when}"
 
 
 def _kill_process(target: ChaosTarget, generator: random.Random) -> Injection:
+    """Kill the agent, a service or the driver of the drone."""
     component = generator.choice(["agent", "mobility", "camera", "driver"])
     if component == "driver":
         pods = target.objects("pods", "-n", NAMESPACE, "-l", "fractus.dev/component=Navigator")
@@ -92,8 +98,7 @@ def _kill_process(target: ChaosTarget, generator: random.Random) -> Injection:
         pod = running[0]
     else:
         pod = target.system_pod(component, target.drone)
-    _send_signal(process_lookup.of_pod(pod["metadata"]["uid"]), signal.SIGKILL, pod["metadata"]["name"])
-    yield f"killed {pod['metadata']['name']}"
+    yield f"killed {_kill_pod(pod)}"
 
 
 def _api_down(target: ChaosTarget, _generator: random.Random) -> Injection:

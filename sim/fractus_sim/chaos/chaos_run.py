@@ -1,4 +1,4 @@
-"""One chaos run: a seeded schedule of faults, missions meanwhile, and evaluation of the invariants."""
+"""One chaos run: seeded schedule of faults, consecutive missions, and evaluation of the invariants."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from fractus_sim.chaos.chaos_cluster import ChaosTarget, VehicleWatch
 from fractus_sim.chaos.chaos_faults import FAULTS, inject
 from fractus_sim.chaos.invariants import Violation
 from fractus_sim.errors import ExperimentError
-from fractus_sim.report.audit_logs import read_audit_logs
+from fractus_sim.report.audit_log_reader import read_audit_logs
 from fractus_sim.testbeds.embedded_cluster import TRAFFIC_EXAMPLE, read_objects
 from fractus_sim.testbeds.kube_commands import NAMESPACE, Object
 
@@ -308,7 +308,7 @@ def _application_name(body: Object) -> str:
 
 
 def _wait_recovered(target: ChaosTarget, missions: Missions) -> list[Violation]:
-    """Wait until deleted objects are gone and all nodes are ready. Return what is still wrong after the timeouts."""
+    """Wait until deleted objects are gone and all nodes are ready. Return violations for what is not restored after the timeouts."""
 
     def applications_deleted() -> bool:
         target.kubectl("delete", "applications.fractus.dev", "--all", "-n", NAMESPACE, "--wait=false")

@@ -7,14 +7,15 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import click
+from fractus_cluster.spec import load_spec
 from rich.console import Console
 from rich.markdown import Markdown
 
 from fractus_sim.command_line import command_errors
-from fractus_sim.demo.demo_clusters import EXAMPLE_NODES, CurrentCluster, DemoCluster, DemoEmbeddedCluster
-from fractus_sim.demo.demo_run import ConsoleProgress, Demo, rewrite_report
-from fractus_sim.demo.live_view import replay_command
+from fractus_sim.demo.demo_clusters import EXAMPLE_NODES, CurrentCluster
+from fractus_sim.demo.demo_run import ConsoleProgress, Demo, replay_command, rewrite_report
 from fractus_sim.report.report_files import PAGE
+from fractus_sim.testbeds.embedded_cluster import DEMO_CLUSTER_FILE, FractusCluster
 
 
 def _parse_assignments(_context: click.Context, _option: click.Parameter, texts: tuple[str, ...]) -> Mapping[str, str]:
@@ -63,9 +64,9 @@ def demo(
                 rewrite_report(out)
             else:
                 progress = ConsoleProgress(console)
-                selected: DemoCluster = CurrentCluster(progress.report, assign)
+                selected: FractusCluster | CurrentCluster = CurrentCluster(progress.report, assign)
                 if cluster == "embedded":
-                    selected = DemoEmbeddedCluster(progress.report)
+                    selected = FractusCluster(load_spec(DEMO_CLUSTER_FILE), progress.report)
                 as_expected = Demo(selected, out, keep, timeout_s, progress).run()
     except KeyboardInterrupt:
         click.echo("demo: interrupted", err=True)

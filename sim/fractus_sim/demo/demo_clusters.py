@@ -1,4 +1,4 @@
-"""Clusters of the demo: a new embedded cluster, or the user's cluster with nodes assigned to the example's nodes."""
+"""The user's cluster for the demo, with nodes assigned to the nodes of the example."""
 
 from __future__ import annotations
 
@@ -7,79 +7,19 @@ import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol
 
-from fractus_cluster.spec import load_spec
 from fractus_core.api.names import CLASS_LABEL
 
 from fractus_sim.errors import ExperimentError
 from fractus_sim.testbeds.embedded_cluster import (
-    DEMO_CLUSTER_FILE,
     ROOT,
     SYSTEM_IMAGES,
-    FractusCluster,
-    cluster_errors,
-    traffic_example_objects,
 )
 from fractus_sim.testbeds.kube_commands import Kube, Object
 
 EXAMPLE_IMAGE = "example-traffic-monitoring"
 EXAMPLE_NODES = ("drone-1", "edge-1", "edge-2", "edge-3", "cloud-1")
 DEMO_CHART = "fractus-demo"
-
-
-class DemoCluster(Protocol):
-    """A cluster for the demo.
-
-    Attributes:
-        disposable: True if the cluster belongs to the demo. The demo may then restart pods, and leaves its objects on
-            the cluster because they are removed with the cluster.
-    """
-
-    disposable: bool
-
-    def build_images(self) -> None:
-        """Build the images of the nodes."""
-
-    def start(self) -> Kube:
-        """Start the cluster with images on its nodes, and label its nodes."""
-
-    def create_environment(self, kube: Kube) -> list[str]:
-        """Create depot, zones and policies, and on the user's cluster also node descriptions and simulated hardware.
-
-        Returns:
-            Releases of charts that were newly installed.
-        """
-
-    def remove(self) -> None:
-        """Restore the original state of the cluster."""
-
-
-class DemoEmbeddedCluster:
-    """The embedded cluster of examples/clusters/demo.yaml. It is removed at the end unless it was already running."""
-
-    disposable = True
-
-    def __init__(self, report: Callable[[str], None]) -> None:
-        with cluster_errors():
-            self._cluster = FractusCluster(load_spec(DEMO_CLUSTER_FILE), report)
-
-    def build_images(self) -> None:
-        """Build the images with changed content."""
-        self._cluster.build_images([EXAMPLE_IMAGE])
-
-    def start(self) -> Kube:
-        """Start the cluster."""
-        return self._cluster.start()
-
-    def create_environment(self, kube: Kube) -> list[str]:
-        """Apply depot, zones and policies. Vehicles are part of the nodes, and agents register them."""
-        kube.apply(traffic_example_objects())
-        return []
-
-    def remove(self) -> None:
-        """Remove the cluster if the demo started it."""
-        self._cluster.remove_if_started()
 
 
 @dataclass
@@ -93,16 +33,10 @@ class CurrentCluster:
 
     report: Callable[[str], None]
     assignments: Mapping[str, str]
-    disposable: bool = False
     _assigned: Mapping[str, str] = field(default_factory=dict)
 
-    def build_images(self) -> None:
-        """Report which images the administrator of the cluster must have loaded."""
-        images = ",".join((*SYSTEM_IMAGES, EXAMPLE_IMAGE, "sim"))
-        self.report(f"using images localhost/fractus/{{{images}}}:dev on the nodes")
-
-    def start(self) -> Kube:
-        """Connect to the cluster, and assign and label its nodes.
+    def connect(self) -> Kube:
+        """Connect to the cluster, and assign and label its nodes. The administrator must have loaded the images.
 
         Raises:
             ExperimentError: kubectl or helm is not installed, or a node of the example cannot be assigned.
@@ -111,6 +45,8 @@ class CurrentCluster:
         helm = shutil.which("helm")
         if kubectl is None or helm is None:
             raise ExperimentError("kubectl and helm must be on the PATH for --cluster current")
+        images = ",".join((*SYSTEM_IMAGES, EXAMPLE_IMAGE, "sim"))
+        self.report(f"using images localhost/fractus/{{{images}}}:dev on the nodes")
         config = Path(os.environ.get("KUBECONFIG", "~/.kube/config")).expanduser()
         kube = Kube(Path(kubectl), Path(helm), config)
         self._assigned = assign_nodes(kube.objects("nodes"), self.assignments)
@@ -120,13 +56,14 @@ class CurrentCluster:
         return kube
 
     def create_environment(self, kube: Kube) -> list[str]:
-        """Install the chart fractus-demo with the assigned nodes."""
+        """Install the chart fractus-demo: node descriptions, simulated hardware, depot, zones and policies.
+
+        Returns:
+            Releases of charts that were newly installed.
+        """
         edges = ",".join(node for example, node in sorted(self._assigned.items()) if node_class(example) == "edge")
         values = (f"drone={self._assigned['drone-1']}", f"edgeNodes={{{edges}}}")
         return [DEMO_CHART] if kube.install(DEMO_CHART, ROOT / "charts" / DEMO_CHART, values) else []
-
-    def remove(self) -> None:
-        """Do nothing. Labels remain for the next run."""
 
 
 def node_class(example: str) -> str:

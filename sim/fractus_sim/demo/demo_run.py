@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import json
 import shutil
+import subprocess
+import sys
+import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,19 +16,27 @@ from pathlib import Path
 from fractus_core.api.nodes import GROUNDED
 from rich.console import Console
 
-from fractus_sim.demo.demo_clusters import DemoCluster
-from fractus_sim.demo.live_view import live_view
+from fractus_sim.demo.demo_clusters import EXAMPLE_IMAGE, CurrentCluster
 from fractus_sim.demo.mission_data import RECORDINGS, collect_mission_data, extract_pictures, fetch_recordings
 from fractus_sim.errors import ExperimentError
 from fractus_sim.progress import Progress
 from fractus_sim.report.flight_record import AUDIT, OBJECTS, PICTURES, FlightRecord
 from fractus_sim.report.mission_report import mission_results, write_mission_report
 from fractus_sim.report.report_files import remove_report
-from fractus_sim.testbeds.embedded_cluster import CHARTS, READY_TIMEOUT_S, ROOT, TRAFFIC_EXAMPLE, read_objects
+from fractus_sim.testbeds.embedded_cluster import (
+    CHARTS,
+    READY_TIMEOUT_S,
+    ROOT,
+    TRAFFIC_EXAMPLE,
+    FractusCluster,
+    read_objects,
+    traffic_example_objects,
+)
 from fractus_sim.testbeds.kube_commands import SYSTEM, Kube
 from fractus_sim.testbeds.mission_watch import Mission, follow_mission, wait_for_drone
 
 LANDING_TIMEOUT_S = 180.0
+_STOP_TIMEOUT_S = 10.0
 LOGS = "components.log"
 _CHART_VALUES = {"fractus": ("camera.recordings.enabled=true",)}
 """Chart values on a cluster of the demo. Recordings are needed because components delete their pictures."""
@@ -75,14 +86,14 @@ class Demo:
     """One run of the demo.
 
     Attributes:
-        cluster: Cluster to use.
+        cluster: An embedded cluster, which is removed at the end if the demo started it, or the user's cluster.
         out: Output folder of the report.
         keep: Do not remove cluster, Fractus and objects at the end.
         timeout_s: Maximum duration of the mission.
         progress: Output of progress lines.
     """
 
-    cluster: DemoCluster
+    cluster: FractusCluster | CurrentCluster
     out: Path
     keep: bool
     timeout_s: float
@@ -104,10 +115,11 @@ class Demo:
         kube: Kube | None = None
         installed: list[str] = []
         try:
-            with self.progress.step("images"):
-                self.cluster.build_images()
+            if isinstance(self.cluster, FractusCluster):
+                with self.progress.step("images"):
+                    self.cluster.build_images([EXAMPLE_IMAGE])
             with self.progress.step("cluster"):
-                kube = self.cluster.start()
+                kube = self.cluster.start() if isinstance(self.cluster, FractusCluster) else self.cluster.connect()
             with self.progress.step("removing objects of an earlier run"):
                 self._remove_application(kube)
             with self.progress.step("Fractus"):
@@ -122,14 +134,18 @@ class Demo:
         """Install Fractus and the environment of the example. Add the newly installed releases to `installed`."""
         for chart in CHARTS:
             # The chart values of the user's cluster are not changed.
-            values = _CHART_VALUES.get(chart, ()) if self.cluster.disposable else ()
+            values = _CHART_VALUES.get(chart, ()) if isinstance(self.cluster, FractusCluster) else ()
             if kube.install(chart, ROOT / "charts" / chart, values):
                 installed.append(chart)
-        if self.cluster.disposable and "fractus" not in installed:
-            # An image with the same name may have new content. Only new pods use it.
-            selector = ["-l", "app.kubernetes.io/name=fractus"]
-            kube.run("delete", "pods", "-n", SYSTEM, *selector, "--timeout=60s", timeout_s=90)
-        installed.extend(self.cluster.create_environment(kube))
+        if isinstance(self.cluster, CurrentCluster):
+            installed.extend(self.cluster.create_environment(kube))
+        else:
+            if "fractus" not in installed:
+                # An image with the same name may have new content. Only new pods use it.
+                selector = ["-l", "app.kubernetes.io/name=fractus"]
+                kube.run("delete", "pods", "-n", SYSTEM, *selector, "--timeout=60s", timeout_s=90)
+            # Vehicles are part of the nodes of the embedded cluster, and agents register them.
+            kube.apply(traffic_example_objects())
         wait_for_drone(kube, READY_TIMEOUT_S, self.progress.show)
 
     def _fly(self, kube: Kube) -> bool:
@@ -179,14 +195,15 @@ class Demo:
         return not failed
 
     def _clean_up(self, kube: Kube | None, installed: list[str]) -> None:
-        if kube is not None and not self.cluster.disposable:
+        if isinstance(self.cluster, FractusCluster):
+            self.cluster.remove_if_started()
+        elif kube is not None:
             try:
                 self._remove_application(kube)
                 for release in reversed(installed):
                     kube.uninstall(release)
             except ExperimentError as error:
                 self.progress.report(f"clean-up failed: {error}")
-        self.cluster.remove()
 
     def _remove_application(self, kube: Kube) -> None:
         """Delete the application and wait until all drones have landed.
@@ -219,3 +236,37 @@ def rewrite_report(out: Path) -> None:
         write_mission_report(FlightRecord.read(out), out)
     except (OSError, json.JSONDecodeError) as error:
         raise ExperimentError(f"no recorded flight in {out}: {error}") from None
+
+
+@contextmanager
+def live_view(kubeconfig: Path, report: Callable[[str], None]) -> Iterator[None]:
+    """Serve the page of `fractus view` and report its address. The demo continues if the page cannot be served."""
+    command = [sys.executable, "-m", "fractus_cli", "view", "--kubeconfig", str(kubeconfig), "--listen", "127.0.0.1:0"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
+
+        def report_address() -> None:
+            line = process.stdout.readline().strip() if process.stdout is not None else ""
+            _, separator, address = line.partition("view: open ")
+            if separator:
+                report(f"live view: {address}")
+            elif line:
+                report(f"live view not available: {line}")
+
+        # The mission does not wait until the page is served.
+        reader = threading.Thread(target=report_address, daemon=True)
+        reader.start()
+        try:
+            yield
+        finally:
+            process.terminate()
+            try:
+                process.wait(_STOP_TIMEOUT_S)
+            except subprocess.TimeoutExpired:
+                process.kill()
+            reader.join(_STOP_TIMEOUT_S)
+
+
+def replay_command(folder: Path) -> str | None:
+    """Return the command that shows the recordings of a report, or None without recordings."""
+    recordings = folder / RECORDINGS
+    return f"fractus view {recordings}/*.mcap" if any(recordings.glob("*.mcap")) else None

@@ -15,7 +15,7 @@ from mcap.exceptions import McapError
 from mcap.reader import NonSeekingReader
 
 from fractus_sim.errors import ExperimentError
-from fractus_sim.report.audit_logs import read_audit_logs
+from fractus_sim.report.audit_log_reader import read_audit_logs
 from fractus_sim.report.flight_record import AUDIT, OBJECTS, PICTURES, FlightRecord, is_of_mission, picture_time_s
 from fractus_sim.testbeds.kube_commands import NAMESPACE, SYSTEM, Kube, Object
 from fractus_sim.testbeds.mission_watch import Mission
@@ -139,7 +139,7 @@ def extract_pictures(recordings: Iterable[Path], record: FlightRecord, folder: P
 
     The image stores cannot be used because components delete their pictures after retrieval.
     """
-    if record.takeoff_s is None:
+    if record.track.takeoff_s is None:
         return
     camera_recordings = [path for path in recordings if path.name.startswith("camera-")]
     pictures = {name: jpeg for path in camera_recordings for name, jpeg in _pictures(path)}

@@ -72,7 +72,7 @@ class VehicleEntry(Model):
     )
 
     @model_validator(mode="after")
-    def _stands_somewhere(self) -> Self:
+    def _check_running_autopilot(self) -> Self:
         if self.connection is not None and (self.count > 1 or self.home is not None or self.parameters):
             raise InvalidObject(
                 "connection", "count, home and parameters cannot be set for a running autopilot; remove them"
@@ -81,7 +81,9 @@ class VehicleEntry(Model):
 
     def names(self) -> tuple[str, ...]:
         """Names of the vehicles of this entry."""
-        return (self.name,) if self.count == 1 else tuple(f"{self.name}-{at + 1}" for at in range(self.count))
+        return (
+            (self.name,) if self.count == 1 else tuple(f"{self.name}-{number}" for number in range(1, self.count + 1))
+        )
 
 
 class NamedZone(Model):
@@ -108,7 +110,7 @@ class Program(Model):
         default=None,
         ge=1024,
         le=65535,
-        description="Port where the program listens; other programs find it by its component (mode standalone).",
+        description="Port where the program listens. Other programs get the address by the name of the component (mode standalone).",
     )
     environment: dict[str, str] = Field(default_factory=dict)
     background: bool = Field(default=False, description="Do not wait for the program; stop it at the end.")
@@ -124,7 +126,12 @@ class ClusterPart(Model):
 
 @dataclass(frozen=True, slots=True)
 class VehicleSetup:
-    """One vehicle and its entry."""
+    """A vehicle of an experiment.
+
+    Attributes:
+        entry: Entry of the experiment file that the vehicle belongs to.
+        home: Start position. None for a running autopilot, or if the cluster file defines it.
+    """
 
     name: str
     system_id: int
@@ -166,7 +173,7 @@ class Experiment(Model):
     checks: tuple[Check, ...] = ()
 
     @model_validator(mode="after")
-    def _consistent(self) -> Self:
+    def _check_consistency(self) -> Self:
         _check_vehicles(self)
         _check_mode(self)
         _check_faults(self)
@@ -187,15 +194,11 @@ class Experiment(Model):
 
     def setups(self) -> tuple[VehicleSetup, ...]:
         """Return all vehicles with consecutive system ids. Rows are expanded."""
-        found: list[VehicleSetup] = []
+        setups: list[VehicleSetup] = []
         for entry in self.vehicles:
-            for at, name in enumerate(entry.names()):
-                found.append(VehicleSetup(name, len(found) + 1, entry, _spread(entry, at)))
-        return tuple(found)
-
-    def zone(self, name: str) -> NamedZone:
-        """Return a zone by name."""
-        return next(zone for zone in self.zones if zone.name == name)
+            for index, name in enumerate(entry.names()):
+                setups.append(VehicleSetup(name, len(setups) + 1, entry, _row_position(entry, index)))
+        return tuple(setups)
 
 
 def load(path: Path) -> Experiment:
@@ -205,7 +208,7 @@ def load(path: Path) -> Experiment:
         InvalidObject: The file is missing, is not YAML, or has an invalid field that the message names.
     """
     try:
-        content, found = parse_document(path.read_bytes(), str(path))
+        content, positions = parse_document(path.read_bytes(), str(path))
     except OSError as error:
         raise InvalidObject("", f"cannot read {path}: {error.strerror}") from None
     except BadDocument as error:
@@ -213,7 +216,7 @@ def load(path: Path) -> Experiment:
     try:
         return parse(content)
     except InvalidObject as error:
-        raise InvalidObject("", f"{found.where(content, error.field)}: {error}") from None
+        raise InvalidObject("", f"{positions.where(content, error.field)}: {error}") from None
 
 
 def parse(content: object) -> Experiment:
@@ -230,13 +233,13 @@ def parse(content: object) -> Experiment:
 
 def _unknown_tag(error: ValidationError) -> InvalidObject | None:
     """Return the error for an unknown fault, check or step. Return None for other validation errors."""
-    finding = error.errors(include_url=False)[0]
-    context = finding.get("ctx", {})
-    field = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in finding["loc"]).lstrip(".")
+    detail = error.errors(include_url=False)[0]
+    context = detail.get("ctx", {})
+    field = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in detail["loc"]).lstrip(".")
     name = str(context.get("discriminator", "")).strip("'")
-    if finding["type"] == "union_tag_not_found":
+    if detail["type"] == "union_tag_not_found":
         return InvalidObject(f"{field}.{name}", "is missing; `fractus experiment schema` lists the possible values")
-    if finding["type"] != "union_tag_invalid":
+    if detail["type"] != "union_tag_invalid":
         return None
     known = [tag.strip(" '") for tag in str(context["expected_tags"]).split(",")]
     near = difflib.get_close_matches(str(context["tag"]), known, n=1)
@@ -244,20 +247,22 @@ def _unknown_tag(error: ValidationError) -> InvalidObject | None:
     return InvalidObject(f"{field}.{name}", f"unknown value {context['tag']}; {hint}")
 
 
-def _spread(entry: VehicleEntry, at: int) -> VehicleHome | None:
-    if entry.home is None or at == 0:
+def _row_position(entry: VehicleEntry, index: int) -> VehicleHome | None:
+    """Return the home of a vehicle of a row by its index in the row."""
+    if entry.home is None or index == 0:
         return entry.home
     bearing = math.radians(entry.bearing)
     start = Place.from_degrees(entry.home.lat, entry.home.lon, entry.home.alt)
-    there = start.offset(at * entry.spacing * math.cos(bearing), at * entry.spacing * math.sin(bearing))
-    return VehicleHome(lat=there.lat_e7 / 1e7, lon=there.lon_e7 / 1e7, alt=entry.home.alt)
+    distance_m = index * entry.spacing
+    place = start.offset(distance_m * math.cos(bearing), distance_m * math.sin(bearing))
+    return VehicleHome(lat=place.lat_e7 / 1e7, lon=place.lon_e7 / 1e7, alt=entry.home.alt)
 
 
 def _check_vehicles(experiment: Experiment) -> None:
     names = [name for entry in experiment.vehicles for name in entry.names()]
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if twice:
-        raise InvalidObject("vehicles", f"the name {twice[0]} is used twice; names must be unique")
+    duplicates = sorted({name for name in names if names.count(name) > 1})
+    if duplicates:
+        raise InvalidObject("vehicles", f"the name {duplicates[0]} is used twice; names must be unique")
     if len(names) > MAX_VEHICLES:
         raise InvalidObject("vehicles", f"{len(names)} vehicles; the maximum is {MAX_VEHICLES}")
     for index, entry in enumerate(experiment.vehicles):
@@ -290,58 +295,63 @@ def _check_mode(experiment: Experiment) -> None:
         )
     names = {name for entry in experiment.vehicles for name in entry.names()}
     for index, program in enumerate(experiment.programs):
-        wanted, field = (program.vehicle, "vehicle") if mode == "vehicles" else (program.component, "component")
-        if wanted is None:
-            raise InvalidObject(f"programs[{index}].{field}", f"is required in mode {mode}")
         if mode == "vehicles":
-            _known(f"programs[{index}].vehicle", [wanted], names, "vehicle")
+            if program.vehicle is None:
+                raise InvalidObject(f"programs[{index}].vehicle", f"is required in mode {mode}")
+            _check_known(f"programs[{index}].vehicle", [program.vehicle], names, "vehicle")
+        elif program.component is None:
+            raise InvalidObject(f"programs[{index}].component", f"is required in mode {mode}")
 
 
 def _check_faults(experiment: Experiment) -> None:
     names = {name for entry in experiment.vehicles for name in entry.names()}
     for index, fault in enumerate(experiment.faults):
-        where = f"faults[{index}]"
-        _known(f"{where}.vehicles", fault.vehicles, names, "vehicle")
+        field = f"faults[{index}]"
+        _check_known(f"{field}.vehicles", fault.vehicles, names, "vehicle")
         if isinstance(fault, LinkLoss) and fault.link not in {None, LINK_OF_MODE[experiment.mode]}:
             raise InvalidObject(
-                f"{where}.link",
+                f"{field}.link",
                 f"{fault.link} does not exist in mode {experiment.mode}; use {LINK_OF_MODE[experiment.mode]}",
             )
         if isinstance(fault, NodePowerOff):
             if experiment.mode == "vehicles":
-                raise InvalidObject(f"{where}.fault", "nodePowerOff needs a node; use mode standalone or cluster")
+                raise InvalidObject(f"{field}.fault", "nodePowerOff needs a node; use mode standalone or cluster")
             if fault.node is not None and experiment.mode != "cluster":
-                raise InvalidObject(f"{where}.node", "is only supported in mode cluster; use `vehicles`")
+                raise InvalidObject(f"{field}.node", "is only supported in mode cluster; use `vehicles`")
 
 
 def _check_checks(experiment: Experiment) -> None:
     names = {name for entry in experiment.vehicles for name in entry.names()}
     zones = {zone.name for zone in experiment.zones}
     programs = {program.name for program in experiment.programs}
-    kinds = {fault.fault for fault in experiment.faults}
+    fault_kinds = {fault.fault for fault in experiment.faults}
     for index, check in enumerate(experiment.checks):
-        where = f"checks[{index}]"
+        field = f"checks[{index}]"
         if isinstance(check, VehicleCheck):
-            _known(f"{where}.vehicles", check.vehicles, names, "vehicle")
+            _check_known(f"{field}.vehicles", check.vehicles, names, "vehicle")
         if isinstance(check, OutsideZone | InsideZone):
-            _known(f"{where}.zone", [check.zone], zones, "zone")
+            _check_known(f"{field}.zone", [check.zone], zones, "zone")
         if isinstance(check, ProgramEnded):
-            _known(f"{where}.program", [check.program], programs, "program")
+            _check_known(f"{field}.program", [check.program], programs, "program")
         if isinstance(check, CallJudged) and experiment.mode == "vehicles":
-            raise InvalidObject(f"{where}.check", "call is only supported in modes standalone and cluster")
+            raise InvalidObject(f"{field}.check", "call is only supported in modes standalone and cluster")
         if isinstance(check, ApplicationPhase) and experiment.mode != "cluster":
-            raise InvalidObject(f"{where}.check", "phase is only supported in mode cluster")
+            raise InvalidObject(f"{field}.check", "phase is only supported in mode cluster")
         if isinstance(check, TaskDone) and not any(entry.task for entry in experiment.vehicles):
-            raise InvalidObject(f"{where}.check", "task: no vehicle has a task")
+            raise InvalidObject(f"{field}.check", "task: no vehicle has a task")
         if isinstance(check, Detections) and not any(entry.camera for entry in experiment.vehicles):
-            raise InvalidObject(f"{where}.check", "detections needs a vehicle with a camera (mode standalone)")
+            raise InvalidObject(f"{field}.check", "detections needs a vehicle with a camera (mode standalone)")
         after = getattr(check, "after", None)
         if after is not None:
-            _known(f"{where}.after", [after], kinds, "fault")
+            _check_known(f"{field}.after", [after], fault_kinds, "fault")
 
 
-def _known(field: str, given: Iterable[str], there: Iterable[str], what: str) -> None:
-    for name in given:
-        if name not in there:
-            known = ", ".join(sorted(there)) or "none"
-            raise InvalidObject(field, f"unknown {what} {name}; known: {known}")
+def _check_known(field: str, names: Iterable[str], known: Iterable[str], kind: str) -> None:
+    """Check that names exist.
+
+    Raises:
+        InvalidObject: A name is unknown. The message lists the known names.
+    """
+    for name in names:
+        if name not in known:
+            raise InvalidObject(field, f"unknown {kind} {name}; known: {', '.join(sorted(known)) or 'none'}")

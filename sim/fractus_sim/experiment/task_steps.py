@@ -37,7 +37,7 @@ class Place(Model):
 
 
 class TaskStep(Model):
-    """One step of a task."""
+    """Step of a task."""
 
     TITLE: ClassVar[str]
 

@@ -122,7 +122,9 @@ def draw_map(content: FlightMap) -> Figure:
     else:
         _draw_tracks(axes, content)
     for drone, node in content.links:
-        axes.plot(*zip(drone, node, strict=True), color=GREEN, linewidth=2.0, label="taking a direct link", zorder=5)
+        axes.plot(
+            *zip(drone, node, strict=True), color=GREEN, linewidth=2.0, label="traffic moves to a direct link", zorder=5
+        )
     _draw_marks(axes, content)
     axes.set_xlim(bounds[0], bounds[2])
     axes.set_ylim(bounds[1], bounds[3])
@@ -200,9 +202,9 @@ def _draw_zones(axes: Any, content: FlightMap, bounds: Bounds) -> None:
 def _draw_zone_name(axes: Any, name: str, shape: Any, colour: str, *, beside: bool) -> None:
     """Draw the name of a zone at its upper border, or next to the zone if the path crosses that position."""
     low_x, low_y, high_x, high_y = shape.bounds
-    at = (high_x, (low_y + high_y) / 2) if beside else ((low_x + high_x) / 2, high_y)
+    position = (high_x, (low_y + high_y) / 2) if beside else ((low_x + high_x) / 2, high_y)
     axes.annotate(
-        name, at, xytext=(5 if beside else 0, 0), textcoords="offset points", ha="left" if beside else "center",
+        name, position, xytext=(5 if beside else 0, 0), textcoords="offset points", ha="left" if beside else "center",
         va="center", fontsize=8.5, color=INK, zorder=5.8,
         bbox={"boxstyle": "round,pad=0.2", "facecolor": "white", "edgecolor": colour, "alpha": 0.9},
     )  # fmt: skip

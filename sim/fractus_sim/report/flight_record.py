@@ -188,24 +188,9 @@ class FlightRecord:
         return Track(self.drone.name if self.drone else "no drone", self.samples)
 
     @property
-    def home(self) -> Place | None:
-        """Takeoff position."""
-        return self.track.home
-
-    @property
-    def takeoff_s(self) -> float | None:
-        """Takeoff time."""
-        return self.track.takeoff_s
-
-    @property
-    def landing_s(self) -> float | None:
-        """Landing time. None while in flight."""
-        return self.track.landing_s
-
-    @property
     def frame(self) -> LocalFrame:
         """Local frame in metres east and north of home, or of the depot if home is unknown."""
-        home = self.home
+        home = self.track.home
         if home is not None:
             return LocalFrame(home.lat, home.lon)
         return LocalFrame.at(self.depots[0].spec.location if self.depots else Point(lat=0, lon=0))

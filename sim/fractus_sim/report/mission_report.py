@@ -14,10 +14,10 @@ import yaml
 from fractus_core.api import EdgeNode, Policy
 from fractus_core.geo import LocalFrame, area_polygon, multipolygon_geojson
 
+from fractus_sim.report.flight_geojson import feature, feature_collection, lonlat, path_feature, point
 from fractus_sim.report.flight_map import XY, DrawnNode, DrawnZone, FlightMap, Mark, ZoneKind, draw_map
 from fractus_sim.report.flight_profile import Limit, Profile, Request, Span, draw_profile
 from fractus_sim.report.flight_record import PICTURES, FlightRecord, JudgedCall, picture_time_s
-from fractus_sim.report.geojson import feature, feature_collection, lonlat, path_feature, point
 from fractus_sim.report.report_files import format_duration, rounded, table, write_report
 
 _PLACEMENT_REASONS = {
@@ -74,7 +74,7 @@ def mission_page(record: FlightRecord) -> str:
 def _headline(record: FlightRecord) -> str:
     status = record.application.status
     phase = (status.phase if status else None) or "Unknown"
-    if record.takeoff_s is None:
+    if record.track.takeoff_s is None:
         reason = (status.message if status else None) or ""
         drone = record.drone.name if record.drone else "The drone"
         return f"**{phase}.** {drone} did not fly. {reason}".strip()
@@ -84,7 +84,7 @@ def _headline(record: FlightRecord) -> str:
         end = "is still in the air"
     else:
         end = f"landed {landing_error_m:.1f} m from the takeoff position"
-    flight_s = _difference(record.takeoff_s, record.landing_s)
+    flight_s = _difference(record.track.takeoff_s, record.track.landing_s)
     duration = f" in {format_duration(flight_s)}" if flight_s is not None else ""
     corrected, refused = _decision_counts(record)
     return (
@@ -198,11 +198,11 @@ def mission_results(record: FlightRecord) -> dict[str, Any]:
         "pictures": record.results,
         "corrected": corrected,
         "refused": refused,
-        "flight_s": rounded(_difference(record.takeoff_s, record.landing_s)),
+        "flight_s": rounded(_difference(record.track.takeoff_s, record.track.landing_s)),
         "distance_m": rounded(record.track.distance_m),
         "max_altitude_m": rounded(record.track.max_altitude_m),
         "max_speed_mps": rounded(record.track.max_speed_mps),
-        "landed": record.landing_s is not None,
+        "landed": record.track.landing_s is not None,
         "landed_from_home_m": rounded(record.track.landing_error_m),
         "times": {name: rounded(seconds) for name, seconds in _times_since_apply(record)},
         "judgements": [
@@ -243,8 +243,8 @@ def _times_since_apply(record: FlightRecord) -> list[tuple[str, float]]:
     events: list[tuple[str, float | None]] = [
         ("planned", record.times.get("planned")),
         ("all pods Running", record.times.get("running")),
-        ("takeoff", record.takeoff_s),
-        ("landed", record.landing_s),
+        ("takeoff", record.track.takeoff_s),
+        ("landed", record.track.landing_s),
         ("mission over, flying home", record.times.get("ended")),
     ]
     known = [(name, time_s - applied_s) for name, time_s in events if time_s is not None]
@@ -289,7 +289,7 @@ def mission_map(record: FlightRecord) -> FlightMap:
 
 def mission_profile(record: FlightRecord) -> Profile:
     """Return the content of the altitude profile. Times are relative to the takeoff."""
-    start_s = record.takeoff_s if record.takeoff_s is not None else record.times.get("applied", 0.0)
+    start_s = record.track.takeoff_s if record.track.takeoff_s is not None else record.times.get("applied", 0.0)
     return Profile(
         title=f"{record.application.name}: altitude",
         tracks=(record.track,),

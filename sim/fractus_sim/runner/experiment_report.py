@@ -12,9 +12,9 @@ from matplotlib.figure import Figure
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fractus_sim.experiment.checks import AltitudeBand, SpeedLimit
+from fractus_sim.report.flight_geojson import feature, feature_collection, lonlat, path_feature, point
 from fractus_sim.report.flight_map import DrawnZone, FlightMap, Mark, draw_map
 from fractus_sim.report.flight_profile import Limit, Profile, Span, draw_profile
-from fractus_sim.report.geojson import feature, feature_collection, lonlat, path_feature, point
 from fractus_sim.report.mission_report import decision_marks, decision_requests, decisions_section
 from fractus_sim.report.report_files import RESULTS, format_duration, rounded, table, write_report
 from fractus_sim.report.track import Sample, Track

@@ -105,7 +105,8 @@ class _Session:
     def report(self, vehicle: str, text: str) -> None:
         """Record an event and report it as progress."""
         self.events.append(Event(self.now_s, vehicle, text))
-        self.progress.report(f"{self.now_s:6.1f} s  {vehicle + ': ' if vehicle else ''}{text}")
+        prefix = f"{vehicle}: " if vehicle else ""
+        self.progress.report(f"{self.now_s:6.1f} s  {prefix}{text}")
         content = {"time_s": round(self.now_s, 3), "text": text}
         self.log.write("/events", "fractus.Event", self.moment.unix_us * 1000, content)
 

@@ -114,9 +114,9 @@ class FaultInjector:
         self._report(running.vehicle, fault.title)
         original: dict[str, float] = {}
         if isinstance(fault, LinkLoss):
-            self._testbed.cut_link(running.vehicle)
+            self._testbed.set_link(running.vehicle, connected=False)
         elif isinstance(fault, NodePowerOff):
-            self._testbed.power_off(fault.node or running.vehicle)
+            self._testbed.set_power(fault.node or running.vehicle, on=False)
         for after_s, values in fault.steps():
             while self._now_s < begin_s + after_s:
                 yield
@@ -129,9 +129,9 @@ class FaultInjector:
         while self._now_s < begin_s + fault.duration:
             yield
         if isinstance(fault, LinkLoss):
-            self._testbed.heal_link(running.vehicle)
+            self._testbed.set_link(running.vehicle, connected=True)
         elif isinstance(fault, NodePowerOff):
-            self._testbed.power_on(fault.node or running.vehicle)
+            self._testbed.set_power(fault.node or running.vehicle, on=True)
         for name, value in original.items():
             yield from self._set(running.vehicle, name, value)
         self.occurrences[running.index] = replace(self.occurrences[running.index], end_s=self._now_s)

@@ -31,6 +31,8 @@ POLL_S = 1.0
 CONNECT_S = 10.0
 DELETE_TIMEOUT_S = 180.0
 BEHIND_TAP_PORT = 5770
+"""Port of the vehicle. The link tap listens on the port to which the services connect."""
+
 ENDED = frozenset({"Completed", "Failed", "Invalid"})
 MAX_NAME = 30
 
@@ -88,25 +90,19 @@ class ClusterTestbed(Testbed):
         """True while an Application has not ended."""
         return any(self._phase.get(body["metadata"]["name"]) not in ENDED for body in self._applications)
 
-    def cut_link(self, vehicle: str) -> None:
-        """Cut the uplink of a node. Services and vehicle keep running."""
+    def set_link(self, vehicle: str, *, connected: bool) -> None:
+        """Cut or restore the uplink of a node. Services and vehicle keep running."""
+        node = self._cluster.node(vehicle)
         with cluster_errors():
-            self._cluster.node(vehicle).cut_link()
+            if connected:
+                node.heal_link()
+            else:
+                node.cut_link()
 
-    def heal_link(self, vehicle: str) -> None:
-        """Restore the uplink of a node."""
+    def set_power(self, node: str, *, on: bool) -> None:
+        """Power a node on or off. Its vehicle keeps flying."""
         with cluster_errors():
-            self._cluster.node(vehicle).heal_link()
-
-    def power_off(self, node: str) -> None:
-        """Power off a node. Its vehicle keeps flying."""
-        with cluster_errors():
-            self._cluster.set_power(node, on=False)
-
-    def power_on(self, node: str) -> None:
-        """Power on a node."""
-        with cluster_errors():
-            self._cluster.set_power(node, on=True)
+            self._cluster.set_power(node, on=on)
 
     def collect(self) -> None:
         """Read the audit logs from the disks of the drones."""
@@ -158,9 +154,7 @@ class ClusterTestbed(Testbed):
 
 
 def _cluster_spec(experiment: Experiment, path: Path) -> ClusterSpec:
-    """Return the cluster specification with seed, wind and parameters of its vehicles.
-
-    The vehicles listen behind the link tap.
+    """Return the cluster specification with seed, wind and parameters of the vehicles, which listen behind the link taps.
 
     Raises:
         ExperimentError: The file cannot be read, or has no vehicle of this name.
@@ -177,6 +171,7 @@ def _cluster_spec(experiment: Experiment, path: Path) -> ClusterSpec:
 
 
 def _with_vehicle(node: NodeSpec, setup: VehicleSetup, experiment: Experiment) -> NodeSpec:
+    """Return the node with the vehicle of the experiment."""
     vehicle = node.vehicle()
     if vehicle is None:
         return node
@@ -197,7 +192,7 @@ def _with_vehicle(node: NodeSpec, setup: VehicleSetup, experiment: Experiment) -
 
 
 def _autopilot_port(spec: ClusterSpec, name: str) -> int:
-    """Return the port where the services of the node connect to the autopilot."""
+    """Return the port on which the services of the node expect the autopilot."""
     node = next(node for node in spec.nodes if node.name == name)
     vehicle = node.vehicle()
     listen = vehicle[1] if vehicle is not None else ""

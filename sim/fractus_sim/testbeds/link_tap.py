@@ -45,7 +45,7 @@ class LinkTap:
     def __init__(self, listener: socket.socket, connect: Callable[[], socket.socket], log: Path) -> None:
         self._connect = connect
         self._log = TlogWriter(log)
-        self._cut = threading.Event()
+        self._connected = True
         self._stop = threading.Event()
         self._selector = selectors.DefaultSelector()
         self._listener = listener
@@ -61,13 +61,9 @@ class LinkTap:
         listener = socket.create_server(("127.0.0.1", port))
         return cls(listener, lambda: socket.create_connection(target, CONNECT_S), log)
 
-    def cut(self) -> None:
-        """Drop all traffic from now on."""
-        self._cut.set()
-
-    def heal(self) -> None:
-        """Forward traffic again."""
-        self._cut.clear()
+    def set_link(self, *, connected: bool) -> None:
+        """Forward traffic, or drop it."""
+        self._connected = connected
 
     def close(self) -> None:
         """Close all connections and the log."""
@@ -120,7 +116,7 @@ class LinkTap:
         if not data:
             self._disconnect(end)
             return
-        if self._cut.is_set() or end.peer is None:
+        if not self._connected or end.peer is None:
             return
         end.framer.feed(data, time.time_ns() // 1000)
         peer = end.peer

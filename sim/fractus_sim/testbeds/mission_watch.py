@@ -93,7 +93,8 @@ class Mission:
         message = status.get("message", "")
         self.drone = status.get("drone") or self.drone
         if (phase, message) != (self.phase, self.message):
-            report(f"application {phase or 'new'}{': ' + message if message else ''}")
+            detail = f": {message}" if message else ""
+            report(f"application {phase or 'new'}{detail}")
         self.phase = phase
         self.message = message
         if self.ended and "ended" not in self.times:

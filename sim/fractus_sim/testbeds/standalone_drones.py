@@ -1,13 +1,13 @@
 """Drones without Kubernetes: vehicle, mobility service, camera world and camera service as local processes.
 
-    with Standalone(Path("out/field")) as ground:
-        drone = ground.add_drone(DroneSetup("drone-1", home=(50.8637, 4.6785, 25.0), camera=CameraSetup()))
-        identity = ground.grant(manifest)      # sign a Grant and store it for the services
-        ground.run("navigator", [sys.executable, "navigator.py"], identity)
-        ground.wait_program("navigator", timeout_s=120.0)
+    with Standalone(Path("out/field")) as drones:
+        drone = drones.add_drone(DroneSetup("drone-1", home=(50.8637, 4.6785, 25.0), camera=CameraSetup()))
+        identity = drones.grant(manifest)      # sign a Grant and store it for the services
+        drones.run("navigator", [sys.executable, "navigator.py"], identity)
+        drones.processes.wait_end("navigator", timeout_s=120.0)
 
-Each program gets the environment of its pod (FRACTUS_*), so programs that use the SDK run unchanged. All processes end
-with the block.
+Each program gets the environment of its pod (FRACTUS_*), so programs that use the SDK run unchanged. All processes are
+stopped at the end of the block.
 
 Files in the directory:
 
@@ -40,7 +40,7 @@ from fractus_sim.testbeds.local_processes import Processes, listening
 
 @dataclass(frozen=True, slots=True)
 class _Program:
-    """Command of a program, kept to restart the program when its node is powered on."""
+    """Command of a program. It restarts the program when its node is powered on."""
 
     node: str
     command: tuple[str, ...]
@@ -101,30 +101,19 @@ class Standalone:
         self._grants[grant.spec.identity] = grant
         return grant.spec.identity
 
-    def revoke(self, identity: str) -> None:
-        """Remove the Grant of a component instance.
-
-        Raises:
-            ExperimentError: The instance has no Grant.
-        """
-        grant = self._granted(identity)
-        (self._drone(grant.spec.node).grants / f"{grant.metadata.name}.json").unlink(missing_ok=True)
-
-    def environment(self, identity: str, services: Mapping[str, str] | None = None) -> dict[str, str]:
-        """Return the environment of a component's pod: identity, service addresses and control points.
+    def environment(self, identity: str) -> dict[str, str]:
+        """Return the FRACTUS_* variables of a component's pod: identity, service addresses and control points.
 
         Args:
             identity: Identity returned by `grant`.
-            services: host:port of each component that this component may call, by component name.
 
         Raises:
             ExperimentError: The identity has no Grant.
         """
-        spec = self._granted(identity).spec
+        spec = self._grant_of(identity).spec
         drone = self._drone(spec.node)
         variables = {
             "FRACTUS_NODE": spec.node,
-            "FRACTUS_HOST_IP": LOOPBACK,
             "FRACTUS_NAMESPACE": spec.application.namespace,
             "FRACTUS_APPLICATION": spec.application.name,
             "FRACTUS_COMPONENT": spec.component,
@@ -137,61 +126,43 @@ class Standalone:
         if spec.control_points:
             points = [point.to_dict() for point in spec.control_points]
             variables["FRACTUS_CONTROL_POINTS"] = json.dumps(points, separators=(",", ":"))
-        for component, address in (services or {}).items():
-            variables[address_variable(component)] = address
-        return {**base_environment(), **variables}
+        return variables
 
     def run(
         self,
         name: str,
         command: Sequence[str],
-        identity: str,
+        identity: str | None = None,
         *,
         environment: Mapping[str, str] | None = None,
         services: Mapping[str, str] | None = None,
         folder: Path | None = None,
     ) -> None:
-        """Start a program as a component instance. Its output is written to `logs/NAME.log`.
+        """Start a program. Its output is written to `logs/NAME.log`.
 
         Args:
             name: Name of the program.
             command: Program and arguments.
-            identity: Identity returned by `grant`.
+            identity: Identity returned by `grant`. None for a program that uses no system service, such as a component in
+                the cloud.
             environment: Additional environment variables.
-            services: See `environment`.
+            services: host:port of each component that the program may call, by component name.
             folder: Working directory.
 
         Raises:
             ExperimentError: The program cannot be started, or the identity has no Grant.
         """
-        variables = {**self.environment(identity, services), **(environment or {})}
-        self._start(name, _Program(self._granted(identity).spec.node, tuple(command), variables, folder))
-
-    def run_beside(
-        self,
-        name: str,
-        command: Sequence[str],
-        *,
-        environment: Mapping[str, str] | None = None,
-        services: Mapping[str, str] | None = None,
-        folder: Path | None = None,
-    ) -> None:
-        """Start a program that uses no system service, such as a component in the cloud.
-
-        Args:
-            name: Name of the program.
-            command: Program and arguments.
-            environment: Additional environment variables.
-            services: See `environment`.
-            folder: Working directory.
-
-        Raises:
-            ExperimentError: The program cannot be started.
-        """
-        variables = {address_variable(c): address for c, address in (services or {}).items()}
-        variables |= {"FRACTUS_HOST_IP": LOOPBACK, "FRACTUS_INSTANCE": name}
-        variables = {**base_environment(), **variables, **(environment or {})}
-        self._start(name, _Program("", tuple(command), variables, folder))
+        variables = {**base_environment(), "FRACTUS_HOST_IP": LOOPBACK}
+        node = ""
+        if identity is None:
+            variables["FRACTUS_INSTANCE"] = name
+        else:
+            variables |= self.environment(identity)
+            node = self._grant_of(identity).spec.node
+        for component, address in (services or {}).items():
+            variables[address_variable(component)] = address
+        variables |= environment or {}
+        self._start(name, _Program(node, tuple(command), variables, folder))
 
     def power_off(self, node: str) -> None:
         """Power off the companion computer of a drone. Services and programs are killed; the vehicle keeps flying.
@@ -218,10 +189,6 @@ class Standalone:
         drone.power_on(wait=wait)
         for name in self._off.pop(node, ()):
             self._start(name, self._programs[name])
-
-    def wait_program(self, name: str, timeout_s: float) -> int | None:
-        """Wait for a program to end. Return its exit code, or None after the timeout."""
-        return self.processes.wait_end(name, timeout_s)
 
     def check(self) -> None:
         """Check that all vehicles and services are running.
@@ -257,7 +224,7 @@ class Standalone:
             raise ExperimentError(f"no drone {node}; known: {', '.join(self.drones) or 'none'}")
         return self.drones[node]
 
-    def _granted(self, identity: str) -> Grant:
+    def _grant_of(self, identity: str) -> Grant:
         if identity not in self._grants:
             raise ExperimentError(f"{identity} has no Grant; call grant() first")
         return self._grants[identity]
@@ -369,14 +336,14 @@ class RunningDrone:
         """
         for folder in (self.grants, self.folder / "state"):
             folder.mkdir(parents=True, exist_ok=True)
-        self._describe()
+        self._write_description()
         if self.setup.autopilot is None:
             self._processes.start(self.process("vehicle"), self._vehicle_command(), base_environment())
-            self._await("vehicle", self._vehicle_port)
-        self._tap = LinkTap.between(self._tap_port, self._autopilot(), self.tlog)
+            self._wait_listening("vehicle", self._vehicle_port)
+        self._tap = LinkTap.between(self._tap_port, self._autopilot_address(), self.tlog)
         if self._world_port is not None:
             self._processes.start(self.process("world"), self._world_command(), base_environment())
-            self._await("world", self._world_port)
+            self._wait_listening("world", self._world_port)
         self.power_on()
 
     def power_on(self, *, wait: bool = True) -> None:
@@ -392,33 +359,28 @@ class RunningDrone:
         if self._camera_port is not None:
             self._processes.start(self.process("camera"), self._camera_command(), base_environment())
         if wait:
-            self._await("mobility", self._mobility_port)
+            self._wait_listening("mobility", self._mobility_port)
         if wait and self._camera_port is not None:
-            self._await("camera", self._camera_port)
+            self._wait_listening("camera", self._camera_port)
 
     def power_off(self) -> None:
         """Kill the services of the companion computer. The vehicle keeps flying."""
         self._processes.stop(self.process("mobility"), self.process("camera"), kill=True)
 
-    def cut_link(self) -> None:
-        """Cut the link between companion computer and autopilot."""
+    def set_link(self, *, connected: bool) -> None:
+        """Cut or restore the link between companion computer and autopilot."""
         if self._tap is not None:
-            self._tap.cut()
-
-    def heal_link(self) -> None:
-        """Restore the link between companion computer and autopilot."""
-        if self._tap is not None:
-            self._tap.heal()
+            self._tap.set_link(connected=connected)
 
     def close(self) -> None:
         """Close the link tap after the processes have ended."""
         if self._tap is not None:
             self._tap.close()
 
-    def _await(self, role: str, port: int) -> None:
+    def _wait_listening(self, role: str, port: int) -> None:
         self._processes.wait(self.process(role), lambda: listening(port), START_TIMEOUT_S)
 
-    def _describe(self) -> None:
+    def _write_description(self) -> None:
         spec: dict[str, Any] = json.loads(json.dumps(dict(self.setup.description)))
         services = spec.setdefault("services", {})
         mobility = services.setdefault("mobility", {})
@@ -430,7 +392,7 @@ class RunningDrone:
         if self.setup.camera is not None:
             camera = services.setdefault("camera", {})
             camera.setdefault("methods", list(_CAMERA_METHODS))
-            # Defaults of the camera world.
+            # These values are the defaults of the camera world.
             camera.setdefault("horizontalFieldOfView", 62.2)
             camera.setdefault("lens", {"model": "pinhole"})
             camera.setdefault("mount", {"pitch": -90, "stabilised": True})
@@ -441,7 +403,7 @@ class RunningDrone:
         Drone.from_body(manifest)
         (self.folder / "node.yaml").write_text(yaml.safe_dump(manifest, sort_keys=False))
 
-    def _autopilot(self) -> tuple[str, int]:
+    def _autopilot_address(self) -> tuple[str, int]:
         if self.setup.autopilot is None:
             return LOOPBACK, self._vehicle_port
         host, _, port = self.setup.autopilot.removeprefix("tcp:").rpartition(":")
@@ -463,11 +425,11 @@ class RunningDrone:
 
     def _world_command(self) -> list[str]:
         camera = self.setup.camera
-        further = camera.world or () if camera is not None else ()
+        arguments = (camera.world or ()) if camera is not None else ()
         lat, lon, alt = self.setup.home
         return [
             *_module("fractus_world"), "--vehicle", self.station_link, "--listen", f"{LOOPBACK}:{self._world_port}",
-            "--origin", f"{lat:.7f},{lon:.7f}", "--ground", f"{alt:g}", *further,
+            "--origin", f"{lat:.7f},{lon:.7f}", "--ground", f"{alt:g}", *arguments,
         ]  # fmt: skip
 
     def _mobility_command(self) -> list[str]:
@@ -493,5 +455,5 @@ def _module(name: str) -> list[str]:
 
 def base_environment() -> dict[str, str]:
     """Return the environment of the current process without FRACTUS_* variables."""
-    kept = {name: value for name, value in os.environ.items() if not name.startswith("FRACTUS_")}
-    return {**kept, "PYTHONUNBUFFERED": "1", "MALLOC_ARENA_MAX": "2"}
+    variables = {name: value for name, value in os.environ.items() if not name.startswith("FRACTUS_")}
+    return {**variables, "PYTHONUNBUFFERED": "1", "MALLOC_ARENA_MAX": "2"}

@@ -92,21 +92,16 @@ class StandaloneTestbed(Testbed):
             return []
         return list(self.observers)
 
-    def cut_link(self, vehicle: str) -> None:
-        """Cut the link between companion computer and autopilot."""
-        self._drones.drones[vehicle].cut_link()
+    def set_link(self, vehicle: str, *, connected: bool) -> None:
+        """Cut or restore the link between companion computer and autopilot."""
+        self._drones.drones[vehicle].set_link(connected=connected)
 
-    def heal_link(self, vehicle: str) -> None:
-        """Restore the link between companion computer and autopilot."""
-        self._drones.drones[vehicle].heal_link()
-
-    def power_off(self, node: str) -> None:
-        """Kill services and programs of a drone."""
-        self._drones.power_off(node)
-
-    def power_on(self, node: str) -> None:
-        """Restart services and programs of a drone."""
-        self._drones.power_on(node, wait=False)
+    def set_power(self, node: str, *, on: bool) -> None:
+        """Kill or restart services and programs of a drone."""
+        if on:
+            self._drones.power_on(node, wait=False)
+        else:
+            self._drones.power_off(node)
 
     def collect(self) -> None:
         """Stop programs and services, and read their audit logs."""
@@ -146,25 +141,20 @@ class StandaloneTestbed(Testbed):
         services = {name: address for name, address in addresses.items() if name != program.component}
         port = {"PORT": str(program.port)} if program.port is not None else {}
         identity = self._identities.get(program.component or "")
-        environment = {DETECTIONS_VARIABLE: str(self._detections.absolute()), **port, **program.environment}
-        if identity is not None:
-            self._drones.run(
-                program.name,
-                program_command(program),
-                identity,
-                environment=environment,
-                services=services,
-                folder=self.base,
-            )
-            return
         components = {component.name for app in self._manifests.applications() for component in app.spec.components}
-        if program.component not in components:
+        if identity is None and program.component not in components:
             raise ExperimentError(
                 f"program {program.name}: no application has a component {program.component}; known:"
                 f" {', '.join(sorted(components))}"
             )
-        self._drones.run_beside(
-            program.name, program_command(program), environment=environment, services=services, folder=self.base
+        environment = {DETECTIONS_VARIABLE: str(self._detections.absolute()), **port, **program.environment}
+        self._drones.run(
+            program.name,
+            program_command(program),
+            identity,
+            environment=environment,
+            services=services,
+            folder=self.base,
         )
 
 

@@ -10,8 +10,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
+from fractus_sim.errors import ExperimentError
 from fractus_sim.experiment.definition import Experiment, Program, VehicleSetup
-from fractus_sim.report.audit_logs import read_audit_logs
+from fractus_sim.report.audit_log_reader import read_audit_logs
 from fractus_sim.testbeds.detections import ObservedObject
 from fractus_sim.testbeds.ground_station import OBSERVER_ID, Link, Station
 from fractus_sim.testbeds.local_processes import Processes
@@ -145,20 +146,16 @@ class Testbed(ABC):
         return ()
 
     @abstractmethod
-    def cut_link(self, vehicle: str) -> None:
-        """Drop all traffic on the link of a vehicle."""
+    def set_link(self, vehicle: str, *, connected: bool) -> None:
+        """Drop all traffic on the link of a vehicle, or restore the link."""
 
-    @abstractmethod
-    def heal_link(self, vehicle: str) -> None:
-        """Restore the link of a vehicle."""
+    def set_power(self, node: str, *, on: bool) -> None:
+        """Power a node on or off.
 
-    @abstractmethod
-    def power_off(self, node: str) -> None:
-        """Power off a node."""
-
-    @abstractmethod
-    def power_on(self, node: str) -> None:
-        """Power on a node."""
+        Raises:
+            ExperimentError: The mode has no nodes.
+        """
+        raise ExperimentError(f"{node}: cannot power {'on' if on else 'off'}; the mode has no nodes")
 
     def collect(self) -> None:
         """Collect results into `findings` before the testbed is closed. This method adds exit codes of programs."""

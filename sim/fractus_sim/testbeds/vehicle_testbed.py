@@ -88,25 +88,11 @@ class VehicleTestbed(Testbed):
         flown = {p.vehicle for p in self.experiment.programs}
         return [s.name for s in self.experiment.setups() if s.name in flown and not s.entry.task]
 
-    def cut_link(self, vehicle: str) -> None:
-        """Cut the links of the ground station and the programs."""
-        self.pilots[vehicle].cut = True
+    def set_link(self, vehicle: str, *, connected: bool) -> None:
+        """Cut or restore the links of the ground station and the programs."""
+        self.pilots[vehicle].cut = not connected
         for tap in self._taps.get(vehicle, ()):
-            tap.cut()
-
-    def heal_link(self, vehicle: str) -> None:
-        """Restore the links of the ground station and the programs."""
-        self.pilots[vehicle].cut = False
-        for tap in self._taps.get(vehicle, ()):
-            tap.heal()
-
-    def power_off(self, node: str) -> None:
-        """Raise an error. The data model rejects this fault in mode vehicles."""
-        raise ExperimentError(f"{node}: mode vehicles has no nodes to power off")
-
-    def power_on(self, node: str) -> None:
-        """Raise an error. The data model rejects this fault in mode vehicles."""
-        raise ExperimentError(f"{node}: mode vehicles has no nodes to power on")
+            tap.set_link(connected=connected)
 
     def _create_vehicle(self, setup: VehicleSetup) -> None:
         try:

@@ -39,6 +39,13 @@ PARAMETERS: Mapping[str, float] = {"WPNAV_SPEED": 500.0}
 """The speed (cm/s) equals the maximum speed in the drone's description, so that no policy corrects it."""
 
 WIND = "2,240,0.5"
+"""Speed (m/s), direction (degrees) and turbulence of the wind."""
+
+CONNECT_TIMEOUT_S = 5.0
+HEARTBEAT_TIMEOUT_S = 15.0
+POSITION_TIMEOUT_S = 120.0
+REQUEST_INTERVAL_S = 1.0
+LINK_POLL_S = 0.05
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,13 +162,6 @@ def _wait_landed(drones: Standalone, drone: RunningDrone, autopilot: Autopilot, 
             raise ExperimentError(f"the drone was not home within {waited_s:.0f} s; last control entry: {control[-1:]}")
         drones.check()
         time.sleep(POLL_S)
-
-
-CONNECT_TIMEOUT_S = 5.0
-HEARTBEAT_TIMEOUT_S = 15.0
-POSITION_TIMEOUT_S = 120.0
-REQUEST_INTERVAL_S = 1.0
-LINK_POLL_S = 0.05
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import shapely
-from fractus_core.api import Application, Drone, Policy, Zone
+from fractus_core.api import Application, Drone, Zone
 from fractus_core.api.grants import GrantSpec
 from fractus_core.documents import BadDocument, dump_documents, parse_documents
 from fractus_core.geo import LocalFrame, area_polygon
@@ -91,11 +91,6 @@ class FieldSite:
     def drone(self) -> Drone:
         """Drone."""
         return Drone.from_body(self.objects("Drone")[0])
-
-    @cached_property
-    def policies(self) -> tuple[Policy, ...]:
-        """Policies."""
-        return tuple(Policy.from_body(d) for d in self.objects("Policy"))
 
     @cached_property
     def frame(self) -> LocalFrame:

@@ -24,8 +24,14 @@ from fractus_sim.scenarios.links.links_site import Site
 
 PLANNED_GAP_S = 1.5
 ABRUPT_GAP_S = 2.5
+"""Maximum time between two receptions: at all times, and at the loss of a link."""
+
 MIN_SHARE = 0.95
-MIN_HEIGHT_M = 15.0
+"""Minimum share of the maximum possible gain."""
+
+MIN_ALTITUDE_M = 15.0
+"""Minimum altitude of the evaluated part of the flight."""
+
 ARRIVED_M = 3.0
 """Distance at which a waypoint is reached."""
 
@@ -49,10 +55,10 @@ class Gain:
 def recorded_flight(site: Site, run: Evidence) -> tuple[RecordedFlight, float]:
     """Return the recorded flight while pictures were sent, and its start in Unix seconds."""
     last_s = max((p.sent_s for p in run.pictures), default=math.inf)
-    flown = [(at, position) for at, position in run.track if position[2] >= MIN_HEIGHT_M and at <= last_s]
-    times = np.array([at for at, _ in flown])
+    flown = [(time_s, place) for time_s, place in run.track if place[2] >= MIN_ALTITUDE_M and time_s <= last_s]
+    times = np.array([time_s for time_s, _ in flown])
     grid = np.arange(times[0], times[-1], STEP_S)
-    places = np.array([position for _, position in flown])
+    places = np.array([place for _, place in flown])
     columns = [np.interp(grid, times, places[:, axis]) for axis in range(3)]
     positions: list[LocalPosition] = [(float(x), float(y), float(z)) for x, y, z in zip(*columns, strict=True)]
     remaining = list(site.path[1:])
@@ -99,15 +105,16 @@ def evaluate_run(run: Evidence, gains_by_rule: list[Gain]) -> list[Expectation]:
     """Return the expectations of the scenario."""
     counts = run.counts()
     flown = gains_by_rule[0]
-    used = {s.peer for s in run.link_uses if s.redirected_s is not None}
+    used = {use.peer for use in run.link_uses if use.redirected_s is not None}
+    used_names = ", ".join(sorted(used)) or "none"
     return [
         Expectation("no picture is lost", counts["lost"] == 0 and counts["sent"] > 0, f"{counts['lost']} of {counts['sent']}"),
         Expectation("no instance receives a picture twice", counts["doubled"] == 0, f"{counts['doubled']}"),
         Expectation(f"two pictures are never received more than {PLANNED_GAP_S:g} s apart, except at a lost link", run.gap_s(abrupt=False) < PLANNED_GAP_S, f"{run.gap_s(abrupt=False):.2f} s"),
         Expectation(f"two pictures are never received more than {ABRUPT_GAP_S:g} s apart at a lost link", run.gap_s(abrupt=True) < ABRUPT_GAP_S, f"{run.gap_s(abrupt=True):.2f} s"),
         Expectation(f"at least {MIN_SHARE:.0%} of the maximum possible gain", flown.share >= MIN_SHARE, f"{flown.share:.1%}"),
-        Expectation("edge-2 (no WiFi) and edge-5 (out of range) receive nothing", not used & {"edge-2", "edge-5"}, ", ".join(sorted(used)) or "none used"),
-        Expectation("at least three edge nodes receive pictures by WiFi", len(used) >= 3, ", ".join(sorted(used)) or "none"),
+        Expectation("edge-2 (no WiFi) and edge-5 (out of range) receive nothing", not used & {"edge-2", "edge-5"}, used_names),
+        Expectation("at least three edge nodes receive pictures by WiFi", len(used) >= 3, used_names),
     ]  # fmt: skip
 
 
@@ -127,10 +134,10 @@ def links_results(
 
 
 def _link_use(use: LinkUse, begin_s: float) -> dict[str, Any]:
-    """Return a link with times in seconds since the first picture."""
+    """Return the use of a link with times in seconds since the first picture."""
 
-    def at(seconds: float | None) -> float | None:
-        return None if seconds is None else round(seconds - begin_s, 3)
+    def relative(time_s: float | None) -> float | None:
+        return None if time_s is None else round(time_s - begin_s, 3)
 
-    content = {key: at(value) if key.endswith("_s") else value for key, value in asdict(use).items()}
-    return content | {"spans": [[at(begin), at(end)] for begin, end in use.spans]}
+    content = {key: relative(value) if key.endswith("_s") else value for key, value in asdict(use).items()}
+    return content | {"spans": [[relative(begin), relative(end)] for begin, end in use.spans]}

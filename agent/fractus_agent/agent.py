@@ -163,13 +163,18 @@ class Agent:
 
     def _observe(self, body: Object) -> NodeObservation:
         services = (body.get("spec") or {}).get("services") or {}
+        snapshot = None
+        telemetry_problem = None
+        if self._feed is not None:
+            snapshot = self._feed.latest
+            telemetry_problem = self._feed.problem
         return NodeObservation(
             kind=body["kind"],
             has_mobility=self._has_mobility(),
             needs_certificate=bool(services),
             certified=self._identity.condition,
-            snapshot=self._feed.latest if self._feed else None,
-            telemetry_problem=self._feed.problem if self._feed else None,
+            snapshot=snapshot,
+            telemetry_problem=telemetry_problem,
             described=self._registration.description_problem,
             camera_described=self._object_file.condition,
             audit_heads=read_audit_heads(self._settings.audit),

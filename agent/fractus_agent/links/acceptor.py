@@ -8,9 +8,10 @@ import logging
 import socket
 import ssl
 from collections import defaultdict
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable, Coroutine
 from ipaddress import IPv4Address
 from pathlib import Path
+from typing import Any
 
 from fractus_agent.links.pairing import (
     HANDSHAKE_TIMEOUT_S,
@@ -46,7 +47,7 @@ class Acceptor:
         self,
         directory: Path,
         refusal: Callable[[str], str],
-        on_session: Callable[[Session], Awaitable[None]],
+        on_session: Callable[[Session], Coroutine[Any, Any, None]],
         *,
         max_peers: int = 4,
     ) -> None:
@@ -165,7 +166,7 @@ class Acceptor:
             try:
                 async with asyncio.TaskGroup() as tasks:
                     tasks.create_task(session.run())
-                    tasks.create_task(_run(self._on_session, session))
+                    tasks.create_task(self._on_session(session))
             except* LinkLost as lost:
                 log.info("links: lost (peer=%s reason=%s)", session.peer, lost.exceptions[0])
 
@@ -198,7 +199,3 @@ def _this_task() -> asyncio.Task[None]:
     task = asyncio.current_task()
     assert task is not None
     return task
-
-
-async def _run(on_session: Callable[[Session], Awaitable[None]], session: Session) -> None:
-    await on_session(session)

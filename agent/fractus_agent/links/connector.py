@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Callable, Coroutine, Mapping
 from ipaddress import IPv4Address
 from pathlib import Path
 from typing import Any
@@ -47,7 +47,7 @@ class Connector:
         self,
         node: str,
         directory: Path,
-        on_session: Callable[[Session], Awaitable[None]],
+        on_session: Callable[[Session], Coroutine[Any, Any, None]],
         on_change: Callable[[LinkState, str], None],
         *,
         address_of: Callable[[str], IPv4Address] = link_address,
@@ -109,7 +109,7 @@ class Connector:
 
     async def _hold(self, session: Session) -> str:
         """Keep a session until it ends, and return the reason of its end."""
-        traffic = asyncio.ensure_future(self._on_session(session))
+        traffic = asyncio.create_task(self._on_session(session))
         heartbeats = asyncio.create_task(session.run())
         try:
             done, _ = await asyncio.wait({traffic, heartbeats}, return_when=asyncio.FIRST_COMPLETED)

@@ -45,16 +45,16 @@ def _nodes() -> Mapping[str, str]:
     """Return the names of the cluster's nodes by their names in the example."""
     if not _current():
         return {name: name for name in EXAMPLE_NODES}
-    done = subprocess.run(["kubectl", "get", "nodes", "-o", "json"], capture_output=True, timeout=60, check=True)
-    return assign_nodes(json.loads(done.stdout)["items"], {})
+    result = subprocess.run(["kubectl", "get", "nodes", "-o", "json"], capture_output=True, timeout=60, check=True)
+    return assign_nodes(json.loads(result.stdout)["items"], {})
 
 
 NODES = _nodes()
 DRONE = NODES["drone-1"]
 
 
-def say(line: str) -> None:
-    """Print progress of a long step, in spite of pytest's capture."""
+def report(line: str) -> None:
+    """Print the progress of a long step past pytest's capture of output."""
     os.write(2, f"e2e: {line}\n".encode())
 
 
@@ -64,25 +64,25 @@ def cluster() -> Iterator[Cluster | None]:
     if _current():
         yield None
         return
-    built = build_images(ROOT, targets=TARGETS, report=say)
+    images = build_images(ROOT, targets=TARGETS, report=report)
     name = "-".join(filter(None, ("e2e", os.environ.get("PYTEST_XDIST_WORKER"))))
-    up = Cluster.load(ROOT / "examples" / "clusters" / "demo.yaml", name=name, report=say)
+    cluster = Cluster.load(ROOT / "examples" / "clusters" / "demo.yaml", name=name, report=report)
     keep = bool(os.environ.get("FRACTUS_E2E_KEEP"))
     if not keep:
-        up.down()
+        cluster.down()
     try:
-        up.up(images=built)
-        yield up
+        cluster.up(images=images)
+        yield cluster
     finally:
         if not keep:
-            up.down()
+            cluster.down()
 
 
 @pytest.fixture(scope="session")
 def kube(cluster: Cluster | None) -> Kube:
     """The cluster with Fractus installed by its charts, and its drone ready to fly."""
     if cluster is not None:
-        programs = ensure_binaries(("kubectl", "helm"), report=say)
+        programs = ensure_binaries(("kubectl", "helm"), report=report)
         kubectl = programs["kubectl"]
         helm = programs["helm"]
         kubeconfig = cluster.kubeconfig
@@ -92,7 +92,7 @@ def kube(cluster: Cluster | None) -> Kube:
     kube = Kube(kubectl, kubeconfig)
     for release in ("fractus-crds", "fractus") if cluster is not None else ("fractus-crds", "fractus", "fractus-demo"):
         chart = ROOT / "charts" / release
-        done = subprocess.run(
+        result = subprocess.run(
             [helm, "upgrade", "--install", release, chart, "-n", SYSTEM, "--create-namespace"],
             env={**os.environ, "KUBECONFIG": str(kubeconfig)},
             capture_output=True,
@@ -100,7 +100,7 @@ def kube(cluster: Cluster | None) -> Kube:
             timeout=120,
             check=False,
         )
-        assert done.returncode == 0, done.stderr
+        assert result.returncode == 0, result.stderr
     for name in ("depot.yaml", "zones.yaml", "policies.yaml") if cluster is not None else ():
         kube.must("apply", "-f", str(EXAMPLE / name))
     kube.wait(

@@ -15,31 +15,31 @@ NODE_KEY = "/var/lib/fractus/tls/tls.key"
 
 def secrets(kube: Kube) -> dict[str, bytes]:
     """Return the values of Secrets, the keys of nodes, and the tokens of Fractus' pods."""
-    found: dict[str, bytes] = {}
+    values: dict[str, bytes] = {}
     for body in kube.all("secrets"):
         # Releases of helm and tokens of kubeadm do not belong to Fractus.
         if body["type"] not in {"helm.sh/release.v1", "bootstrap.kubernetes.io/token"}:
             for name, value in (body.get("data") or {}).items():
-                found[f"{body['metadata']['namespace']}/{body['metadata']['name']}/{name}"] = base64.b64decode(value)
+                values[f"{body['metadata']['namespace']}/{body['metadata']['name']}/{name}"] = base64.b64decode(value)
     for pod in kube.all("pods", SYSTEM, "app.kubernetes.io/component in (agent,operator)"):
         name = pod["metadata"]["name"]
-        found[f"token of {name}"] = kube.must("exec", "-n", SYSTEM, name, "--", "cat", TOKEN).encode()
+        values[f"token of {name}"] = kube.must("exec", "-n", SYSTEM, name, "--", "cat", TOKEN).encode()
         if pod["metadata"]["labels"]["app.kubernetes.io/component"] == "agent":
-            found[f"key of {pod['spec']['nodeName']}"] = kube.must(
+            values[f"key of {pod['spec']['nodeName']}"] = kube.must(
                 "exec", "-n", SYSTEM, name, "--", "cat", NODE_KEY
             ).encode()
-    return found
+    return values
 
 
 def readable(kube: Kube) -> dict[str, str]:
     """Return the logs of all pods of Fractus and its applications, Events, and all objects except Secrets."""
-    found: dict[str, str] = {}
+    texts: dict[str, str] = {}
     for pod in (*kube.all("pods", SYSTEM), *kube.all("pods", None, "fractus.dev/application")):
         namespace = pod["metadata"]["namespace"]
         name = pod["metadata"]["name"]
-        found[f"log of {name}"] = kube.must("logs", "-n", namespace, name, "--all-containers")
+        texts[f"log of {name}"] = kube.must("logs", "-n", namespace, name, "--all-containers")
         if any(status["restartCount"] for status in pod["status"].get("containerStatuses") or ()):
-            found[f"log of {name} before"] = kube.run("logs", "-n", namespace, name, "--all-containers", "-p").stdout
+            texts[f"log of {name} before"] = kube.run("logs", "-n", namespace, name, "--all-containers", "-p").stdout
     kinds = kube.must("api-resources", "--api-group=fractus.dev", "-o", "name").split()
     for kind in (
         *kinds,
@@ -53,8 +53,8 @@ def readable(kube: Kube) -> dict[str, str]:
         "serviceaccounts",
     ):
         for body in kube.all(kind):
-            what = f"{kind} {body['metadata'].get('namespace', '')}/{body['metadata']['name']}"
-            found[what] = json.dumps(body)
+            name = f"{kind} {body['metadata'].get('namespace', '')}/{body['metadata']['name']}"
+            texts[name] = json.dumps(body)
             if kind.startswith("nodegrants"):
-                found[f"{what} unpacked"] = json.dumps(unpack(body["spec"]["packed"], body["spec"]["count"]))
-    return found
+                texts[f"{name} unpacked"] = json.dumps(unpack(body["spec"]["packed"], body["spec"]["count"]))
+    return texts

@@ -43,58 +43,59 @@ class Kube:
 
     def must(self, *args: str, stdin: str | None = None, timeout_s: float = 60) -> str:
         """Run kubectl and return its standard output."""
-        done = self.run(*args, stdin=stdin, timeout_s=timeout_s)
-        if done.returncode:
-            raise CommandFailed(f"kubectl {' '.join(args)}: {done.stderr.strip()}")
-        return done.stdout
+        result = self.run(*args, stdin=stdin, timeout_s=timeout_s)
+        if result.returncode:
+            raise CommandFailed(f"kubectl {' '.join(args)}: {result.stderr.strip()}")
+        return result.stdout
 
     def apply(self, *objects: Object) -> None:
-        """Apply objects; the API server must accept all of them."""
+        """Apply objects. The API server must accept all of them."""
         self.must("apply", "-f", "-", stdin=yaml.safe_dump_all(objects))
 
     def refused(self, obj: Object) -> str:
-        """Apply an object and return the API server's refusal, empty when it was accepted."""
-        done = self.run("apply", "-f", "-", stdin=yaml.safe_dump(obj))
-        return done.stderr if done.returncode else ""
+        """Apply an object. Return the refusal of the API server, or an empty string if it accepted the object."""
+        result = self.run("apply", "-f", "-", stdin=yaml.safe_dump(obj))
+        return result.stderr if result.returncode else ""
 
     def get(self, kind: str, name: str, namespace: str = "default") -> Object | None:
         """Return an object, or None if it does not exist."""
-        done = self.run("get", kind, name, "-n", namespace, "-o", "json", "--ignore-not-found")
-        if done.returncode:
-            raise CommandFailed(done.stderr.strip())
-        return json.loads(done.stdout) if done.stdout.strip() else None
+        result = self.run("get", kind, name, "-n", namespace, "-o", "json", "--ignore-not-found")
+        if result.returncode:
+            raise CommandFailed(result.stderr.strip())
+        return json.loads(result.stdout) if result.stdout.strip() else None
 
     def all(self, kind: str, namespace: str | None = None, selector: str = "") -> list[Object]:
-        """Return the objects of a kind, in one namespace or in all."""
+        """Return the objects of a kind, in one namespace or in all namespaces."""
         scope = ["-n", namespace] if namespace else ["-A"]
         text = self.must("get", kind, *scope, "-o", "json", *(["-l", selector] if selector else []))
         return list(json.loads(text)["items"])
 
-    def wait(self, what: str, condition: Callable[[], Any], timeout_s: float = 60, poll_s: float = 0.3) -> Any:
-        """Poll until the condition returns something true, and return that."""
+    def wait(self, description: str, condition: Callable[[], Any], timeout_s: float = 60, poll_s: float = 0.3) -> Any:
+        """Poll a condition until it returns a true value, and return this value."""
         deadline = time.monotonic() + timeout_s
         last: Exception | None = None
         while time.monotonic() < deadline:
             try:
-                found = condition()
+                value = condition()
             except CommandFailed as error:
-                found = None
+                value = None
                 last = error
-            if found:
-                return found
+            if value:
+                return value
             time.sleep(poll_s)
         cause = f" ({last})" if last else ""
-        raise AssertionError(f"waited {timeout_s:.0f} s for: {what}{cause}\n{self.state()}")
+        raise AssertionError(f"waited {timeout_s:.0f} s for: {description}{cause}\n{self.state()}")
 
     def state(self) -> str:
         """Return the state of the cluster for the report of a failed test."""
-        looks = (
+        commands = (
             ("get", "applications.fractus.dev,deploymentplans.fractus.dev,grants.fractus.dev,drones.fractus.dev", "-A"),
             ("get", "applications.fractus.dev", "-A", "-o", 'jsonpath={range .items[*]}{.status}{"\\n"}{end}'),
             ("get", "pods", "-A", "-o", "wide"),
             ("logs", "-n", "fractus-system", "deployment/fractus-operator", "--tail=25"),
         )
-        return "\n".join(done.stdout + done.stderr for done in (self.run(*look) for look in looks))
+        results = [self.run(*command) for command in commands]
+        return "\n".join(result.stdout + result.stderr for result in results)
 
     def pod(self, selector: str, namespace: str, node: str | None = None) -> Object:
         """Return the only running pod that matches a selector."""
@@ -110,7 +111,7 @@ class Kube:
         return pods[0]
 
     def kill_pod(self, pod: Object) -> None:
-        """SIGKILL every process of a pod's containers, as a crash would; the sandbox stays."""
+        """Kill every process of a pod's containers by SIGKILL, like a crash. The sandbox of the pod stays."""
         if not process_lookup.send_signal(process_lookup.of_pod(pod["metadata"]["uid"]), signal.SIGKILL):
             raise CommandFailed(f"pod {pod['metadata']['name']} has no processes to kill")
 

@@ -1,6 +1,6 @@
 """The embedded cluster: nodes, loss of power and of links, repair and removal.
 
-These tests start clusters of their own, also with FRACTUS_E2E_CLUSTER=current. They need root on Linux.
+These tests start separate clusters, also with FRACTUS_E2E_CLUSTER=current. They need root on Linux.
 """
 
 from __future__ import annotations
@@ -83,37 +83,39 @@ def spec_of(name: str, nodes: int = 2) -> ClusterSpec:
     return parse_spec({"name": name, "nodes": [drone, *edges]}, source="test")
 
 
-def until(condition: Callable[[], Any], what: str, timeout_s: float = 40.0) -> Any:
-    """Wait for a condition and return what it returned."""
+def until(condition: Callable[[], Any], description: str, timeout_s: float = 40.0) -> Any:
+    """Poll a condition until it returns a true value, and return this value."""
     deadline = time.monotonic() + timeout_s
-    while not (found := condition()):
-        assert time.monotonic() < deadline, f"waited {timeout_s:.0f} s for {what}"
+    while not (result := condition()):
+        assert time.monotonic() < deadline, f"waited {timeout_s:.0f} s for {description}"
         threading.Event().wait(0.1)
-    return found
+    return result
 
 
 def leftovers(name: str) -> list[str]:
-    """Return everything that a cluster of this name has on the machine."""
-    found = [f"mount {line}" for line in Path("/proc/self/mountinfo").read_text().splitlines() if f"/{name}/" in line]
-    found += [f"netns {p}" for p in Path("/run/netns").glob(f"fractus.{name}*")]
-    # os.walk ignores groups of other clusters that are removed meanwhile.
+    """Return mounts, namespaces, control groups, files, claims, links and processes of a cluster on this machine."""
+    remains = [f"mount {line}" for line in Path("/proc/self/mountinfo").read_text().splitlines() if f"/{name}/" in line]
+    remains += [f"netns {p}" for p in Path("/run/netns").glob(f"fractus.{name}*")]
+    # os.walk ignores control groups of other clusters that are removed during the walk.
     groups = ((Path(parent), below) for parent, below, _ in os.walk("/sys/fs/cgroup"))
-    found += [f"cgroup {parent / name}" for parent, below in groups if parent.name == "fractus-sim" and name in below]
-    found += [f"state {p}" for p in (state_of(name).path, Path(f"/run/fractus-sim/cluster.{name}.lock")) if p.exists()]
+    remains += [f"cgroup {parent / name}" for parent, below in groups if parent.name == "fractus-sim" and name in below]
+    remains += [
+        f"state {p}" for p in (state_of(name).path, Path(f"/run/fractus-sim/cluster.{name}.lock")) if p.exists()
+    ]
     ledger = Path("/run/fractus-sim/machine.json")
-    found += ["claim"] if ledger.exists() and name in json.loads(ledger.read_text())["claims"] else []
-    found += ["link"] if Path(f"/sys/class/net/{host_link(name)}").exists() else []
+    remains += ["claim"] if ledger.exists() and name in json.loads(ledger.read_text())["claims"] else []
+    remains += ["link"] if Path(f"/sys/class/net/{host_link(name)}").exists() else []
     for process in Path("/proc").glob("[0-9]*/cmdline"):
         try:
             words = process.read_bytes().decode(errors="replace").split("\0")
         except (FileNotFoundError, ProcessLookupError):
             continue
-        found += [f"process {words[:4]}"] if any(f"/{name}/" in w or f"fractus.{name}" in w for w in words) else []
-    return found
+        remains += [f"process {words[:4]}"] if any(f"/{name}/" in w or f"fractus.{name}" in w for w in words) else []
+    return remains
 
 
 def ready(cluster: Cluster) -> dict[str, bool]:
-    """Return the readiness of each node, as the API server reports it."""
+    """Return for each node if the API server reports it as ready."""
     return {node.name: bool(node.ready) for node in cluster.status()}
 
 
@@ -147,14 +149,14 @@ def small() -> Iterator[Cluster]:
 
 @pytest.fixture
 def healthy(small: Cluster) -> Iterator[Cluster]:
-    """The small cluster, put right again afterwards."""
+    """The small cluster, which is repaired after the test."""
     yield small
     small.up()
     for node in ("drone-1", "edge-1"):
         until(lambda node=node: running(small, node), f"the pod on {node}")
 
 
-def test_nodes_are_as_described(small: Cluster) -> None:
+def test_cluster_nodes_match_their_description(small: Cluster) -> None:
     items = json.loads(small.kubectl("get", "nodes", "-o", "json").stdout)["items"]
     nodes = {item["metadata"]["name"]: item for item in items}
     assert set(nodes) == {"drone-1", "edge-1"}
@@ -170,40 +172,40 @@ def test_nodes_are_as_described(small: Cluster) -> None:
     assert not Path("/etc/fractus/node.yaml").exists()
 
 
-def test_services_and_names_work_across_nodes(small: Cluster) -> None:
-    found = pods(small)
+def test_cluster_services_and_names_work_across_nodes(small: Cluster) -> None:
+    pods_by_node = pods(small)
     for node, other in (("drone-1", "edge-1"), ("edge-1", "drone-1")):
-        name = found[node]["metadata"]["name"]
-        address = found[other]["status"]["podIP"]
+        name = pods_by_node[node]["metadata"]["name"]
+        address = pods_by_node[other]["status"]["podIP"]
         fetched = small.kubectl("exec", name, "--", *FETCH, f"http://{address}:8080/hostname")
-        assert fetched.stdout.strip() == found[other]["metadata"]["name"]
+        assert fetched.stdout.strip() == pods_by_node[other]["metadata"]["name"]
         small.kubectl("exec", name, "--", *FETCH, "http://web.default.svc.cluster.local/hostname")
-    assert "GET /hostname" in small.kubectl("logs", found["edge-1"]["metadata"]["name"]).stdout
+    assert "GET /hostname" in small.kubectl("logs", pods_by_node["edge-1"]["metadata"]["name"]).stdout
 
 
-def test_machine_reaches_pods_but_keeps_its_settings(small: Cluster) -> None:
+def test_cluster_pods_are_reachable_from_machine_without_changed_settings(small: Cluster) -> None:
     address = pods(small)["edge-1"]["status"]["podIP"]
-    done = subprocess.run(
+    result = subprocess.run(
         ["curl", "-sf", "-m", "5", f"http://{address}:8080/hostname"], capture_output=True, check=True
     )
-    assert done.stdout
-    seen = small.node("edge-1").exec(["cat", "/proc/sys/vm/overcommit_memory"]).stdout.strip()
-    assert seen == "1"  # what kubelet wants, without the machine's own being touched
+    assert result.stdout
+    overcommit = small.node("edge-1").exec(["cat", "/proc/sys/vm/overcommit_memory"]).stdout.strip()
+    assert overcommit == "1"  # the node has the value that kubelet expects; the setting of the machine is unchanged
     records = json.loads(Path("/run/fractus-sim/machine.json").read_text())["sysctls"]
     assert set(records) <= {"fs.inotify.max_user_instances", "fs.inotify.max_user_watches"}
 
 
-def test_second_up_changes_nothing(small: Cluster) -> None:
+def test_cluster_up_changes_nothing_if_all_parts_run(small: Cluster) -> None:
     state = state_of(NAME)
     before = {path.name: path.read_text() for path in (state.path / "processes").iterdir()}
     started = time.monotonic()
     small.up(images=[IMAGE])
-    took_s = time.monotonic() - started
+    elapsed_s = time.monotonic() - started
     assert {path.name: path.read_text() for path in (state.path / "processes").iterdir()} == before
-    assert took_s < 30, f"took {took_s:.1f} s"  # under 2 s on an idle machine
+    assert elapsed_s < 30, f"took {elapsed_s:.1f} s"  # less than 2 s on an idle machine
 
 
-def test_power_off_kills_the_node_but_not_its_vehicle(healthy: Cluster) -> None:
+def test_cluster_power_off_ends_node_but_not_its_vehicle(healthy: Cluster) -> None:
     drone = healthy.node("drone-1")
     vehicle = read_record(state_of(NAME).process("vehicle.drone-1"))
     assert vehicle is not None
@@ -215,11 +217,11 @@ def test_power_off_kills_the_node_but_not_its_vehicle(healthy: Cluster) -> None:
     assert vehicle.alive
     with pytest.raises(ClusterError, match="drone-1 is off"):
         drone.exec(["true"])
-    until(lambda: not ready(healthy)["drone-1"], "the node to be missed")
+    until(lambda: not ready(healthy)["drone-1"], "the node to be reported as not ready")
     assert vehicle.alive
     drone.power_on()
-    until(lambda: ready(healthy)["drone-1"], "the node to be back")
-    until(lambda: running(healthy, "drone-1"), "the pod to be back")
+    until(lambda: ready(healthy)["drone-1"], "the node to be ready again")
+    until(lambda: running(healthy, "drone-1"), "the pod to be ready again")
     assert pods(healthy)["drone-1"]["metadata"]["uid"] == uid
     assert vehicle.alive
     assert (drone.fractus_state / "file").read_text() == "kept\n"
@@ -229,34 +231,34 @@ def test_power_off_kills_the_node_but_not_its_vehicle(healthy: Cluster) -> None:
     )
 
 
-def test_cut_link_loses_contact_and_nothing_else(healthy: Cluster) -> None:
+def test_cluster_cut_link_disconnects_node_without_restarts(healthy: Cluster) -> None:
     edge = healthy.node("edge-1")
     pod = pods(healthy)["edge-1"]
     edge.cut_link()
     assert [node.linked for node in healthy.status() if node.name == "edge-1"] == [False]
-    until(lambda: not ready(healthy)["edge-1"], "the node to be missed")
+    until(lambda: not ready(healthy)["edge-1"], "the node to be reported as not ready")
     assert edge.exec(["curl", "-sf", "-m", "5", f"http://{pod['status']['podIP']}:8080/hostname"]).stdout
     edge.heal_link()
-    until(lambda: ready(healthy)["edge-1"] and running(healthy, "edge-1"), "the node to be back")
-    again = pods(healthy)["edge-1"]
-    assert again["metadata"]["uid"] == pod["metadata"]["uid"]
-    assert again["status"]["containerStatuses"][0]["restartCount"] == 0
+    until(lambda: ready(healthy)["edge-1"] and running(healthy, "edge-1"), "the node to be ready again")
+    pod_after = pods(healthy)["edge-1"]
+    assert pod_after["metadata"]["uid"] == pod["metadata"]["uid"]
+    assert pod_after["status"]["containerStatuses"][0]["restartCount"] == 0
 
 
-def test_documented_commands_of_the_embedded_cluster_work(healthy: Cluster) -> None:
+def test_cluster_commands_of_the_documentation_work(healthy: Cluster) -> None:
     drone = healthy.node("drone-1")
     edge = healthy.node("edge-1")
     typed_words = [shlex.split(line, comments=True) for line in shell_lines("docs/embedded-cluster.md")]
     lines = {words[2]: words for words in typed_words if len(words) > 3}
 
-    def typed(verb: str, *instead: str) -> str:
-        """A line as it stands, or with its last words replaced; with the cluster's name, for there are others."""
+    def typed(verb: str, *replacements: str) -> str:
+        """Run a documented line for the cluster of this test, with its last words replaced if there are replacements."""
         words = lines[verb]
         argv = [str(Path(sys.executable).with_name("fractus")), "cluster", verb, "--name", NAME, *words[3:]]
-        argv = [*argv[: len(argv) - len(instead)], *instead] if instead else argv
-        done = subprocess.run(argv, capture_output=True, text=True, timeout=120, check=False)
-        assert done.returncode == 0, f"{argv}: {done.stderr}"
-        return done.stdout
+        argv = [*argv[: len(argv) - len(replacements)], *replacements] if replacements else argv
+        result = subprocess.run(argv, capture_output=True, text=True, timeout=120, check=False)
+        assert result.returncode == 0, f"{argv}: {result.stderr}"
+        return result.stdout
 
     assert str(drone.address) in typed("exec")
     assert (lines["power"][3:], lines["link"][3:]) == (["off", "drone-1"], ["cut", "edge-1"])
@@ -275,19 +277,19 @@ def test_documented_commands_of_the_embedded_cluster_work(healthy: Cluster) -> N
 
 
 @pytest.mark.parametrize("victim", ["control-plane", "node.edge-1", "vehicle.drone-1"])
-def test_up_repairs_what_died(healthy: Cluster, victim: str) -> None:
+def test_cluster_up_repairs_killed_part(healthy: Cluster, victim: str) -> None:
     record = read_record(state_of(NAME).process(victim))
     assert record is not None
     kill(record)
     healthy.up()
-    again = read_record(state_of(NAME).process(victim))
-    assert again is not None
-    assert again.alive
-    assert again != record
+    replacement = read_record(state_of(NAME).process(victim))
+    assert replacement is not None
+    assert replacement.alive
+    assert replacement != record
     assert all(ready(healthy).values())
 
 
-def test_daemons_that_die_come_back_and_pods_live_on(healthy: Cluster) -> None:
+def test_cluster_restarts_killed_daemons_without_restarting_pods(healthy: Cluster) -> None:
     edge = healthy.node("edge-1")
     before = pods(healthy)["edge-1"]["status"]["containerStatuses"][0]["containerID"]
 
@@ -297,15 +299,15 @@ def test_daemons_that_die_come_back_and_pods_live_on(healthy: Cluster) -> None:
     for program in ("kubelet", "containerd"):
         old = pid(program)
         edge.exec(["kill", "-9", old.split("/")[2]])
-        until(lambda program=program, old=old: pid(program) not in ("", old), f"{program} to be back")
+        until(lambda program=program, old=old: pid(program) not in ("", old), f"{program} to run again")
     until(
-        lambda: edge.exec(["ctr", "-n", "k8s.io", "tasks", "ls"], check=False).returncode == 0, "containerd to answer"
+        lambda: edge.exec(["ctr", "-n", "k8s.io", "tasks", "ls"], check=False).returncode == 0, "containerd to respond"
     )
     until(lambda: running(healthy, "edge-1"), "the pod to be ready")
     assert pods(healthy)["edge-1"]["status"]["containerStatuses"][0]["containerID"] == before
 
 
-def test_nodes_come_and_go_with_the_file(healthy: Cluster) -> None:
+def test_cluster_up_adds_and_removes_nodes_of_changed_file(healthy: Cluster) -> None:
     address = healthy.node("edge-1").address
     three = Cluster(spec_of(NAME, 3), report=print)
     three.up()
@@ -318,13 +320,13 @@ def test_nodes_come_and_go_with_the_file(healthy: Cluster) -> None:
     assert not list(Path("/run/netns").glob(f"fractus.{NAME}.edge-2"))
 
 
-def test_images_come_in_the_layers_that_are_missing(small: Cluster) -> None:
+def test_cluster_load_image_transfers_only_missing_layers(small: Cluster) -> None:
     assert small.load_images([IMAGE]) == {"drone-1": 0, "edge-1": 0}
     with pytest.raises(ClusterError, match="no image localhost/fractus/nothing:1"):
         small.load_images(["localhost/fractus/nothing:1"])
 
 
-def test_second_cluster_does_not_disturb(small: Cluster) -> None:
+def test_cluster_is_not_affected_by_second_cluster(small: Cluster) -> None:
     name = f"{NAME}b"
     second = Cluster(spec_of(name, 1), report=print)
     try:
@@ -342,7 +344,7 @@ def test_second_cluster_does_not_disturb(small: Cluster) -> None:
 
 @pytest.mark.parametrize("after_s", [0.8, 2.0, 3.5])
 @pytest.mark.parametrize("then", ["up", "down"])
-def test_survives_an_interrupted_up(then: str, after_s: float) -> None:
+def test_cluster_recovers_from_interrupted_up(then: str, after_s: float) -> None:
     name = f"{NAME}i"
     file = state_of(name).path.parent / f".{name}.yaml"
     file.parent.mkdir(parents=True, exist_ok=True)
@@ -362,4 +364,4 @@ def test_survives_an_interrupted_up(then: str, after_s: float) -> None:
         file.unlink()
         cluster.down()
     assert leftovers(name) == []
-    cluster.down()  # once more is harmless
+    cluster.down()  # a repeated call has no effect

@@ -17,7 +17,7 @@ IMAGE = "localhost/fractus/example-traffic-monitoring:dev"
 
 @pytest.fixture(scope="module")
 def alices(kube: Kube) -> Iterator[Kube]:
-    """The cluster with a namespace that Alice may edit."""
+    """The cluster with a namespace in which the user Alice has the role edit."""
     binding = {
         "apiVersion": "rbac.authorization.k8s.io/v1",
         "kind": "RoleBinding",
@@ -32,7 +32,7 @@ def alices(kube: Kube) -> Iterator[Kube]:
 
 
 def pod(name: str) -> Object:
-    """A pod that may run on drones."""
+    """Return a pod that may run on drones."""
     container = {
         "name": "main",
         "image": IMAGE,
@@ -55,17 +55,17 @@ def pod(name: str) -> Object:
     }
 
 
-def grasping(name: str) -> Object:
-    """A pod that uses the network of its node."""
-    made = pod(name)
-    made["spec"]["hostNetwork"] = True
-    return made
+def host_network_pod(name: str) -> Object:
+    """Return a pod that uses the network of its node."""
+    body = pod(name)
+    body["spec"]["hostNetwork"] = True
+    return body
 
 
 def create(kube: Kube, obj: Object) -> str:
-    """Create an object as Alice and return the refusal, empty when it was accepted."""
-    done = kube.run("create", "-f", "-", "--as", ALICE, stdin=yaml.safe_dump(obj))
-    return done.stderr if done.returncode else ""
+    """Create an object as Alice. Return the refusal, or an empty string if the object was accepted."""
+    result = kube.run("create", "-f", "-", "--as", ALICE, stdin=yaml.safe_dump(obj))
+    return result.stderr if result.returncode else ""
 
 
 def host_network(spec: Object, _main: Object) -> None:
@@ -102,7 +102,7 @@ def privileged(_spec: Object, main: Object) -> None:
     main["securityContext"] = {"privileged": True, "capabilities": {"drop": ["ALL"]}}
 
 
-def privileged_at_first(spec: Object, main: Object) -> None:
+def privileged_init_container(spec: Object, main: Object) -> None:
     first = {**copy.deepcopy(main), "name": "first"}
     privileged(spec, first)
     spec["initContainers"] = [first]
@@ -140,11 +140,11 @@ def unconfined(_spec: Object, main: Object) -> None:
     main["securityContext"]["seccompProfile"] = {"type": "Unconfined"}
 
 
-def displacing(spec: Object, _main: Object) -> None:
+def critical_priority(spec: Object, _main: Object) -> None:
     spec["priorityClassName"] = "system-node-critical"
 
 
-GRASPS: dict[Callable[[Object, Object], None], str] = {
+ESCALATIONS: dict[Callable[[Object, Object], None], str] = {
     host_network: "remove hostNetwork",
     host_network_by_wildcard: "remove hostNetwork",
     host_network_by_value: "remove hostNetwork",
@@ -153,7 +153,7 @@ GRASPS: dict[Callable[[Object, Object], None], str] = {
     host_path: "use volumes of the types",
     node_name: "instead of nodeName",
     privileged: "allowPrivilegeEscalation to false",
-    privileged_at_first: "allowPrivilegeEscalation to false",
+    privileged_init_container: "allowPrivilegeEscalation to false",
     escalation: "allowPrivilegeEscalation to false",
     capability: "remove add",
     default_capabilities: "capabilities.drop to [ALL]",
@@ -162,17 +162,17 @@ GRASPS: dict[Callable[[Object, Object], None], str] = {
     hook_to_the_autopilot: "remove host from httpGet",
     root: "must not run as root",
     unconfined: "RuntimeDefault",
-    displacing: "PriorityClass below",
+    critical_priority: "PriorityClass below",
 }
 
 
-@pytest.mark.parametrize("grasp", GRASPS, ids=lambda grasp: grasp.__name__)
-def test_pods_with_access_to_the_node_are_refused(alices: Kube, grasp: Callable[[Object, Object], None]) -> None:
-    wanted = pod("grasp")
-    grasp(wanted["spec"], wanted["spec"]["containers"][0])
-    refusal = create(alices, wanted)
+@pytest.mark.parametrize("escalate", ESCALATIONS, ids=lambda escalate: escalate.__name__)
+def test_pods_with_access_to_the_node_are_refused(alices: Kube, escalate: Callable[[Object, Object], None]) -> None:
+    body = pod("escalation")
+    escalate(body["spec"], body["spec"]["containers"][0])
+    refusal = create(alices, body)
     assert "fractus-pods" in refusal
-    assert GRASPS[grasp] in refusal
+    assert ESCALATIONS[escalate] in refusal
 
 
 def test_pods_without_access_to_the_node_run_on_drones(alices: Kube) -> None:
@@ -189,15 +189,15 @@ def test_debug_containers_get_no_access_to_the_node(alices: Kube) -> None:
     alices.wait("the pod runs", lambda: phase(alices, "debugged") == "Running")
     debug = {"name": "debug", "image": IMAGE, "securityContext": {"privileged": True}}
     patch = yaml.safe_dump({"spec": {"ephemeralContainers": [debug]}})
-    # As the administrator, because the role edit has no access to ephemeral containers.
-    done = alices.run(
+    # The administrator adds the container, because the role edit has no access to ephemeral containers.
+    result = alices.run(
         "patch", "pod", "debugged", "-n", NAMESPACE, "--subresource=ephemeralcontainers", "--patch", patch
     )
-    assert "allowPrivilegeEscalation to false" in done.stderr
+    assert "allowPrivilegeEscalation to false" in result.stderr
 
 
 def test_deployments_create_no_pods_with_access_to_the_node(alices: Kube) -> None:
-    template = grasping("unused")["spec"]
+    template = host_network_pod("unused")["spec"]
     deployment = {
         "apiVersion": "apps/v1",
         "kind": "Deployment",
@@ -218,29 +218,29 @@ def test_deployments_create_no_pods_with_access_to_the_node(alices: Kube) -> Non
 
 
 def test_pending_pod_gets_no_toleration_of_drones_later(alices: Kube) -> None:
-    waiting = grasping("waiting")
+    waiting = host_network_pod("waiting")
     waiting["spec"]["schedulingGates"] = [{"name": "example.com/later"}]
     tolerations = waiting["spec"].pop("tolerations")
     assert create(alices, waiting) == ""
     patch = yaml.safe_dump({"spec": {"tolerations": tolerations}})
-    done = alices.run("patch", "pod", "waiting", "-n", NAMESPACE, "--as", ALICE, "--type=merge", "--patch", patch)
-    assert "remove hostNetwork" in done.stderr
+    result = alices.run("patch", "pod", "waiting", "-n", NAMESPACE, "--as", ALICE, "--type=merge", "--patch", patch)
+    assert "remove hostNetwork" in result.stderr
 
 
 def test_node_name_does_not_place_a_pod_on_a_drone(alices: Kube) -> None:
-    named = grasping("named")
+    named = host_network_pod("named")
     del named["spec"]["tolerations"]
     named["spec"]["nodeName"] = DRONE
     assert create(alices, named) == ""
-    seen: list[Object] = []
+    observed: list[Object] = []
 
-    def over() -> bool:
-        now = get(alices, "named")
-        seen.extend([now] if now else [])
-        return now is None or now["status"]["phase"] == "Failed"
+    def rejected() -> bool:
+        current = get(alices, "named")
+        observed.extend([current] if current else [])
+        return current is None or current["status"]["phase"] == "Failed"
 
-    alices.wait("the pod is turned away", over, timeout_s=60)
-    statuses = [s for found in seen for s in found["status"].get("containerStatuses", [])]
+    alices.wait("the pod is rejected", rejected, timeout_s=60)
+    statuses = [s for body in observed for s in body["status"].get("containerStatuses", [])]
     assert not [s for s in statuses if s.get("started") or "running" in s["state"] or "terminated" in s["state"]]
     events = [e for e in alices.all("events", NAMESPACE) if e["involvedObject"]["name"] == "named"]
     assert not {"Pulled", "Created", "Started"} & {e["reason"] for e in events}

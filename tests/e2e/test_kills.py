@@ -35,7 +35,7 @@ def test_killed_part_does_not_leave_the_drone_unsupervised_in_flight(grounded: K
     kube.wait(f"{part} runs again", lambda: restarts(kube.get("pod", name, namespace)) > before, timeout_s=60)
     kube.wait("the mission is over", lambda: phase(kube, application) in {"Completed", "Failed"}, timeout_s=240)
     kube.wait("the drone is home", lambda: flight_state(kube) == "inactive", timeout_s=150)
-    kube.wait("the landing is on record", landed(kube, entries), timeout_s=30)
+    kube.wait("the landing is in the audit log", landed(kube, entries), timeout_s=30)
     log = audit_log(kube)[entries:]
     assert_supervised(log)
     if part in {"operator", "agent"}:
@@ -46,25 +46,25 @@ def test_killed_part_does_not_leave_the_drone_unsupervised_in_flight(grounded: K
 def in_midleg(kube: Kube, entries: int) -> Callable[[], bool]:
     """Return a condition: the audit log shows an allowed Goto."""
 
-    def seen() -> bool:
+    def goto_logged() -> bool:
         return any(
             e["kind"] == "call" and e["method"] == "Goto" and e["action"] != "deny" for e in audit_log(kube)[entries:]
         )
 
-    return seen
+    return goto_logged
 
 
 def landed(kube: Kube, entries: int) -> Callable[[], bool]:
     """Return a condition: the audit log shows that the service detected the landing."""
 
-    def seen() -> bool:
+    def landing_logged() -> bool:
         return any(e["kind"] == "control" and e["action"] == "landed" for e in audit_log(kube)[entries:])
 
-    return seen
+    return landing_logged
 
 
 def leader(kube: Kube) -> Object:
-    """The pod of the operator that acts."""
+    """Return the pod of the active operator."""
     lease = kube.get("lease", "fractus-operator", SYSTEM)
     return kube.get("pod", lease["spec"]["holderIdentity"], SYSTEM)
 
@@ -74,7 +74,7 @@ def restarts(pod: Object) -> int:
 
 
 def assert_supervised(log: list[Object]) -> None:
-    """While armed there is a record at least every few seconds, or a takeover after the gap."""
+    """Check that the audit log names a control authority in every recorded state of the flight."""
     states = [e for e in log if e["kind"] == "state"]
     assert states, "no flight was recorded"
     assert all(s["controller"] for s in states)

@@ -43,10 +43,10 @@ def audit_log(kube: Kube) -> list[Object]:
 
 def children(kube: Kube, namespace: str = "default", pods: str = "") -> list[str]:
     kinds = "deployments,replicasets,services,secrets,endpointslices,poddisruptionbudgets"
-    found = kube.all(kinds, namespace, "fractus.dev/application")
-    found += kube.all("pods", namespace, f"fractus.dev/application{pods}")
+    objects = kube.all(kinds, namespace, "fractus.dev/application")
+    objects += kube.all("pods", namespace, f"fractus.dev/application{pods}")
     grants = kube.all("grants.fractus.dev")
-    return [f"{o['kind']}/{o['metadata']['name']}" for o in (*found, *grants)]
+    return [f"{o['kind']}/{o['metadata']['name']}" for o in (*objects, *grants)]
 
 
 def test_traffic_monitoring_flies_under_policies(grounded: Kube) -> None:
@@ -56,7 +56,7 @@ def test_traffic_monitoring_flies_under_policies(grounded: Kube) -> None:
     kube.apply(app)
     kube.wait("all pods of the example are Ready", lambda: ready(kube, "traffic-monitoring"), timeout_s=60)
     print(f"apply to all pods Ready: {time.monotonic() - started:.1f} s")
-    kept = secrets(kube)
+    secret_values = secrets(kube)
     texts = {f"{name} in flight": text for name, text in readable(kube).items()}
 
     plan = kube.get("deploymentplan", "traffic-monitoring")
@@ -100,10 +100,10 @@ def test_traffic_monitoring_flies_under_policies(grounded: Kube) -> None:
     events = {e["reason"] for e in kube.all("events", "default")}
     assert {"Planned", "MissionComplete"} <= events
 
-    assert {f"{SYSTEM}/fractus-ca/tls.key", f"key of {DRONE}"} <= kept.keys()
-    assert any(re.fullmatch(r"default/traffic-monitoring-navigator\b.*-tls/tls\.key", name) for name in kept)
+    assert {f"{SYSTEM}/fractus-ca/tls.key", f"key of {DRONE}"} <= secret_values.keys()
+    assert any(re.fullmatch(r"default/traffic-monitoring-navigator\b.*-tls/tls\.key", name) for name in secret_values)
     texts |= readable(kube) | {"audit log": audit_text(kube)}
-    assert leaks(texts, kept) == []
+    assert leaks(texts, secret_values) == []
 
 
 def test_deleted_application_flies_the_drone_home(grounded: Kube) -> None:
@@ -126,10 +126,10 @@ def test_status_has_the_last_output_of_a_failed_component(grounded: Kube) -> Non
     kube.apply(app)
 
     def failed() -> Object | None:
-        found = condition(kube.get("application.fractus.dev", "failing"), "Ready")
-        return found if found.get("reason") == "ComponentFailed" else None
+        ready_condition = condition(kube.get("application.fractus.dev", "failing"), "Ready")
+        return ready_condition if ready_condition.get("reason") == "ComponentFailed" else None
 
-    failure = kube.wait("its failure is reported", failed, timeout_s=120)
+    failure = kube.wait("the failure is reported", failed, timeout_s=120)
     last_output = "failed with exit code 1: no route to the river"
     assert last_output in failure["message"]
     messages = [e["message"] for e in kube.all("events", "default") if e["reason"] == "ComponentFailed"]
@@ -139,14 +139,16 @@ def test_status_has_the_last_output_of_a_failed_component(grounded: Kube) -> Non
 def test_application_deleted_without_operator_leaves_no_objects(grounded: Kube) -> None:
     kube = grounded
     kube.apply(short_flight("orphan"))
-    kube.wait("its grant is there", lambda: kube.all("grants.fractus.dev"), timeout_s=120)
+    kube.wait("the Grant exists", lambda: kube.all("grants.fractus.dev"), timeout_s=120)
     kube.must("scale", "deployment/fractus-operator", "-n", SYSTEM, "--replicas=0")
     try:
-        kube.wait("the operator is gone", lambda: not kube.all("pods", SYSTEM, "app.kubernetes.io/component=operator"))
+        kube.wait(
+            "the operator has ended", lambda: not kube.all("pods", SYSTEM, "app.kubernetes.io/component=operator")
+        )
         kube.must("delete", "application.fractus.dev", "orphan", "--wait=false")
     finally:
         kube.must("scale", "deployment/fractus-operator", "-n", SYSTEM, "--replicas=2")
-    kube.wait("the application is gone", lambda: kube.get("application.fractus.dev", "orphan") is None, timeout_s=90)
+    kube.wait("the Application is deleted", lambda: kube.get("application.fractus.dev", "orphan") is None, timeout_s=90)
     kube.wait("nothing is left", lambda: not children(kube), timeout_s=60)
 
 

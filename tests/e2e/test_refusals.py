@@ -60,7 +60,7 @@ def unknown_zone() -> Object:
         "apiVersion": "fractus.dev/v1alpha1",
         "kind": "Policy",
         "metadata": {"name": "bad"},
-        # For another application only: a policy that cannot be resolved must not hold up the other tests' flights.
+        # The policy selects another application only, because an unresolved policy would prevent flights of other tests.
         "spec": {
             "type": "GeofenceControl",
             "kind": "exclusion",

@@ -1,4 +1,4 @@
-"""Procedure of docs/tutorial.md on a cluster: an image of the reader flies, and an update and a lowered ceiling take effect."""
+"""Procedure of docs/tutorial.md on a cluster: the reader's image flies, and a policy and an update take effect."""
 
 from __future__ import annotations
 
@@ -34,16 +34,16 @@ def files(text: str) -> dict[str, str]:
 
 def typed(text: str) -> list[tuple[str, list[str]]]:
     """Return the commands of the text, each with the output that it shows."""
-    found: list[tuple[str, list[str]]] = []
-    shell: bool | None = None  # unset outside of blocks
+    commands: list[tuple[str, list[str]]] = []
+    shell: bool | None = None  # None outside of blocks
     for line in text.splitlines():
         if line.startswith("```"):
             shell = (line == "```") if shell is None else None
         elif shell and line.startswith("$ "):
-            found.append((line[2:], []))
+            commands.append((line[2:], []))
         elif shell:
-            found[-1][1].append(line.removeprefix("... "))
-    return found
+            commands[-1][1].append(line.removeprefix("... "))
+    return commands
 
 
 def on_own_cluster(command: str) -> str:
@@ -82,7 +82,7 @@ def test_application_of_the_tutorial_flies_on_a_cluster(checkout: Path) -> None:
     assert sum(command.startswith("fractus ") for command, _ in commands) >= 5
     script = [
         "set -e",
-        # Evidence for this test, before what it is of goes.
+        # Print the state of the cluster if a command fails.
         "trap 'kubectl get applications,deploymentplans,pods,events -A -o wide >&2 || true' ERR",
     ]
     for command, _ in commands:
@@ -96,18 +96,20 @@ def test_application_of_the_tutorial_flies_on_a_cluster(checkout: Path) -> None:
     (checkout / "written").mkdir()
     for name, text in written.items():
         (checkout / "written" / name).write_text(text)
-    done = subprocess.run(
+    result = subprocess.run(
         ["bash", "-c", "\n".join(script)], cwd=checkout, capture_output=True, text=True, timeout=TIMEOUT_S, check=False,
         env={**os.environ, "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"},
     )  # fmt: skip
-    assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-6000:]
+    assert result.returncode == 0, result.stdout[-3000:] + result.stderr[-6000:]
     for command, expected in commands:
         for line in expected:
-            assert line in done.stdout, f"{command} does not print: {line}\n{done.stdout}"
+            assert line in result.stdout, f"{command} does not print: {line}\n{result.stdout}"
 
     (pod,) = json.loads((checkout / "patrol" / "waiting.json").read_text())["items"]
     (container,) = pod["status"]["containerStatuses"]
-    assert (container["image"], container["restartCount"]) == ("localhost/patrol:1", 0), "the update waits"
+    assert (container["image"], container["restartCount"]) == ("localhost/patrol:1", 0), (
+        "the update took effect in flight"
+    )
     events = json.loads((checkout / "patrol" / "events.json").read_text())["items"]
     missions = [e for e in events if e["reason"] == "MissionComplete" and e["involvedObject"]["name"] == "patrol"]
     assert len(missions) == 2, [f"{e['reason']}: {e['message']}" for e in events]

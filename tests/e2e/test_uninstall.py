@@ -16,9 +16,9 @@ pytestmark = pytest.mark.slow
 
 def helm(kube: Kube, *args: str) -> subprocess.CompletedProcess[str]:
     """Run helm from the folder of kubectl, or from the PATH if that folder has none."""
-    beside = kube.kubectl.with_name("helm")
+    sibling = kube.kubectl.with_name("helm")
     return subprocess.run(
-        [str(beside) if beside.exists() else shutil.which("helm") or "helm", *args, "-n", SYSTEM],
+        [str(sibling) if sibling.exists() else shutil.which("helm") or "helm", *args, "-n", SYSTEM],
         env={**os.environ, "KUBECONFIG": str(kube.kubeconfig)},
         capture_output=True,
         text=True,
@@ -35,14 +35,14 @@ def test_uninstall_is_refused_while_an_application_exists(kube: Kube) -> None:
     (release,) = json.loads(helm(kube, "list", "--filter", "^fractus$", "--output", "json").stdout)
     kube.apply(application)
     try:
-        done = helm(kube, "uninstall", "fractus", "--timeout", "60s")
-        assert done.returncode != 0
+        result = helm(kube, "uninstall", "fractus", "--timeout", "60s")
+        assert result.returncode != 0
         log = kube.must("logs", "job/fractus-uninstall", "-n", SYSTEM)
         assert "Fractus still runs default/kept: delete all Applications first" in log
         assert kube.get("deployment", "fractus-operator", SYSTEM)
         assert kube.get("daemonset", "fractus-mobility", SYSTEM)
     finally:
         kube.must("delete", "application.fractus.dev", "kept", "--timeout=60s", timeout_s=90)
-        back = helm(kube, "rollback", "fractus", release["revision"])
-    assert back.returncode == 0, back.stderr
+        rollback = helm(kube, "rollback", "fractus", release["revision"])
+    assert rollback.returncode == 0, rollback.stderr
     kube.must("delete", "job", "fractus-uninstall", "-n", SYSTEM, "--ignore-not-found")

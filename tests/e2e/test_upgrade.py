@@ -16,23 +16,23 @@ CHART = str(ROOT / "charts" / "fractus")
 
 
 def services(kube: Kube) -> dict[str, str]:
-    """The drone's service pods and how often their containers started."""
-    found = {}
+    """Return uid and restart count of the drone's service pods, by name."""
+    pods = {}
     for pod in kube.all("pods", SYSTEM, "app.kubernetes.io/component in (agent,mobility,camera)"):
         if pod["spec"].get("nodeName") == DRONE and "deletionTimestamp" not in pod["metadata"]:
             restarts = sum(c["restartCount"] for c in pod["status"].get("containerStatuses", ()))
-            found[pod["metadata"]["name"]] = f"{pod['metadata']['uid']} {restarts}"
-    return found
+            pods[pod["metadata"]["name"]] = f"{pod['metadata']['uid']} {restarts}"
+    return pods
 
 
 def upgrade(kube: Kube, *values: str) -> subprocess.CompletedProcess[str]:
     return helm(kube, "upgrade", "fractus", CHART, *(f"--set={value}" for value in values))
 
 
-def refused(kube: Kube, *command: str) -> None:
-    done = kube.run(*command)
-    assert done.returncode, command
-    assert f"{DRONE} is in the air: wait until it has landed" in done.stderr, done.stderr
+def check_refused(kube: Kube, *command: str) -> None:
+    result = kube.run(*command)
+    assert result.returncode, command
+    assert f"{DRONE} is in the air: wait until it has landed" in result.stderr, result.stderr
 
 
 def test_upgrade_during_a_flight_does_not_disturb_it(grounded: Kube) -> None:
@@ -45,14 +45,14 @@ def test_upgrade_during_a_flight_does_not_disturb_it(grounded: Kube) -> None:
     assert len(before) == 3
 
     # Changes that would remove the services are refused.
-    done = upgrade(kube, "mobility.enabled=false")
-    assert done.returncode
-    assert f"mobility.enabled: {DRONE} is in the air and keeps its services" in done.stderr
-    refused(kube, "label", "node", DRONE, "fractus.dev/class-")
-    refused(kube, "delete", "node", DRONE)
-    refused(kube, "delete", "daemonset", "fractus-mobility", "-n", SYSTEM)
+    result = upgrade(kube, "mobility.enabled=false")
+    assert result.returncode
+    assert f"mobility.enabled: {DRONE} is in the air and keeps its services" in result.stderr
+    check_refused(kube, "label", "node", DRONE, "fractus.dev/class-")
+    check_refused(kube, "delete", "node", DRONE)
+    check_refused(kube, "delete", "daemonset", "fractus-mobility", "-n", SYSTEM)
     mobility = next(name for name in before if "mobility" in name)
-    refused(kube, "delete", "pod", mobility, "-n", SYSTEM, "--force", "--grace-period=0")
+    check_refused(kube, "delete", "pod", mobility, "-n", SYSTEM, "--force", "--grace-period=0")
     # An upgrade with other values and a missing image succeeds, but takes no effect during the flight.
     operators = {p["metadata"]["name"] for p in kube.all("pods", SYSTEM, "app.kubernetes.io/component=operator")}
     assert upgrade(kube, "image.tag=missing", "camera.resources.requests.cpu=21m").returncode == 0
@@ -68,7 +68,7 @@ def test_upgrade_during_a_flight_does_not_disturb_it(grounded: Kube) -> None:
         for p in kube.all("pods", SYSTEM, "app.kubernetes.io/component=operator")
         if condition(p, "Ready").get("status") == "True"
     }
-    assert operators <= running, "the running operators are not stopped for an image that does not start"
+    assert operators <= running, "a running operator was stopped for an image that does not start"
     assert services(kube) == before
     assert upgrade(kube, "camera.resources.requests.cpu=21m", "image.tag=dev").returncode == 0
 

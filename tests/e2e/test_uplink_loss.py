@@ -43,12 +43,12 @@ def received(kube: Kube, pod: str) -> list[float]:
 
 def pods_of(kube: Kube) -> dict[str, tuple[str, int]]:
     """Return uid and restart count of the pods on the drone and of the application, by name."""
-    found = {}
+    pods = {}
     for namespace in ("default", SYSTEM):
         for pod in kube.all("pods", namespace):
             if namespace == "default" or pod["spec"].get("nodeName") == DRONE:
-                found[pod["metadata"]["name"]] = (pod["metadata"]["uid"], restarts(pod))
-    return found
+                pods[pod["metadata"]["name"]] = (pod["metadata"]["uid"], restarts(pod))
+    return pods
 
 
 def drone_ready(kube: Kube) -> bool:
@@ -64,10 +64,10 @@ def linked(kube: Kube) -> bool:
 
 def test_calls_continue_over_wifi_when_the_uplink_is_lost(grounded: Kube, cluster: Cluster | None) -> None:
     if cluster is None:
-        pytest.skip("cuts the drone's uplink, which only the embedded cluster lets a test do")
+        pytest.skip("the test cuts the drone's uplink, which only the embedded cluster supports")
     kube = grounded
     kube.apply(slow_flight())
-    kube.wait("traffic takes the direct link", lambda: linked(kube), timeout_s=150)
+    kube.wait("traffic uses the direct link", lambda: linked(kube), timeout_s=150)
     checker = kube.pod("fractus.dev/component=ImageChecker", "default", PEER)["metadata"]["name"]
     kube.wait("pictures over the link", lambda: received(kube, checker), timeout_s=30)
     before = pods_of(kube)
@@ -77,10 +77,10 @@ def test_calls_continue_over_wifi_when_the_uplink_is_lost(grounded: Kube, cluste
     try:
         kube.wait("the drone is no longer Ready", lambda: not drone_ready(kube), timeout_s=CUT_S)
         assert condition(kube.get("node", DRONE), "Ready")["status"] == "Unknown"
-        while (left_s := cut_s + CUT_S - time.time()) > 0:
+        while (remaining_s := cut_s + CUT_S - time.time()) > 0:
             last_s = max(received(kube, checker))
             assert time.time() - last_s < QUIET_S, f"no picture since {last_s - cut_s:.0f} s after the cut"
-            time.sleep(min(left_s, 5.0))
+            time.sleep(min(remaining_s, 5.0))
         arrived = [at for at in received(kube, checker) if cut_s < at]
     finally:
         node.heal_link()

@@ -37,11 +37,11 @@ NORTH = {
 }
 TIMEOUT_S = 90.0
 PACE_S = 0.2
-"""Between two pictures: a component that calls more often than fifty times a second is told to slow down."""
+"""Pause between two pictures, so that the camera service does not refuse calls because of their rate."""
 
 
 class Station:
-    """A ground station on a link of its own, which the service does not hear."""
+    """A ground station on a separate link to the vehicle."""
 
     def __init__(self, port: int) -> None:
         self._link = socket.create_connection(("127.0.0.1", port), timeout=10)
@@ -63,7 +63,7 @@ class Station:
 
 
 class Stage:
-    """A drone in flight with a camera on a gimbal, and a passenger that takes pictures north of which people live."""
+    """A drone in flight with a camera on a gimbal, and a passenger. A privacy zone (`NORTH`) is north of the drone."""
 
     def __init__(self, rig: Rig, station: Station, driver: Driver, camera: Any) -> None:
         self.rig = rig
@@ -71,50 +71,50 @@ class Stage:
         self.driver = driver
         self.camera = camera
 
-    async def taken(self) -> tuple[Any, bytes]:
-        """The decision on a picture, and the picture; waits for the camera and for a position."""
+    async def take_picture(self) -> tuple[Any, bytes]:
+        """Return the decision on a picture and the picture. Retry until the camera is ready and the position is known."""
         async with asyncio.timeout(TIMEOUT_S):
             while True:
                 try:
-                    shot = await self.camera.CaptureImage(
+                    capture = await self.camera.CaptureImage(
                         camera_pb2.CaptureImageRequest(), wait_for_ready=True, timeout=60
                     )
                 except grpc.aio.AioRpcError as error:
                     assert error.code() in {grpc.StatusCode.UNAVAILABLE, grpc.StatusCode.PERMISSION_DENIED}, error
                     await asyncio.sleep(PACE_S)
                     continue
-                request = camera_pb2.RetrieveImageRequest(name=shot.image.name)
+                request = camera_pb2.RetrieveImageRequest(name=capture.image.name)
                 try:
                     chunks = [chunk async for chunk in self.camera.RetrieveImage(request, timeout=20)]
                 except grpc.aio.AioRpcError as error:
-                    # What it shows was measured otherwise when it was taken.
+                    # The measured attitude changed after the capture.
                     assert "ask again" in (error.details() or ""), error
                     await asyncio.sleep(PACE_S)
                     continue
-                await self.camera.DeleteImage(camera_pb2.DeleteImageRequest(name=shot.image.name), timeout=5)
+                await self.camera.DeleteImage(camera_pb2.DeleteImageRequest(name=capture.image.name), timeout=5)
                 return chunks[0].decision, b"".join(chunk.data for chunk in chunks)
 
-    async def until(self, action: int) -> tuple[Any, bytes]:
-        """Pictures until one is decided on like that: what was seen while the gimbal turned counts for a moment."""
+    async def take_until(self, action: int) -> tuple[Any, bytes]:
+        """Take pictures until a decision has this action. After a turn, poses during the turn still count for a moment."""
         async with asyncio.timeout(TIMEOUT_S):
             while True:
-                decision, data = await self.taken()
+                decision, data = await self.take_picture()
                 if decision.action == action:
                     return decision, data
                 await asyncio.sleep(PACE_S)
 
-    async def points(self, pitch_deg: float, yaw_deg: float) -> pb.Telemetry:
-        """Wait until the gimbal is measured there."""
+    async def wait_for_attitude(self, pitch_deg: float, yaw_deg: float) -> pb.Telemetry:
+        """Wait until the gimbal's measured attitude is near these angles."""
 
-        def there(state: pb.Telemetry) -> bool:
-            turned = abs((state.gimbal.yaw_deg - yaw_deg + 180) % 360 - 180)
-            return state.HasField("gimbal") and abs(state.gimbal.pitch_deg - pitch_deg) < 3 and turned < 10
+        def is_near(state: pb.Telemetry) -> bool:
+            yaw_error_deg = abs((state.gimbal.yaw_deg - yaw_deg + 180) % 360 - 180)
+            return state.HasField("gimbal") and abs(state.gimbal.pitch_deg - pitch_deg) < 3 and yaw_error_deg < 10
 
-        return await self.rig.until(there, description=f"gimbal at {pitch_deg:g}, {yaw_deg:g}")
+        return await self.rig.until(is_near, description=f"gimbal at {pitch_deg:g}, {yaw_deg:g}")
 
 
 async def take_off(driver: Driver) -> None:
-    """In flight; a busy machine may lose a position meanwhile, and then it is asked for again."""
+    """Acquire control, arm and take off. Retry if the position is unknown for a moment on a busy machine."""
     await driver.take()
     await driver.arm()
     async with asyncio.timeout(TIMEOUT_S):
@@ -175,37 +175,37 @@ async def point(driver: Driver, pitch_deg: float, yaw_deg: float = 0.0) -> pb.Po
 async def test_gimbal_picture_is_judged_by_measured_attitude(stage: Stage) -> None:
     driver = stage.driver
     assert (await point(driver, -90.0)).decision.action == ALLOW
-    await stage.points(-90.0, 0.0)
-    _, below = await stage.until(ALLOW)
+    await stage.wait_for_attitude(-90.0, 0.0)
+    _, below = await stage.take_until(ALLOW)
     assert brightness(below) > 10
 
-    # The driver turns it to the people's yard.
+    # The driver turns the camera to the privacy zone.
     await point(driver, -10.0)
-    await stage.points(-10.0, 0.0)
-    decision, ahead = await stage.taken()
+    await stage.wait_for_attitude(-10.0, 0.0)
+    decision, ahead = await stage.take_picture()
     assert (decision.action, decision.code, list(decision.policies)) == (CORRECT, "PrivacyFilter", ["north"])
     assert brightness(ahead) < 1
 
-    # Turned around it shows as much, and not that.
+    # The driver turns the camera away from the privacy zone.
     await point(driver, -10.0, 180.0)
-    await stage.points(-10.0, 180.0)
-    _, behind = await stage.until(ALLOW)
+    await stage.wait_for_attitude(-10.0, 180.0)
+    _, behind = await stage.take_until(ALLOW)
     assert brightness(behind) > 10
     direction = Image.open(io.BytesIO(behind)).getexif().get_ifd(GPS)[DIRECTION]
     assert abs(float(direction) - 180.0) < 10.0
 
-    # A pilot who turns it back asks no one.
+    # A ground station turns the camera back without a call to the service.
     stage.station.point(-10.0, 0.0)
-    await stage.points(-10.0, 0.0)
-    assert (await stage.taken())[0].action == CORRECT
+    await stage.wait_for_attitude(-10.0, 0.0)
+    assert (await stage.take_picture())[0].action == CORRECT
     stage.station.point(-90.0, 0.0)
-    await stage.points(-90.0, 0.0)
-    await stage.until(ALLOW)
+    await stage.wait_for_attitude(-90.0, 0.0)
+    await stage.take_until(ALLOW)
 
-    # Straight down, but nothing measures that any more.
+    # The camera points straight down, but its attitude is no longer measured.
     stage.station.set_type(SERVOS)
     await stage.rig.until(lambda state: not state.HasField("gimbal"), description="a gimbal that is not measured")
-    decision, hidden = await stage.until(CORRECT)
+    decision, hidden = await stage.take_until(CORRECT)
     assert decision.code == "PrivacyFilter"
     assert brightness(hidden) < 1
 
@@ -217,12 +217,14 @@ async def test_point_gimbal_is_refused_for_passenger_or_invalid_angle(stage: Sta
         (stage.rig.stub(PASSENGER), -45.0, grpc.StatusCode.PERMISSION_DENIED, "NotADriver"),
     ]
     for stub, pitch_deg, status, code in refused:
-        found = await denied(stub.PointGimbal(pb.PointGimbalRequest(pitch_deg=pitch_deg), timeout=10))
-        assert (found[0], found[1].code) == (status, code)
-    # Each was judged, and the audit log has it as soon as its batch is written: at the latest when the service ends.
+        refused_status, decision = await denied(
+            stub.PointGimbal(pb.PointGimbalRequest(pitch_deg=pitch_deg), timeout=10)
+        )
+        assert (refused_status, decision.code) == (status, code)
+    # The audit log is written in batches, at the latest when the service ends.
     stage.rig.kill("service", signal.SIGTERM)
     calls = [entry for entry in stage.rig.entries("call") if "PointGimbal" in str(entry)]
-    assert len(calls) >= len(refused), "each was judged, and the audit log has it"
+    assert len(calls) >= len(refused), "the audit log lacks a refused call"
 
 
 async def test_point_gimbal_is_refused_for_fixed_camera(stage: Stage) -> None:
@@ -233,6 +235,6 @@ async def test_point_gimbal_is_refused_for_fixed_camera(stage: Stage) -> None:
     described["spec"]["services"]["camera"]["mount"] = {"pitch": -90, "stabilised": True}
     path.write_text(yaml.safe_dump(described))
     await stage.rig.until_logged("service", "description: changed")
-    code, why = await denied(point(stage.driver, -90.0))
-    assert (code, why.code) == (grpc.StatusCode.FAILED_PRECONDITION, "CameraFixed")
-    assert "services.camera.mount.gimbal" in why.reason
+    code, decision = await denied(point(stage.driver, -90.0))
+    assert (code, decision.code) == (grpc.StatusCode.FAILED_PRECONDITION, "CameraFixed")
+    assert "services.camera.mount.gimbal" in decision.reason

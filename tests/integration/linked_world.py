@@ -356,7 +356,7 @@ class World:
     def _run_radio(self) -> None:
         while not self._closed.is_set():
             with self.turn:
-                self.radio.turn(0.01)
+                self.radio.step(0.01)
             time.sleep(0)
 
     def command(self, **command: object) -> None:

@@ -50,8 +50,8 @@ def make_radio(layout: Layout) -> tuple[Radio, list[Follower]]:
     frame = Frame(layout.origin)
     followers = []
     for entry in layout.stations:
-        at = frame.position(entry.place.lat, entry.place.lon, entry.place.alt)
-        station = Station(at, entry.address, reach=entry.range_m / range_m)
+        position = frame.position(entry.place.lat, entry.place.lon, entry.place.alt)
+        station = Station(position, entry.address, reach=entry.range_m / range_m)
         radio.add_station(entry.name, Tap(entry.namespace, entry.device, entry.address), station)
         if entry.vehicle is not None:
             followers.append(_follower(entry, entry.vehicle, station, frame))
@@ -85,12 +85,12 @@ def radio(layout: Path) -> None:
     # On a busy machine, frames would otherwise wait for the CPU longer than their travel time.
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(REAL_TIME_PRIORITY))
-    except OSError:  # the control group may not permit real-time scheduling
+    except OSError:  # the control group may forbid real-time scheduling
         with contextlib.suppress(OSError):
             os.nice(HIGHEST)
     try:
         while True:
-            carrier.turn()
+            carrier.step()
     finally:
         carrier.close()
 

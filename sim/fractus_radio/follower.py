@@ -82,7 +82,7 @@ class Follower:
                 elif message.name == "GLOBAL_POSITION_INT" and message.sysid == autopilot:
                     self._handle_position(message)
                 received_s = time.monotonic()
-            # Repeat the request, because a restarted autopilot has forgotten it.
+            # The request is repeated, because a restart of the autopilot removes it.
             if autopilot is not None and time.monotonic() - requested_s > REQUEST_INTERVAL_S:
                 requested_s = time.monotonic()
                 link.sendall(_encode_request(endpoint, autopilot))

@@ -44,9 +44,9 @@ class Station:
     Attributes:
         position: Position in metres, in the common frame of all stations.
         address: MAC address.
-        network: Network name (SSID). Stations hear only stations of their network.
-        silent: Receives but sends nothing, like a peer that pairs and never responds.
-        off: Neither receives nor sends.
+        network: Network name (SSID). A station receives only frames of its own network.
+        silent: True if the station receives but sends nothing, like a peer that pairs and never responds.
+        off: True if the station neither receives nor sends.
         loss_db: Additional loss by a fade or interference.
         reach: Range relative to the range of the medium. A link has the shorter range of its ends.
     """
@@ -122,7 +122,7 @@ class Medium:
 
     @property
     def next_s(self) -> float:
-        """Time at which the current attempt ends; infinite while the air is free."""
+        """Time at which the current attempt ends. Infinite while the air is free."""
         return self._free_s if self._sending is not None else math.inf
 
     def advance(self, now_s: float) -> Iterator[Arrival]:
@@ -135,7 +135,7 @@ class Medium:
                 self._begin(self._free_s)
 
     def _begin(self, at_s: float) -> None:
-        """Start sending the next frame. Stations send in turn, so that contention is fair."""
+        """Start to send the next frame. Stations take turns, so that contention is fair."""
         for _ in range(len(self._order)):
             name = self._order[0]
             self._order.rotate(-1)
@@ -148,21 +148,23 @@ class Medium:
     def _end(self, attempt: Attempt) -> Iterator[Arrival]:
         name = attempt.station
         frame = attempt.frame
-        if frame[0] & GROUP_BIT:  # broadcasts are neither acknowledged nor retried
-            yield from (Arrival(other, frame) for other in self.stations if other != name and self._hears(name, other))
+        if frame[0] & GROUP_BIT:  # a broadcast has no acknowledgement and no retry
+            yield from (
+                Arrival(other, frame) for other in self.stations if other != name and self._receives(name, other)
+            )
             return
         receiver = next((n for n, s in self.stations.items() if s.address == frame[:6] and n != name), None)
-        arrived = receiver is not None and self._hears(name, receiver)
+        arrived = receiver is not None and self._receives(name, receiver)
         if receiver is not None and arrived:
             if not attempt.arrived:
                 yield Arrival(receiver, frame)
-            if self._hears(receiver, name):
+            if self._receives(receiver, name):
                 return
         if attempt.number + 1 < ATTEMPTS and not self.stations[name].off:
             self._sending = Attempt(name, frame, attempt.number + 1, attempt.arrived or arrived)
             self._free_s += airtime_s(len(frame), attempt.number + 1)
 
-    def _hears(self, sender: str, receiver: str) -> bool:
+    def _receives(self, sender: str, receiver: str) -> bool:
         a = self.stations[sender]
         b = self.stations[receiver]
         if a.off or b.off or a.network != b.network:

@@ -78,7 +78,7 @@ class Radio:
         for tap, uplink in zip(ends, directions, strict=True):
             self._forward_from(tap, uplink.offer)
 
-    def turn(self, max_wait_s: float = 0.5) -> None:
+    def step(self, max_wait_s: float = 0.5) -> None:
         """Wait for the next event and handle all due events."""
         due_s = min(
             (self._medium.next_s, *(u.next_s for wire in self._wires.values() for u in wire.directions)),

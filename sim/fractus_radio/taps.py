@@ -39,7 +39,7 @@ class Tap:
             raise ValueError(f"device name {device!r} is longer than {MAX_NAME} characters")
         self.device = device
 
-        def make() -> int:
+        def create() -> int:
             number = os.open(TUN, os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
             try:
                 fcntl.ioctl(number, TUNSETIFF, struct.pack("16sH22x", device.encode(), IFF_TAP | IFF_NO_PI))
@@ -48,7 +48,7 @@ class Tap:
                 raise
             return number
 
-        self._number = in_namespace(namespace, make)
+        self._number = in_namespace(namespace, create)
         inside = ["nsenter", f"--net={namespace}", "ip", "link", "set", device]
         if address is not None:
             inside += ["address", address.hex(":")]

@@ -25,7 +25,7 @@ class Uplink:
     off: bool = False
     dropped: int = 0
     _free_s: float = -math.inf
-    _under_way: deque[tuple[float, bytes]] = field(default_factory=deque)
+    _in_transit: deque[tuple[float, bytes]] = field(default_factory=deque)
 
     def offer(self, frame: bytes, now_s: float) -> None:
         """Queue a frame. Drop it if the queue is full."""
@@ -35,16 +35,16 @@ class Uplink:
             return
         sent_s = max(self._free_s, now_s) + len(frame) * 8 / self.rate_bps
         self._free_s = sent_s
-        self._under_way.append((sent_s + self.delay_s, frame))
+        self._in_transit.append((sent_s + self.delay_s, frame))
 
     @property
     def next_s(self) -> float:
-        """Time of the next arrival; infinite if no frame is in transit."""
-        return self._under_way[0][0] if self._under_way else math.inf
+        """Time of the next arrival. Infinite if no frame is in transit."""
+        return self._in_transit[0][0] if self._in_transit else math.inf
 
     def advance(self, now_s: float) -> Iterator[bytes]:
         """Return the frames that have arrived by `now_s`."""
-        while self._under_way and self._under_way[0][0] <= now_s:
-            _, frame = self._under_way.popleft()
+        while self._in_transit and self._in_transit[0][0] <= now_s:
+            _, frame = self._in_transit.popleft()
             if not self.off:
                 yield frame

@@ -62,7 +62,7 @@ def _origin(_context: click.Context, _option: click.Parameter, text: str | None)
     default=DEFAULT_LISTEN,
     show_default=True,
     metavar="HOST:PORT",
-    help="HOST:PORT to serve at.",
+    help="Address to serve at.",
 )
 @click.option(
     "--vehicle",
@@ -87,18 +87,32 @@ def _origin(_context: click.Context, _option: click.Parameter, text: str | None)
     "--fov", "fov_deg", type=float, default=62.2, show_default=True, help="Horizontal field of view, degrees."
 )
 @click.option(
-    "--resolution", callback=_resolution, default="1920x1080", show_default=True, help="Pixels, WIDTHxHEIGHT."
+    "--resolution",
+    callback=_resolution,
+    default="1920x1080",
+    show_default=True,
+    help="Largest picture, WIDTHxHEIGHT in pixels.",
 )
 @click.option(
-    "--mount-pitch", "mount_pitch_deg", type=float, default=-90.0, show_default=True, help="-90 is down, 0 is ahead."
+    "--mount-pitch",
+    "mount_pitch_deg",
+    type=float,
+    default=-90.0,
+    show_default=True,
+    help="Pitch of the camera, degrees: -90 is down, 0 is ahead.",
 )
 @click.option(
-    "--mount-yaw", "mount_yaw_deg", type=float, default=0.0, show_default=True, help="Clockwise from the nose."
+    "--mount-yaw",
+    "mount_yaw_deg",
+    type=float,
+    default=0.0,
+    show_default=True,
+    help="Direction of the camera, degrees clockwise from the nose.",
 )
 @click.option(
-    "--stabilised/--fixed-mount", default=True, show_default=True, help="A gimbal compensates roll and pitch."
+    "--stabilised/--fixed-mount", default=True, show_default=True, help="Whether a gimbal compensates roll and pitch."
 )
-@click.option("--seed", type=int, default=7, show_default=True, help="Seed of the landscape and of all that moves.")
+@click.option("--seed", type=int, default=7, show_default=True, help="Seed of the landscape and of the moving objects.")
 @click.option(
     "--origin",
     callback=_origin,
@@ -108,17 +122,18 @@ def _origin(_context: click.Context, _option: click.Parameter, text: str | None)
 @click.option(
     "--orthophoto",
     type=click.Path(path_type=Path, dir_okay=False),
-    help="Your own aerial picture instead of the landscape: a GeoTIFF, or a PNG or JPEG with a world file.",
+    help="Aerial picture to use instead of the landscape: a GeoTIFF, or a PNG or JPEG with a world file.",
 )
 @click.option(
     "--crs",
-    help="System of the orthophoto's world file: EPSG:4326 (the default), a projected one such as EPSG:32633, or local "
-    "(metres from --origin).",
+    help="Coordinate system of the orthophoto's world file: EPSG:4326 (default), a projected system such as EPSG:32633, or "
+    "local (metres from --origin).",
 )
 @click.option(
     "--photos",
     type=click.Path(path_type=Path, file_okay=False),
-    help="Geotagged pictures instead of a world: the one taken nearest is served; thermal ones in ir/ or named *_ir.",
+    help="Directory of geotagged pictures to serve instead of a world. The camera serves the picture that was taken nearest. "
+    "Thermal pictures are in ir/ or have names that end in _ir.",
 )
 def camera_world(
     *,
@@ -139,7 +154,7 @@ def camera_world(
 ) -> None:
     """Serve the pictures of a camera above a simulated world: /snapshot.jpg, /truth.json, /orthophoto.png."""
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
-    from fractus_world.camera_api import CameraApi  # noqa: PLC0415 - the command line stays quick
+    from fractus_world.camera_api import CameraApi  # noqa: PLC0415 - imported late, so that --help is fast
     from fractus_world.photos import Photos  # noqa: PLC0415
     from fractus_world.pose_provider import FixedPose, VehiclePose, parse_address  # noqa: PLC0415
     from fractus_world.server import CameraServer  # noqa: PLC0415
@@ -151,16 +166,15 @@ def camera_world(
         poses: VehiclePose | FixedPose = VehiclePose(parse_address(vehicle), ground_amsl_m)
         if pose is not None:
             poses = FixedPose(pose, ground_amsl_m or 0.0)
-        own = None
+        world = None
         if orthophoto is not None:
             from fractus_world.raster import read_raster  # noqa: PLC0415 - PROJ takes a second to load
 
-            own = World.on(read_raster(orthophoto, crs, origin), seed)
+            world = World.on(read_raster(orthophoto, crs, origin), seed)
         album = None if photos is None else Photos.of(photos)
     except ValueError as error:
         raise click.ClickException(str(error)) from error
-    world = WorldAround(seed, origin, own)
-    api = CameraApi(world, poses, intrinsics, mount, now=time.time, photos=album)
+    api = CameraApi(WorldAround(seed, origin, world), poses, intrinsics, mount, now=time.time, photos=album)
     try:
         server = CameraServer(listen, api)
     except OSError as error:

@@ -56,11 +56,11 @@ class Billboard:
     variation: int
 
     def corners(self) -> Matrix:
-        """Upper left, upper right, lower right, lower left of the picture, in the world's frame, shape (4, 3)."""
+        """Return the corners of the picture in the world's frame, shape (4, 3): upper left, clockwise."""
         return self._points(((0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)))
 
     def face_corners(self) -> Matrix:
-        """The same of the face."""
+        """Return the corners of the face, in the order of `corners`."""
         left, top, right, bottom = face_box(self.variation)
         return self._points(((left, top), (right, top), (right, bottom), (left, bottom)))
 
@@ -89,30 +89,30 @@ class Billboards(Protocol):
     """Provides the positions of billboards."""
 
     def within(self, box: Matrix) -> list[Billboard]:
-        """The billboards in a box ((x0, y0), (x1, y1))."""
+        """Return the billboards in a box ((x0, y0), (x1, y1))."""
 
 
 class BillboardsAroundOrigin:
-    """Six billboards within 100 m of a world's origin, for worlds made from a picture of the user."""
+    """Six billboards within 100 m of the origin, for worlds whose ground is a picture of the user."""
 
     def __init__(self, seed: int) -> None:
         self._boards = []
         for n in range(6):
             bearing = 2 * math.pi * (n / 6 + 0.1 * unit(seed, 71, n))
-            away = 14.0 + 14.0 * n
-            x = away * math.sin(bearing)
-            y = away * math.cos(bearing)
+            distance_m = 14.0 + 14.0 * n
+            x = distance_m * math.sin(bearing)
+            y = distance_m * math.cos(bearing)
             heading = math.degrees(bearing) + 180.0 if n % 2 else 360.0 * unit(seed, 72, n)
             size = (4.8, 3.2, 6.4)[n % 3]
             self._boards.append(Billboard(f"face-{n}", x, y, heading, n % 2 == 1, size, n % VARIATIONS))
 
     def within(self, box: Matrix) -> list[Billboard]:
-        """The billboards in a box."""
-        return [board for board in self._boards if _in(board, box)]
+        """Return the billboards in a box."""
+        return [board for board in self._boards if _is_in(board, box)]
 
 
 class LandscapeBillboards:
-    """Billboards beside main roads, and in parks and meadows of a procedural landscape."""
+    """Billboards of a procedural landscape, beside main roads and in parks and meadows."""
 
     def __init__(self, roads: Roads, blocks: Blocks) -> None:
         self._roads = roads
@@ -120,7 +120,7 @@ class LandscapeBillboards:
         self._near_origin = BillboardsAroundOrigin(roads.seed)
 
     def within(self, box: Matrix) -> list[Billboard]:
-        """The billboards in a box."""
+        """Return the billboards in a box."""
         boards = self._near_origin.within(box)
         (x0, y0), (x1, y1) = box
         for i, j in self._blocks.near(x0, y0, x1, y1):
@@ -128,7 +128,7 @@ class LandscapeBillboards:
             boards += [
                 self._beside(road, step) for road, step in ((Road("east", j), i), (Road("north", i), j)) if road.main
             ]
-        return [board for board in boards if _in(board, box)]
+        return [board for board in boards if _is_in(board, box)]
 
     def _on_lawn(self, i: int, j: int) -> list[Billboard]:
         if self._blocks.kind(i, j) not in ("park", "meadow"):
@@ -151,12 +151,12 @@ class LandscapeBillboards:
         )
 
 
-def _in(board: Billboard, box: Matrix) -> bool:
+def _is_in(board: Billboard, box: Matrix) -> bool:
     return bool(box[0][0] <= board.x <= box[1][0] and box[0][1] <= board.y <= box[1][1])
 
 
 def face_box(variation: int) -> tuple[float, float, float, float]:
-    """Return the position of the face in the picture of a variation: left, top, right, bottom as shares."""
+    """Return left, top, right and bottom of the face in the picture of a variation, as shares of its size."""
     wide = _CROP[2] - _CROP[0]
     high = _CROP[3] - _CROP[1]
     left = (_FACE[0] - _CROP[0]) / wide

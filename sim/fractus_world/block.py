@@ -84,7 +84,7 @@ class Block:
 
     @cached_property
     def roof_boxes(self) -> Points:
-        """The same of each roof."""
+        """West, south, east and north edge of each roof, shape (n, 4)."""
         return _boxes([roof.corners for roof in self.roofs])
 
 

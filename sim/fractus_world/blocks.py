@@ -14,7 +14,7 @@ from fractus_world.randomness import dice, unit
 from fractus_world.roads import Road, Roads, cell
 
 _REACH = 0.5 + 0.2 + 0.1
-"""Maximum extent of a block from its centre, in cells: half a cell, the vertex jitter, and the curvature of roads."""
+"""Maximum distance of a block's outline from its centre, in cells: half a cell, vertex jitter, and road curvature."""
 
 
 class Blocks:
@@ -28,8 +28,12 @@ class Blocks:
         """Return the land use of a block."""
         draw = unit(self.roads.seed, 11, i, j)
         if self.roads.town(i, j):
-            return "houses" if draw < 0.74 or (i, j) == (0, 0) else "works" if draw < 0.88 else "park"
-        return "fields" if draw < 0.66 else "wood" if draw < 0.82 else "meadow"
+            if draw < 0.74 or (i, j) == (0, 0):
+                return "houses"
+            return "works" if draw < 0.88 else "park"
+        if draw < 0.66:
+            return "fields"
+        return "wood" if draw < 0.82 else "meadow"
 
     def crop(self, i: int, j: int) -> Colour:
         """Return the crop of a block's first field."""
@@ -47,11 +51,12 @@ class Blocks:
         return block
 
     def _verge_m(self, i: int, j: int) -> float:
+        """Return the distance between the centre line of a road and the usable ground of a block."""
         around = ((Road("east", j), i), (Road("east", j + 1), i), (Road("north", i), j), (Road("north", i + 1), j))
         return max(self.roads.width_m(road, step) for road, step in around) / 2 + 3.0
 
     def near(self, x0: float, y0: float, x1: float, y1: float) -> list[tuple[int, int]]:
-        """The blocks that may reach into a box."""
+        """Return the blocks that may overlap a box."""
         west, south = cell(x0, y0)
         east, north = cell(x1, y1)
         columns = range(math.ceil(west - _REACH), math.floor(east + _REACH) + 1)

@@ -1,4 +1,4 @@
-"""The shapes of vehicles and people: convex parts, drawn one over the other."""
+"""Shapes of vehicles and people: convex parts that are drawn one over the other."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class Part:
 
 
 def parts_of(thing: Thing) -> tuple[Part, ...]:
-    """The parts of a thing in the order in which they are drawn."""
+    """Return the parts of a thing in drawing order."""
     moving = thing.speed_mps > 0.1
     if thing.kind == "person":
         stride = 2 * math.pi * ((thing.x + thing.y) % 1.4) / 1.4 if moving else 0.0
@@ -215,7 +215,7 @@ _VEHICLES: dict[Kind, Callable[[Colour, bool], tuple[Part, ...]]] = {
 
 
 def silhouette(thing: Thing) -> tuple[Part, ...]:
-    """The one part that is left of a thing which is only a few pixels long: its sides and roof in its main colour."""
+    """Return simplified parts of a thing that is only a few pixels long, in its main colour."""
     if thing.kind == "person":
         return _far_person(CLOTHES[thing.looks % 997 % len(CLOTHES)])
     colour = (206, 208, 206) if thing.kind == "truck" else PAINTS[thing.looks // 128 % len(PAINTS)]

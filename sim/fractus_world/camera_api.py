@@ -45,7 +45,7 @@ class RequestError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Snapshot:
-    """All that a picture depended on."""
+    """Inputs of a picture, kept so that its ground truth can be computed later."""
 
     number: int
     pose: Pose
@@ -58,7 +58,7 @@ class Snapshot:
 
 @dataclass(frozen=True, slots=True)
 class Response:
-    """A response's body and headers."""
+    """Body and headers of a response."""
 
     content_type: str
     body: bytes
@@ -99,7 +99,7 @@ class CameraApi:
         self._busy = threading.Lock()
         self._waiting = threading.BoundedSemaphore(MAX_WAITING)
 
-    def answer(self, path: str, query: dict[str, str]) -> Response:
+    def handle(self, path: str, query: dict[str, str]) -> Response:
         """Handle a GET request.
 
         Raises:
@@ -138,34 +138,34 @@ class CameraApi:
         camera_pose = self._poses.now()
         if camera_pose is None:
             raise RequestError(HTTPStatus.SERVICE_UNAVAILABLE, _NO_POSE)
-        snapshot = self._noted(camera_pose, lens, time_s, "ir" if band == "ir" else "rgb")
+        snapshot = self._record(camera_pose, lens, time_s, "ir" if band == "ir" else "rgb")
         with _RenderSlot(self._waiting, self._busy):
-            picture = self._taken(snapshot)
+            picture = self._render(snapshot)
         done, encoded = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
         if not done:
             raise RequestError(HTTPStatus.INTERNAL_SERVER_ERROR, "the picture cannot be encoded")
         headers = (("X-Fractus-Snapshot", str(snapshot.number)), ("X-Fractus-Time", f"{snapshot.time_s:.3f}"))
         return Response("image/jpeg", encoded.tobytes(), headers)
 
-    def _taken(self, shot: Snapshot) -> Picture:
+    def _render(self, shot: Snapshot) -> Picture:
         lens = shot.intrinsics
         if self._photos is not None:
             photo, _ = self._photos.nearest(shot.pose.lat, shot.pose.lon, shot.amsl_m, shot.band)
             return resized(photo, lens.width, lens.height)
-        world = self._seen(shot.pose)
+        world = self._world_at(shot.pose)
         return world.render(shot.pose, lens, mount=shot.mount, time_s=shot.time_s, band=shot.band)
 
-    def _sighted(self) -> Pose | None:
+    def _pose(self) -> Pose | None:
         camera_pose = self._poses.now()
         return None if camera_pose is None else camera_pose.pose
 
-    def _seen(self, pose: Pose | None) -> World:
-        world = self._world.seen_from(pose)
+    def _world_at(self, pose: Pose | None) -> World:
+        world = self._world.at(pose)
         if world is None:
             raise RequestError(HTTPStatus.SERVICE_UNAVAILABLE, _NO_POSE)
         return world
 
-    def _noted(self, camera_pose: CameraPose, lens: Intrinsics, time_s: float, band: Band) -> Snapshot:
+    def _record(self, camera_pose: CameraPose, lens: Intrinsics, time_s: float, band: Band) -> Snapshot:
         pose = camera_pose.pose
         mount = camera_pose.mount or self._mount
         amsl_m = camera_pose.ground_amsl_m + pose.height_m
@@ -181,7 +181,7 @@ class CameraApi:
         _only(query, "snapshot")
         with self._lock:
             if not self._snapshots:
-                raise RequestError(HTTPStatus.NOT_FOUND, "no picture has been taken; ask for /snapshot.jpg first")
+                raise RequestError(HTTPStatus.NOT_FOUND, "no picture has been taken; request /snapshot.jpg first")
             number = _whole(query, "snapshot", next(reversed(self._snapshots)))
             snapshot = self._snapshots.get(number)
         if snapshot is None:
@@ -189,18 +189,20 @@ class CameraApi:
         content: dict[str, Any] = {"snapshot": snapshot.number, "time": snapshot.time_s, "band": snapshot.band}
         pose = snapshot.pose
         if self._photos is not None:
-            photo, away_m = self._photos.nearest(pose.lat, pose.lon, snapshot.amsl_m, snapshot.band)
-            place = {"lat": photo.lat, "lon": photo.lon, "amslM": photo.amsl_m, "awayM": round(away_m, 3)}
+            photo, distance_m = self._photos.nearest(pose.lat, pose.lon, snapshot.amsl_m, snapshot.band)
+            place = {"lat": photo.lat, "lon": photo.lon, "amslM": photo.amsl_m, "awayM": round(distance_m, 3)}
             content |= {"photo": {"name": photo.path.name, **place}} | Truth(pose, (), ()).as_json()
         else:
             with _RenderSlot(self._waiting, self._busy):
-                truth = self._seen(pose).truth(pose, snapshot.intrinsics, mount=snapshot.mount, time_s=snapshot.time_s)
+                truth = self._world_at(pose).truth(
+                    pose, snapshot.intrinsics, mount=snapshot.mount, time_s=snapshot.time_s
+                )
             content |= truth.as_json()
         return Response("application/json", json.dumps(content).encode())
 
     def _sheet(self, query: dict[str, str]) -> Sheet:
         _only(query, "lat", "lon", "metres", "pixels")
-        frame = self._seen(self._sighted()).frame
+        frame = self._world_at(self._pose()).frame
         return Sheet(
             _number(query, "lat", frame.lat),
             _number(query, "lon", frame.lon),
@@ -211,7 +213,7 @@ class CameraApi:
     def _orthophoto(self, query: dict[str, str]) -> Response:
         sheet = self._sheet(query)
         with _RenderSlot(self._waiting, self._busy):
-            picture = self._seen(None).map(sheet)
+            picture = self._world_at(None).map(sheet)
         done, encoded = cv2.imencode(".png", picture, [cv2.IMWRITE_PNG_COMPRESSION, 3])
         if not done:
             raise RequestError(HTTPStatus.INTERNAL_SERVER_ERROR, "the map cannot be encoded")
@@ -222,7 +224,7 @@ class CameraApi:
 
 
 class _RenderSlot:
-    """The right to render: one at a time, few wait, and none for long."""
+    """Permission to render. One request renders at a time, and a few others wait for a limited time."""
 
     def __init__(self, waiting: threading.BoundedSemaphore, busy: threading.Lock) -> None:
         self._waiting = waiting
@@ -233,7 +235,7 @@ class _RenderSlot:
             raise RequestError(HTTPStatus.SERVICE_UNAVAILABLE, "too many concurrent requests; try again")
         if not self._busy.acquire(timeout=RENDER_WAIT_S):
             self._waiting.release()
-            raise RequestError(HTTPStatus.SERVICE_UNAVAILABLE, "the pictures before this one take too long; try again")
+            raise RequestError(HTTPStatus.SERVICE_UNAVAILABLE, "earlier pictures take too long; try again")
 
     def __exit__(self, *_: object) -> None:
         self._busy.release()
@@ -244,7 +246,7 @@ def _only(query: dict[str, str], *known: str) -> None:
     for name in query:
         if name not in known:
             names = ", ".join(known) or "none"
-            raise RequestError(HTTPStatus.BAD_REQUEST, f"unknown parameter {name[:40]!r}; known are: {names}")
+            raise RequestError(HTTPStatus.BAD_REQUEST, f"unknown parameter {name[:40]!r}; known parameters: {names}")
 
 
 def _number(query: dict[str, str], name: str, default: float) -> float:
@@ -254,7 +256,7 @@ def _number(query: dict[str, str], name: str, default: float) -> float:
     except ValueError as error:
         raise RequestError(HTTPStatus.BAD_REQUEST, f"{name}: {text!r} is not a number") from error
     if not abs(value) < 1e15:
-        raise RequestError(HTTPStatus.BAD_REQUEST, f"{name}: {text!r} is not a number that makes sense here")
+        raise RequestError(HTTPStatus.BAD_REQUEST, f"{name}: {text!r} is out of range")
     return value
 
 

@@ -1,4 +1,4 @@
-"""Georeferences of pictures: world files and GeoTIFF tags, in degrees, projected, or local coordinates."""
+"""Georeferences of pictures from world files and GeoTIFF tags, in degrees, projected or local coordinates."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Points = NDArray[np.float64]
 
 _WGS84 = 4326
 _DEGREES = (_WGS84, 4979, 4258, 4269)
-"""Geographic systems that agree with WGS 84 to within a metre or so."""
+"""EPSG codes of geographic systems that differ from WGS 84 by about a metre at most."""
 _WORLD_FILES = {".png": ".pgw", ".jpg": ".jgw", ".jpeg": ".jgw", ".tif": ".tfw", ".tiff": ".tfw"}
 
 
@@ -29,11 +29,11 @@ class Degrees:
     """Longitude and latitude (EPSG:4326)."""
 
     def to_plane(self, lats: Points, lons: Points) -> Points:
-        """Coordinates of the system, shape (n, 2), of degrees."""
+        """Convert degrees to coordinates of the system, shape (n, 2)."""
         return np.column_stack((lons, lats))
 
     def to_degrees(self, x: float, y: float) -> tuple[float, float]:
-        """Latitude and longitude of a point of the system."""
+        """Return latitude and longitude of a point of the system."""
         return y, x
 
 
@@ -48,33 +48,33 @@ class Projected:
         try:
             crs = pyproj.CRS.from_epsg(code)
         except pyproj.exceptions.CRSError:
-            raise GeoreferenceError(f"EPSG:{code} is no coordinate reference system that PROJ knows") from None
+            raise GeoreferenceError(f"EPSG:{code} is not a coordinate reference system of PROJ") from None
         if not crs.is_projected:
             raise GeoreferenceError(f"EPSG:{code} ({crs.name}) is not projected; convert the picture to EPSG:4326")
         self._from_degrees = pyproj.Transformer.from_crs(_WGS84, crs, always_xy=True)
 
     def to_plane(self, lats: Points, lons: Points) -> Points:
-        """Easting and northing, shape (n, 2), of degrees."""
+        """Convert degrees to eastings and northings, shape (n, 2)."""
         return np.column_stack(self._from_degrees.transform(lons, lats))
 
     def to_degrees(self, x: float, y: float) -> tuple[float, float]:
-        """Latitude and longitude of an easting and northing."""
+        """Return latitude and longitude of an easting and northing."""
         lon, lat = self._from_degrees.transform(x, y, direction="INVERSE")
         return lat, lon
 
 
 @dataclass(frozen=True, slots=True)
 class Metres:
-    """Metres east and north of a place."""
+    """Metres east and north of an origin."""
 
     frame: LocalFrame
 
     def to_plane(self, lats: Points, lons: Points) -> Points:
-        """Metres east and north, shape (n, 2), of degrees."""
+        """Convert degrees to metres east and north, shape (n, 2)."""
         return self.frame.xy_array(lats, lons)
 
     def to_degrees(self, x: float, y: float) -> tuple[float, float]:
-        """Latitude and longitude of a point."""
+        """Return latitude and longitude of a point."""
         return self.frame.latlon(x, y)
 
 
@@ -83,21 +83,21 @@ System = Degrees | Projected | Metres
 
 @dataclass(frozen=True, slots=True)
 class Georeference:
-    """The mapping between a picture and the earth.
+    """Mapping between a picture and the earth.
 
     Attributes:
-        system: Of the plane coordinates.
-        affine: Shape (2, 3): plane coordinates of a pixel (column, row, 1), whose origin is the picture's corner.
+        system: System of the plane coordinates.
+        affine: Matrix, shape (2, 3), from (column, row, 1) to plane coordinates. (0, 0) is the corner of the picture.
     """
 
     system: System
     affine: Points
 
     def pixels(self, lats: Points, lons: Points) -> Points:
-        """Columns and rows, shape (n, 2), of places in degrees."""
+        """Return columns and rows, shape (n, 2), of positions in degrees."""
         plane = self.system.to_plane(lats, lons)
         if isinstance(self.system, Degrees):
-            # Whatever side of the antimeridian the picture counts from.
+            # The picture may be on either side of the antimeridian.
             middle = self.affine[0, 2]
             plane[:, 0] = middle + (plane[:, 0] - middle + 180.0) % 360.0 - 180.0
         inverse = np.linalg.inv(self.affine[:, :2])
@@ -105,7 +105,7 @@ class Georeference:
         return pixels
 
     def place(self, column: float, row: float) -> tuple[float, float]:
-        """Latitude and longitude of a point of the picture."""
+        """Return latitude and longitude of a point of the picture."""
         x, y = self.affine @ np.array([column, row, 1.0])
         lat, lon = self.system.to_degrees(float(x), float(y))
         return lat, (lon + 180.0) % 360.0 - 180.0
@@ -119,7 +119,7 @@ def parse_system(text: str, origin: tuple[float, float] | None) -> System:
     """
     if text.lower() == "local":
         if origin is None:
-            raise GeoreferenceError("crs local: metres around which place? give the origin as LAT,LON")
+            raise GeoreferenceError("crs local: the origin is missing; set it as LAT,LON")
         return Metres(LocalFrame(*origin))
     code = text.upper().removeprefix("EPSG:")
     if not code.isdigit():
@@ -138,15 +138,15 @@ def read_world_file(picture: Path, system: System) -> Georeference:
         GeoreferenceError: The world file is missing or invalid.
     """
     names = [picture.with_suffix(suffix) for suffix in (_WORLD_FILES.get(picture.suffix.lower(), ".wld"), ".wld")]
-    found = next((name for name in names if name.is_file()), None)
-    if found is None:
+    path = next((name for name in names if name.is_file()), None)
+    if path is None:
         raise GeoreferenceError(f"{picture}: no world file; store {names[0].name} in the same folder")
     try:
-        a, d, b, e, c, f = (float(line) for line in found.read_text(encoding="ascii").split())
+        a, d, b, e, c, f = (float(line) for line in path.read_text(encoding="ascii").split())
     except (ValueError, OSError) as error:
-        raise GeoreferenceError(f"{found}: a world file has six lines of one number each: {error}") from error
+        raise GeoreferenceError(f"{path}: a world file has six lines with one number each: {error}") from error
     # A world file refers to the centre of the first pixel.
-    return _checked(np.array([[a, b, c - a / 2 - b / 2], [d, e, f - d / 2 - e / 2]]), system, str(found))
+    return _checked(np.array([[a, b, c - a / 2 - b / 2], [d, e, f - d / 2 - e / 2]]), system, str(path))
 
 
 def from_geotiff(tags: Mapping[str, Any], source: str, origin: tuple[float, float] | None) -> Georeference:
@@ -159,10 +159,9 @@ def from_geotiff(tags: Mapping[str, Any], source: str, origin: tuple[float, floa
     number = getattr(code, "value", code)
     epsg = 32767 if number is None else int(number)
     system = parse_system("local", origin) if epsg == 32767 else _system_of(epsg)
-    # tifffile names the second value of GTRasterTypeGeoKey RasterPixelIsPoint: then the tie is a pixel's middle.
-    shift = (
-        0.5 if int(getattr(tags.get("GTRasterTypeGeoKey"), "value", tags.get("GTRasterTypeGeoKey") or 1)) == 2 else 0.0
-    )
+    # With RasterPixelIsPoint (2), the tie point is the centre of a pixel instead of its corner.
+    raster_type = tags.get("GTRasterTypeGeoKey") or 1
+    shift = 0.5 if int(getattr(raster_type, "value", raster_type)) == 2 else 0.0
     matrix = tags.get("ModelTransformation")
     if matrix is not None:
         whole = np.asarray(matrix, np.float64).reshape(4, 4)
@@ -183,7 +182,9 @@ def from_geotiff(tags: Mapping[str, Any], source: str, origin: tuple[float, floa
 
 def _checked(affine: Points, system: System, source: str) -> Georeference:
     if not np.isfinite(affine).all() or abs(float(np.linalg.det(affine[:, :2]))) < 1e-24:
-        raise GeoreferenceError(f"{source}: its pixels have no size on the ground")
+        raise GeoreferenceError(f"{source}: the georeference gives pixels no size on the ground")
     if isinstance(system, Degrees) and not (abs(affine[1, 2]) <= 90.5 and abs(affine[0, 2]) <= 540.0):
-        raise GeoreferenceError(f"{source}: its corner is not a longitude and latitude; is its system EPSG:4326?")
+        raise GeoreferenceError(
+            f"{source}: the corner is not a longitude and latitude; check that its system is EPSG:4326"
+        )
     return Georeference(system, affine)

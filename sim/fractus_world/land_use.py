@@ -46,11 +46,11 @@ class Site:
 
     Attributes:
         block: Current content.
-        inside: Ground without roads and verges.
+        inside: Ground area without roads and verges.
         roll: Random source.
         crop: Crop of the first field.
-        trees: As in `Block`, but as a list.
-        built: Areas of houses.
+        trees: Trees as in `Block`, but as a list.
+        built: Ground areas of houses.
     """
 
     block: Block
@@ -79,7 +79,7 @@ class _Frontage:
 
 
 def _fields(site: Site) -> None:
-    """Strips of crops side by side, and a hedge here and there."""
+    """Add strips of crops side by side, with hedges between some of them."""
     block = site.block
     inside = site.inside
     roll = site.roll
@@ -105,7 +105,7 @@ def _fields(site: Site) -> None:
 
 
 def _hedge(site: Site, line: shapely.Geometry, radius_m: tuple[float, float], gap_m: tuple[float, float]) -> None:
-    """Bushes along a line."""
+    """Add bushes along a line."""
     roll = site.roll
     at = 0.0
     while at < line.length:
@@ -139,7 +139,7 @@ def _wood(site: Site) -> None:
 
 
 def _park(site: Site) -> None:
-    """Lawn, a pitch, a pond, paths and trees."""
+    """Add lawn, a pitch, a pond, paths and trees."""
     block = site.block
     inside = site.inside
     roll = site.roll
@@ -168,7 +168,7 @@ def _park(site: Site) -> None:
 
 
 def _works(site: Site) -> None:
-    """Halls on a paved yard with a car park."""
+    """Add halls on a paved yard with a car park."""
     block = site.block
     inside = site.inside
     roll = site.roll
@@ -215,7 +215,7 @@ def _car_park(site: Site, level: shapely.Polygon, taken: shapely.Geometry, turn:
 
 
 def _houses(site: Site) -> None:
-    """Rows of houses along the roads around and along streets between them, each with a drive and a garden behind."""
+    """Add rows of houses along the surrounding roads and along inner streets. Each house has a drive and a garden."""
     block = site.block
     inside = site.inside
     roll = site.roll
@@ -248,7 +248,7 @@ def _houses(site: Site) -> None:
 
 
 def _row(site: Site, ground: shapely.Polygon) -> list[shapely.Geometry]:
-    """Place houses around an area. Return possible positions of hedges."""
+    """Add houses along the edge of an area. Return possible positions of hedges."""
     hedges: list[shapely.Geometry] = []
     ring = ground.exterior
     roll = site.roll
@@ -267,14 +267,14 @@ def _row(site: Site, ground: shapely.Polygon) -> list[shapely.Geometry]:
 
 
 def _frontage(line: shapely.LinearRing, at_m: float) -> _Frontage:
-    """The point so far along a ring that runs counter-clockwise or clockwise; `away` leads inside."""
-    here = line.interpolate(at_m - 1.0)
+    """Return the frontage at a distance along a ring of any orientation. `away` points to its inside."""
+    behind = line.interpolate(at_m - 1.0)
     ahead = line.interpolate(at_m + 1.0)
-    length = max(math.hypot(ahead.x - here.x, ahead.y - here.y), 1e-6)
-    ax = (ahead.x - here.x) / length
-    ay = (ahead.y - here.y) / length
+    length = max(math.hypot(ahead.x - behind.x, ahead.y - behind.y), 1e-6)
+    ax = (ahead.x - behind.x) / length
+    ay = (ahead.y - behind.y) / length
     side = 1.0 if line.is_ccw else -1.0
-    return _Frontage((here.x, here.y), (ax, ay), (-ay * side, ax * side))
+    return _Frontage((behind.x, behind.y), (ax, ay), (-ay * side, ax * side))
 
 
 def _house(site: Site, ground: shapely.Polygon, front: _Frontage, lot: float) -> None:

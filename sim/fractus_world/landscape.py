@@ -1,4 +1,4 @@
-"""The procedural ground: paints a tile of any level straight from the layout of roads and blocks."""
+"""Procedural ground: draws tiles of any level from the layout of roads and blocks."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _TRACK: Colour = (128, 152, 166)
 _PAINT: Colour = (214, 218, 220)
 _TREES_DOWN_TO_M = 0.7
 _DETAIL_DOWN_TO_M = 2.1
-_AFAR: dict[Kind, Colour] = {
+_COARSE_COLOURS: dict[Kind, Colour] = {
     "wood": (44, 72, 54),
     "houses": (92, 112, 112),
     "works": (140, 144, 146),
@@ -37,14 +37,14 @@ _SHADOW_DEPTH = 0.56
 _EARTHY = np.array([0.86, 1.0, 0.98], np.float32)
 _LEAFY = np.array([0.8, 1.0, 1.0], np.float32)
 _LIGHT = np.clip(np.outer(np.arange(256), [0.97, 1.0, 1.03]), 0, 255).astype(np.uint8).reshape(256, 1, 3)
-"""The colour of an afternoon."""
+"""Colour correction for the light of an afternoon."""
 _DASH_M = 3.0
 _DASH_EVERY_M = 9.0
 _JUNCTION_M = 11.0
 
 
 class Landscape:
-    """A ground that a seed makes; see `tiles.Ground`."""
+    """Ground that is generated from a seed. See `tiles.Ground`."""
 
     def __init__(self, frame: LocalFrame, seed: int) -> None:
         self.frame = frame
@@ -55,14 +55,14 @@ class Landscape:
         self._noise = Noise(seed)
 
     def tile(self, level: int, column: int, row: int) -> Picture:
-        """Paint one tile."""
+        """Draw one tile."""
         pixel_m = FINEST_M * 2**level
         extent = TILE_PX * pixel_m
         drawing = TileDrawing(column * extent, -row * extent, pixel_m, TILE_PX, _GRASS)
         west, south, east, north = drawing.box
         near = self.blocks.near(west, south, east, north)
         if pixel_m > _DETAIL_DOWN_TO_M:
-            self._from_afar(drawing, near)
+            self._draw_coarse(drawing, near)
             self._grain(drawing)
         else:
             blocks = [self.blocks.block(i, j) for i, j in near]
@@ -71,15 +71,15 @@ class Landscape:
                 _patches(drawing, block)
             self._roads(drawing, near)
             self._grain(drawing)
-            _stand_up(drawing, blocks)
+            _draw_raised(drawing, blocks)
         return np.asarray(cv2.LUT(drawing.colour, _LIGHT), np.uint8)
 
-    def _from_afar(self, drawing: TileDrawing, near: list[tuple[int, int]]) -> None:
-        """Draw only what is visible from kilometres away: the land use of each block with straight borders."""
+    def _draw_coarse(self, drawing: TileDrawing, near: list[tuple[int, int]]) -> None:
+        """Draw the land use of each block with straight borders, and main roads. This is enough from kilometres away."""
         vertex = self.roads.vertex
         for i, j in near:
             kind = self.blocks.kind(i, j)
-            colour = self.blocks.crop(i, j) if kind == "fields" else _AFAR[kind]
+            colour = self.blocks.crop(i, j) if kind == "fields" else _COARSE_COLOURS[kind]
             outline = np.array([vertex(i, j), vertex(i + 1, j), vertex(i + 1, j + 1), vertex(i, j + 1)])
             drawing.fill(outline, colour, 90)
         for i, j in near if drawing.pixel_m < 10.0 else ():
@@ -125,7 +125,7 @@ class Landscape:
                     drawing.line(edge[:, :2] + wheel * half * edge[:, 2:], (98, 98, 100), 0.5)
 
     def _grain(self, drawing: TileDrawing) -> None:
-        """Uneven ground: clods, tufts and stains, as rough as each material is."""
+        """Add noise for clods, tufts and stains, with the roughness of each material."""
         fine = self._noise.between(0.0, 0.6, drawing) * 6.5 + self._noise.between(1.0, 4.5, drawing) * 5.5
         shift = fine * (drawing.rough.astype(np.float32) / 128.0)
         shift += self._noise.between(8.0, 70.0, drawing) * 3.6 + self._noise.between(120.0, 300.0, drawing) * 2.0
@@ -142,7 +142,7 @@ def _patches(drawing: TileDrawing, block: Block) -> None:
 
 
 def _rows(drawing: TileDrawing, patch: Patch, heading_deg: float) -> None:
-    """Rows of a crop, swaths, and the tramlines that a tractor leaves every 18 m."""
+    """Draw crop rows, swaths, and a tractor's tramlines every 18 m."""
     mask = drawing.mask(patch.outline)
     rows = np.flatnonzero(mask.any(axis=1))
     columns = np.flatnonzero(mask.any(axis=0))
@@ -166,7 +166,7 @@ def _rows(drawing: TileDrawing, patch: Patch, heading_deg: float) -> None:
 
 
 def _profile(across_m: NDArray[np.floating], pixel_m: float) -> NDArray[np.float32]:
-    """Brightness across the rows of a field."""
+    """Return the brightness across the rows of a field."""
     seen = np.clip(0.8 - pixel_m / 0.75, 0.0, 1.0)
     rows = 7.0 * seen * np.sin(across_m * (2 * math.pi / 0.75))
     swath = np.where((across_m // 6.0) % 2 < 1.0, 2.2, -2.2)
@@ -178,18 +178,18 @@ def _profile(across_m: NDArray[np.floating], pixel_m: float) -> NDArray[np.float
 
 
 def _marks(drawing: TileDrawing, edge: Points, width_m: float, main: bool) -> None:
-    """Lines along both sides of a main road, dashes in the middle."""
+    """Draw lines along both sides of a main road, and a dashed centre line."""
     if drawing.pixel_m > 0.5:
         return
-    way = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(edge[:, :2], axis=0), axis=1))))
+    distance = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(edge[:, :2], axis=0), axis=1))))
 
     def between(start_m: float, end_m: float, offset_m: float, count: int) -> Points:
         at = np.linspace(start_m, end_m, count)
-        line = np.column_stack([np.interp(at, way, edge[:, k]) for k in range(4)])
+        line = np.column_stack([np.interp(at, distance, edge[:, k]) for k in range(4)])
         points: Points = line[:, :2] + offset_m * line[:, 2:]
         return points
 
-    length = float(way[-1])
+    length = float(distance[-1])
     if main:
         for side in (-1.0, 1.0):
             points = between(_JUNCTION_M, length - _JUNCTION_M, side * (width_m / 2 - 0.35), 48)
@@ -202,15 +202,15 @@ def _marks(drawing: TileDrawing, edge: Points, width_m: float, main: bool) -> No
         at += _DASH_EVERY_M
 
 
-def _stand_up(drawing: TileDrawing, blocks: list[Block]) -> None:
-    """Draw raised objects after their shadows."""
+def _draw_raised(drawing: TileDrawing, blocks: list[Block]) -> None:
+    """Draw roofs and trees after their shadows."""
     roofs = [block.roofs[index] for block in blocks for index in drawing.within(block.roof_boxes, 10.0)]
     trees = _trees(drawing, blocks) if drawing.pixel_m <= _TREES_DOWN_TO_M else np.empty((0, 4))
     for roof in roofs:
         drawing.shadow(roof.corners, roof.height_m)
     for x, y, radius, _ in trees:
         drawing.round_shadow(x, y, radius, 1.5 * radius)
-    drawing.cast(_SHADOW_DEPTH)
+    drawing.darken_shadows(_SHADOW_DEPTH)
     for roof in roofs:
         _roof(drawing, roof)
     for x, y, radius, looks in trees:
@@ -220,10 +220,10 @@ def _stand_up(drawing: TileDrawing, blocks: list[Block]) -> None:
 def _trees(drawing: TileDrawing, blocks: list[Block]) -> Points:
     west, south, east, north = drawing.box
     margin = 9.0
-    found = [block.trees for block in blocks if len(block.trees)]
-    if not found:
+    groups = [block.trees for block in blocks if len(block.trees)]
+    if not groups:
         return np.empty((0, 4))
-    trees = np.vstack(found)
+    trees = np.vstack(groups)
     x = trees[:, 0]
     y = trees[:, 1]
     keep = (x > west - margin) & (x < east + margin) & (y > south - margin) & (y < north + margin)
@@ -260,7 +260,7 @@ def _roof(drawing: TileDrawing, roof: Roof) -> None:
 
 
 def _courses(drawing: TileDrawing, half: Points, colour: Colour) -> None:
-    """The courses of tiles on one side of a roof, parallel to the ridge."""
+    """Draw rows of tiles on one side of a roof, parallel to the ridge."""
     near, far, end, start = half
     count = int(np.linalg.norm(start - near) / 0.36)
     for k in range(1, count):

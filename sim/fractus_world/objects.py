@@ -31,7 +31,7 @@ _SHADELESS_PX = 5.0
 _TINY_PX = 1.2
 _MIN_BOARD_PX = 6.0
 _REACH = 0.55
-"""Things are drawn up to this times the focal length in pixels, in metres."""
+"""Maximum distance of drawn objects in metres, divided by the focal length in pixels."""
 _SHADOW = 0.5
 _BOARD_BACK = (96, 100, 104)
 _FRAME_WARMTH = 118
@@ -40,10 +40,10 @@ _FAR_PX = 30_000.0
 
 @dataclass(frozen=True, slots=True)
 class _Shape:
-    """A convex piece of something.
+    """A convex part of an object.
 
     Attributes:
-        hull: Its corners in fixed-point pixels, shape (n, 1, 2).
+        hull: Corners in fixed-point pixels, shape (n, 1, 2).
         colour: Blue, green, red.
         warmth: Grey value for a thermal camera.
     """
@@ -129,15 +129,15 @@ class ObjectLayer:
 
 
 def _thing_actors(view: View, things: list[Thing]) -> list[_InSight]:
-    """The things that are in sight; their corners are projected all at once."""
+    """Return the visible things. The corners of all things are projected together."""
     if not things:
         return []
     place = np.array([(thing.x, thing.y) for thing in things]) - view.place
     away = np.hypot(np.hypot(place[:, 0], place[:, 1]), view.height_m)
     sizes = np.array([max(thing.size_m) for thing in things]) * view.intrinsics.focal_px / np.maximum(away, 0.1)
     parts = [_parts(thing, float(size)) for thing, size in zip(things, sizes, strict=True)]
-    counts = np.array([sum(len(part.points) for part in found) for found in parts])
-    corners = np.vstack([part.points for found in parts for part in found])
+    counts = np.array([sum(len(part.points) for part in body) for body in parts])
+    corners = np.vstack([part.points for body in parts for part in body])
     world = _placed(things, corners, counts)
     pixels, depth = view.project(world)
     fallen = world.copy()
@@ -171,7 +171,7 @@ def _parts(thing: Thing, size_px: float) -> tuple[Part, ...]:
 
 
 def _placed(things: list[Thing], corners: Matrix, counts: NDArray[np.int64]) -> Matrix:
-    """Corners of bodies in the world's frame, shape (n, 3)."""
+    """Return the corners of bodies in the world's frame, shape (n, 3)."""
     angles = np.radians([thing.heading_deg for thing in things])
     sines = np.repeat(np.sin(angles), counts)
     cosines = np.repeat(np.cos(angles), counts)
@@ -226,7 +226,7 @@ def _hull(pixels: Matrix) -> Fixed:
 
 
 def _fixed(points: Matrix) -> Fixed:
-    """Pixel coordinates as OpenCV's fixed-point numbers, whose origin is the middle of the first pixel."""
+    """Return pixel coordinates as fixed-point numbers of OpenCV. Their origin is the centre of the first pixel."""
     return np.round((np.clip(points, -_FAR_PX, _FAR_PX) - 0.5) * (1 << _SHIFT)).astype(np.int32)
 
 
@@ -237,7 +237,7 @@ def _fill(picture: Picture, shape: _Shape, band: Band) -> None:
 
 
 def _clip(low: Matrix, high: Matrix, shape: tuple[int, ...]) -> tuple[int, int, int, int] | None:
-    """Return the whole pixels of a picture that a box touches, or None."""
+    """Return the pixels of a picture that a box touches, as left, top, right and bottom, or None."""
     x0 = max(math.floor(low[0]) - 1, 0)
     y0 = max(math.floor(low[1]) - 1, 0)
     x1 = min(math.ceil(high[0]) + 1, shape[1])
@@ -247,10 +247,10 @@ def _clip(low: Matrix, high: Matrix, shape: tuple[int, ...]) -> tuple[int, int, 
 
 def _darken(picture: Picture, hull: Fixed) -> None:
     corners = hull[:, 0, :] / (1 << _SHIFT) + 0.5
-    found = _clip(corners.min(axis=0), corners.max(axis=0), picture.shape)
-    if found is None:
+    box = _clip(corners.min(axis=0), corners.max(axis=0), picture.shape)
+    if box is None:
         return
-    x0, y0, x1, y1 = found
+    x0, y0, x1, y1 = box
     light = np.full((y1 - y0, x1 - x0, 3), 255, np.uint8)
     dark = int(255 * (1 - _SHADOW))
     shifted = hull - np.array([x0, y0], np.int32) * (1 << _SHIFT)
@@ -266,10 +266,10 @@ def _draw_board(picture: Picture, view: View, item: _InSight, board: Billboard, 
     if not board.faces(viewer):
         _fill(picture, item.shapes[0], band)
         return
-    found = _clip(item.points.min(axis=0), item.points.max(axis=0), picture.shape)
-    if found is None:
+    box = _clip(item.points.min(axis=0), item.points.max(axis=0), picture.shape)
+    if box is None:
         return
-    x0, y0, x1, y1 = found
+    x0, y0, x1, y1 = box
     size_px = max(
         float(np.linalg.norm(item.points[3] - item.points[0])),
         float(np.linalg.norm(item.points[2] - item.points[1])),
@@ -316,7 +316,7 @@ def _box(points: Matrix, view: View) -> Box | None:
 
 
 def _shares(view: View, hulls: Iterable[Fixed], labels: Labels, number: int) -> tuple[float, float]:
-    """Return the share of hulls inside the picture, and the share that is also labelled with a number."""
+    """Return the share of hulls inside the picture, and the share that is also visible, according to the labels."""
     pieces = list(hulls)
     points = np.vstack(pieces)[:, 0, :] / (1 << _SHIFT)
     low = np.floor(points.min(axis=0)) - 1
@@ -340,7 +340,7 @@ def _shares(view: View, hulls: Iterable[Fixed], labels: Labels, number: int) -> 
 
 
 def _true_heading(view: View, heading_deg: float) -> float:
-    """A direction of the world's frame as one from true north at the camera."""
+    """Convert a heading in the world's frame to a heading from true north at the camera."""
     angle = math.radians(heading_deg)
     east, north = view.unturn @ np.array([math.sin(angle), math.cos(angle)])
     return math.degrees(math.atan2(east, north))

@@ -19,7 +19,7 @@ Matrix = NDArray[np.float64]
 MIN_HEIGHT_M = 0.2
 MAX_PIXELS = 8192
 NEAR_M = 0.3
-"""Near limit along the optical axis."""
+"""Minimum depth of visible points along the optical axis."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,13 +118,13 @@ def _about_z(angle_deg: float) -> Matrix:
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
-# Camera axes (right, down, ahead) in the axes of an airframe (ahead, right, down); and north, east, down as east, north, up.
+# Camera axes (right, down, ahead) to airframe axes (ahead, right, down), and north, east, down to east, north, up.
 _AXES = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 _TO_ENU = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 
 
 def camera_rotation(pose: Pose, mount: Mount) -> Matrix:
-    """The rotation from camera axes (right, down, ahead) to east, north, up."""
+    """Return the rotation from camera axes (right, down, ahead) to east, north, up."""
     body = _about_z(pose.yaw_deg)
     if not mount.stabilised:
         body = body @ _about_y(pose.pitch_deg) @ _about_x(pose.roll_deg)
@@ -169,7 +169,7 @@ class View:
 
     @classmethod
     def of(cls, pose: Pose, mount: Mount, intrinsics: Intrinsics, frame: LocalFrame) -> View:
-        """The view of a camera on an airframe, in the frame of a world."""
+        """Return the view of a camera on an airframe, in the frame of a world."""
         turn = plane_turn(frame, pose.lat, pose.lon)
         return cls(
             intrinsics,
@@ -181,7 +181,7 @@ class View:
         )
 
     def rays(self, pixels: Matrix) -> Matrix:
-        """Directions (east, north, up; length 1 along the optical axis), shape (..., 3), of pixels, shape (..., 2)."""
+        """Return the directions (east, north, up) of pixels, shape (..., 2) to (..., 3). The optical axis has length 1."""
         lens = self.intrinsics
         across = (pixels - np.array([lens.width / 2.0, lens.height / 2.0])) / lens.focal_px
         ahead = np.ones((*across.shape[:-1], 1))
@@ -189,7 +189,7 @@ class View:
         return directions
 
     def ground_matrix(self) -> Matrix:
-        """The homography from pixels to metres in the world's frame; the third component is negative for ground in sight."""
+        """Return the homography from pixels to metres in the world's frame. Visible ground has a negative third component."""
         lens = self.intrinsics
         inverse = np.array(
             [
@@ -203,9 +203,9 @@ class View:
         return np.vstack((self.turn @ local + np.outer(self.place, rays[2]), rays[2]))
 
     def project(self, points: Matrix) -> tuple[Matrix, Matrix]:
-        """Pixels, shape (n, 2), and depths in metres, shape (n,), of points of the world's frame, shape (n, 3), z up.
+        """Return pixels, shape (n, 2), and depths in metres, shape (n,), of points of the world's frame, shape (n, 3), z up.
 
-        The pixels of points nearer than `NEAR_M` mean nothing.
+        Pixels of points nearer than `NEAR_M` are invalid.
         """
         plane = (points[:, :2] - self.place) @ self.unturn.T
         camera = np.column_stack((plane, points[:, 2] - self.height_m)) @ self.rotation
@@ -216,7 +216,7 @@ class View:
         return pixels, depth
 
     def ground_within(self, limit_m: float) -> Matrix | None:
-        """The part of the ground in sight and nearer than a limit, as a box in the world's frame: ((x0, y0), (x1, y1))."""
+        """Return the bounding box ((x0, y0), (x1, y1)) of the visible ground up to a distance, or None if no ground is visible."""
         lens = self.intrinsics
         steps = np.linspace(0.0, 1.0, 9)
         u, v = np.meshgrid(steps * lens.width, steps * lens.height)

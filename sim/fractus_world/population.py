@@ -89,8 +89,7 @@ class TownPopulation:
         (x0, y0), (x1, y1) = box
         middle = (box[0] + box[1]) / 2.0
         for i, j in self._blocks.near(x0, y0, x1, y1):
-            away = math.dist(centre(i, j), middle)
-            if away > _PARKED_WITHIN_M + SPACING_M:
+            if math.dist(centre(i, j), middle) > _PARKED_WITHIN_M + SPACING_M:
                 continue
             things += self._walkers(i, j, time_s)
             things += self._in_block(self._blocks.block(i, j), i, j, time_s)
@@ -103,16 +102,16 @@ class TownPopulation:
         for family, across, along in (("east", 1, 0), ("north", 0, 1)):
             for index in range(math.floor(low[across] - 0.5), math.ceil(high[across] + 0.5) + 1):
                 road = Road("east" if family == "east" else "north", index)
-                for way in (1, -1):
-                    things += self._lane(road, way, (low[along] - 0.6, high[along] + 0.6), time_s)
+                for direction in (1, -1):
+                    things += self._lane(road, direction, (low[along] - 0.6, high[along] + 0.6), time_s)
         return things
 
-    def _lane(self, road: Road, way: int, span: tuple[float, float], time_s: float) -> list[Thing]:
-        """The vehicles of one lane; all drive at one speed, so that none runs into another."""
+    def _lane(self, road: Road, direction: int, span: tuple[float, float], time_s: float) -> list[Thing]:
+        """Return the vehicles of one lane. All have the same speed, so that they do not collide."""
         family = 1 if road.family == "east" else 2
-        key = (self._seed, 31, family, road.index, way)
+        key = (self._seed, 31, family, road.index, direction)
         gap = _GAP_M[road.main] / SPACING_M
-        rate = way * _SPEED_MPS[road.main] * (0.85 + 0.3 * unit(*key)) / SPACING_M
+        rate = direction * _SPEED_MPS[road.main] * (0.85 + 0.3 * unit(*key)) / SPACING_M
         first = math.floor((span[0] - rate * time_s) / gap) - 1
         last = math.ceil((span[1] - rate * time_s) / gap)
         things = []
@@ -122,13 +121,13 @@ class TownPopulation:
                 continue
             x, y, dx, dy = self._roads.along(road, along)
             length = math.hypot(dx, dy)
-            ux = way * dx / length
-            uy = way * dy / length
+            ux = direction * dx / length
+            uy = direction * dy / length
             offset = _LANE_M[road.main]
             looks = mixed(*key, slot, 5)
             things.append(
                 Thing(
-                    f"vehicle-{road.family[0]}{road.index}{'+' if way > 0 else '-'}{slot}",
+                    f"vehicle-{road.family[0]}{road.index}{'+' if direction > 0 else '-'}{slot}",
                     _vehicle_kind(looks, road.main),
                     x + uy * offset,
                     y - ux * offset,
@@ -140,7 +139,7 @@ class TownPopulation:
         return things
 
     def _walkers(self, i: int, j: int, time_s: float) -> list[Thing]:
-        """People who walk up and down the pavements of the two roads that begin at a vertex."""
+        """Return the people who walk to and fro on the pavements of the two roads that begin at a vertex."""
         things = []
         for road, step in ((Road("east", j), i), (Road("north", i), j)):
             if not self._roads.built_up(road, step):
@@ -150,12 +149,12 @@ class TownPopulation:
                 key = (self._seed, 42, family, i, j, n)
                 pace = WALK_MPS * (0.8 + 0.4 * unit(*key))
                 turn = (unit(*key, 1) + time_s * pace / (2 * SPACING_M)) % 1.0
-                way = 1 if turn < 0.5 else -1
-                share = 0.04 + 0.92 * (2 * turn if way > 0 else 2 - 2 * turn)
+                direction = 1 if turn < 0.5 else -1
+                share = 0.04 + 0.92 * (2 * turn if direction > 0 else 2 - 2 * turn)
                 x, y, dx, dy = self._roads.along(road, step + share)
                 length = math.hypot(dx, dy)
                 side = (self._roads.width_m(road, step) / 2 + 1.2) * (1 if unit(*key, 2) < 0.5 else -1)
-                heading = math.degrees(math.atan2(way * dx, way * dy))
+                heading = math.degrees(math.atan2(direction * dx, direction * dy))
                 speed = 0.92 * pace * length / SPACING_M
                 place = (x - dy / length * side, y + dx / length * side)
                 things.append(
@@ -172,7 +171,7 @@ class TownPopulation:
         return things + [self._stroller(i, j, n, time_s) for n in range(_STROLLERS.get(block.kind, 0))]
 
     def _stroller(self, i: int, j: int, n: int, time_s: float) -> Thing:
-        """A person who wanders about in the open, on a closed curve."""
+        """Return a person who walks on a closed curve in the open."""
         draws = [unit(self._seed, 61, i, j, n, k) for k in range(7)]
         x, y = centre(i + 0.5 * (draws[0] - 0.5), j + 0.5 * (draws[1] - 0.5))
         reach = 6.0 + 22.0 * draws[2]
@@ -200,8 +199,8 @@ def _vehicle_kind(looks: int, main: bool) -> Kind:
 
 
 def nearest(things: list[Thing], place: Matrix, count: int) -> list[Thing]:
-    """At most `count` things, the nearest to a place, farthest first."""
+    """Return the `count` things nearest to a place, the farthest of them first."""
     if not things:
         return []
-    away = np.hypot([t.x - place[0] for t in things], [t.y - place[1] for t in things])
-    return [things[k] for k in np.argsort(away, kind="stable")[:count]][::-1]
+    distances = np.hypot([t.x - place[0] for t in things], [t.y - place[1] for t in things])
+    return [things[k] for k in np.argsort(distances, kind="stable")[:count]][::-1]

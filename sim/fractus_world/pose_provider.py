@@ -11,6 +11,7 @@ import time
 from dataclasses import dataclass, replace
 from typing import Protocol
 
+from fractus_runtime.backoff import Backoff
 from fractus_runtime.mavlink_codec import Endpoint, Message, message_id
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
@@ -22,12 +23,14 @@ STALE_S = 2.0
 CONNECT_TIMEOUT_S = 3.0
 READ_TIMEOUT_S = 0.5
 SILENCE_S = 5.0
-"""A link that brings nothing for so long is opened again."""
-RETRY_S = (0.2, 3.0)
-ASK_EVERY_S = 5.0
+"""Time without a message after which the link is reopened, in seconds."""
+
+FIRST_RETRY_S = 0.2
+MAX_RETRY_S = 3.0
+REQUEST_INTERVAL_S = 5.0
 SYSTEM = 242
 COMPONENT = mavlink.MAV_COMP_ID_CAMERA
-"""MAVLink ids of a camera; no heartbeats are sent, so that none can hold off an autopilot's failsafe."""
+"""MAVLink component id. The camera sends no heartbeats, because they could delay a failsafe of the autopilot."""
 _STREAMS = {"GLOBAL_POSITION_INT": 20.0, "ATTITUDE": 20.0, "GIMBAL_DEVICE_ATTITUDE_STATUS": 10.0}
 
 
@@ -61,12 +64,12 @@ class FixedPose:
     ground_amsl_m: float = 0.0
 
     def now(self) -> CameraPose | None:
-        """Always the same."""
+        """Return the fixed position."""
         return CameraPose(self.pose, self.ground_amsl_m)
 
 
 @dataclass(slots=True)
-class _Heard:
+class _Telemetry:
     position: Message | None = None
     position_s: float = -math.inf
     attitude: Message | None = None
@@ -86,17 +89,17 @@ class VehiclePose:
     def __init__(self, address: tuple[str, int], ground_amsl_m: float | None = None) -> None:
         self._address = address
         self._ground_amsl_m = ground_amsl_m
-        self._heard = _Heard()
+        self._telemetry = _Telemetry()
         self._lock = threading.Lock()
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="vehicle", daemon=True)
 
     def start(self) -> None:
-        """Begin to follow."""
+        """Start the thread."""
         self._thread.start()
 
     def stop(self) -> None:
-        """End, within a few seconds."""
+        """Stop the thread within a few seconds."""
         self._stop.set()
         self._thread.join(CONNECT_TIMEOUT_S + 2 * READ_TIMEOUT_S)
 
@@ -106,47 +109,47 @@ class VehiclePose:
         Return None if position or attitude are older than two seconds.
         """
         with self._lock:
-            heard = replace(self._heard)
+            latest = replace(self._telemetry)
         now_s = time.monotonic()
-        if heard.position is None or heard.attitude is None:
+        if latest.position is None or latest.attitude is None:
             return None
-        if now_s - min(heard.position_s, heard.attitude_s) > STALE_S:
+        if now_s - min(latest.position_s, latest.attitude_s) > STALE_S:
             return None
-        mount = heard.mount if now_s - heard.mount_s < STALE_S else None
+        mount = latest.mount if now_s - latest.mount_s < STALE_S else None
         ground_m = self._ground_amsl_m
         if ground_m is None:
-            ground_m = (heard.position.real("alt") - heard.position.real("relative_alt")) / 1000.0
-        return CameraPose(_pose(heard.position, heard.attitude, now_s - heard.position_s, ground_m), ground_m, mount)
+            ground_m = (latest.position.real("alt") - latest.position.real("relative_alt")) / 1000.0
+        return CameraPose(_pose(latest.position, latest.attitude, now_s - latest.position_s, ground_m), ground_m, mount)
 
     def _run(self) -> None:
-        wait_s = RETRY_S[0]
+        backoff = Backoff(FIRST_RETRY_S, MAX_RETRY_S)
         while not self._stop.is_set():
             try:
                 with socket.create_connection(self._address, timeout=CONNECT_TIMEOUT_S) as link:
                     log.info("camera world: connected to the vehicle (address=%s:%d)", *self._address)
                     if self._follow(link):
-                        wait_s = RETRY_S[0]
+                        backoff.succeeded()
             except OSError as error:
-                log.info("camera world: no vehicle (address=%s:%d, error=%s)", *self._address, error)
-            self._stop.wait(wait_s)
-            wait_s = min(2 * wait_s, RETRY_S[1])
+                log.info("camera world: cannot connect to the vehicle (address=%s:%d error=%s)", *self._address, error)
+            self._stop.wait(backoff.delay_s())
 
     def _follow(self, link: socket.socket) -> bool:
         """Receive until the link fails. Return True if a message was received."""
         link.settimeout(READ_TIMEOUT_S)
         endpoint = Endpoint(SYSTEM, COMPONENT)
         autopilot: tuple[int, int] | None = None
-        asked_s = -math.inf
-        heard_s = opened_s = time.monotonic()
+        requested_s = -math.inf
+        opened_s = time.monotonic()
+        received_s = opened_s
         while not self._stop.is_set():
             data = None
             with contextlib.suppress(TimeoutError):
                 data = link.recv(65536)
             now_s = time.monotonic()
-            if data == b"" or now_s - heard_s > SILENCE_S:
+            if data == b"" or now_s - received_s > SILENCE_S:
                 break
             for message in endpoint.decode(data or b""):
-                heard_s = now_s
+                received_s = now_s
                 if (
                     message.name == "HEARTBEAT"
                     and message.integer("autopilot") != mavlink.MAV_AUTOPILOT_INVALID
@@ -154,29 +157,29 @@ class VehiclePose:
                 ):
                     autopilot = (message.sysid, message.compid)
                 if autopilot is not None and message.sysid == autopilot[0]:
-                    self._take(message, now_s)
-            if autopilot is not None and now_s - asked_s > ASK_EVERY_S:
-                asked_s = now_s
-                _ask(link, endpoint, autopilot)
-        return heard_s > opened_s
+                    self._store(message, now_s)
+            if autopilot is not None and now_s - requested_s > REQUEST_INTERVAL_S:
+                requested_s = now_s
+                _request_streams(link, endpoint, autopilot)
+        return received_s > opened_s
 
-    def _take(self, message: Message, now_s: float) -> None:
+    def _store(self, message: Message, now_s: float) -> None:
         with self._lock:
             if message.name == "GLOBAL_POSITION_INT":
                 # An autopilot without a fix reports zeros.
                 if message.integer("lat") != 0 or message.integer("lon") != 0:
-                    self._heard.position = message
-                    self._heard.position_s = now_s
+                    self._telemetry.position = message
+                    self._telemetry.position_s = now_s
             elif message.name == "ATTITUDE":
-                self._heard.attitude = message
-                self._heard.attitude_s = now_s
+                self._telemetry.attitude = message
+                self._telemetry.attitude_s = now_s
             elif message.name == "GIMBAL_DEVICE_ATTITUDE_STATUS":
-                self._heard.mount = _gimbal(message, self._heard.attitude)
-                self._heard.mount_s = now_s
+                self._telemetry.mount = _gimbal(message, self._telemetry.attitude)
+                self._telemetry.mount_s = now_s
 
 
-def _ask(link: socket.socket, endpoint: Endpoint, autopilot: tuple[int, int]) -> None:
-    """Ask for the streams; a restarted autopilot has forgotten them, so this is repeated."""
+def _request_streams(link: socket.socket, endpoint: Endpoint, autopilot: tuple[int, int]) -> None:
+    """Request the streams. The request is repeated, because a restart of the autopilot removes them."""
     for name, rate_hz in _STREAMS.items():
         values = {
             "target_system": autopilot[0],
@@ -189,6 +192,7 @@ def _ask(link: socket.socket, endpoint: Endpoint, autopilot: tuple[int, int]) ->
 
 
 def _pose(position: Message, attitude: Message, age_s: float, ground_amsl_m: float) -> Pose:
+    """Return the pose, extrapolated by the age of the position."""
     north = position.real("vx") / 100.0 * age_s
     east = position.real("vy") / 100.0 * age_s
     lat = position.real("lat") * 1e-7
@@ -206,7 +210,7 @@ def _pose(position: Message, attitude: Message, age_s: float, ground_amsl_m: flo
 
 
 def _gimbal(message: Message, attitude: Message | None) -> Mount | None:
-    """The mount that a gimbal's quaternion and flags describe; None when they are no attitude."""
+    """Return the mount described by a gimbal's quaternion and flags, or None if the quaternion is no attitude."""
     w, x, y, z = (float(part) for part in message.array("q") if not isinstance(part, bytes))
     norm = math.sqrt(w * w + x * x + y * y + z * z)
     if not 0.5 < norm < 2.0:

@@ -18,7 +18,7 @@ def mixed(*keys: int) -> int:
 
 
 def unit(*keys: int) -> float:
-    """A number from 0 to 1."""
+    """Return a pseudo-random number from 0 to 1."""
     return mixed(*keys) / 2**64
 
 
@@ -28,7 +28,7 @@ def dice(*keys: int) -> random.Random:
 
 
 def smooth(seed: int, x: float, y: float) -> float:
-    """Value noise from 0 to 1 over a lattice of unit cells."""
+    """Return value noise from 0 to 1 over a lattice of unit cells."""
     i = int(x // 1)
     j = int(y // 1)
     a = x - i

@@ -1,4 +1,4 @@
-"""The user's own aerial picture as a ground: a GeoTIFF, or a PNG or JPEG with a world file."""
+"""Ground from an aerial picture of the user: a GeoTIFF, or a PNG or JPEG with a world file."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from fractus_world.optics import Matrix
 from fractus_world.tiles import TILE_PX, Picture, interpolated
 
 MAX_PIXELS = 400_000_000
-NOTHING = (112, 118, 116)
+OUTSIDE = (112, 118, 116)
 """Colour outside of the picture: blue, green, red."""
 _GRID = 16
 _LEVELS = 12
@@ -42,11 +42,11 @@ class Raster:
         self.finest_m = math.sqrt(abs(ax * by - ay * bx))
         if not 1e-4 < self.finest_m < 1000.0:
             raise GeoreferenceError(
-                f"a pixel is {self.finest_m:g} m wide; is the world file in the units of its system?"
+                f"a pixel is {self.finest_m:g} m wide; check that the world file uses the units of its system"
             )
 
     def tile(self, level: int, column: int, row: int) -> Picture:
-        """Cut a tile out of the picture, with its scale and rotation."""
+        """Return a tile, cut out of the picture, scaled and rotated."""
         grid = self._source(level, column, row) / 2.0**level
         source = self._half(level)
         low = np.floor(grid.reshape(-1, 2).min(axis=0)).astype(int) - 2
@@ -54,18 +54,18 @@ class Raster:
         low = np.maximum(low, 0)
         high = np.minimum(high, [source.shape[1], source.shape[0]])
         blank = np.empty((TILE_PX, TILE_PX, 3), np.uint8)
-        blank[:] = NOTHING
+        blank[:] = OUTSIDE
         if bool((low >= high).any()):
             return blank
         part = np.ascontiguousarray(source[low[1] : high[1], low[0] : high[0]])
         at = (np.arange(TILE_PX) + 0.5) * (_GRID / TILE_PX)
         maps = [interpolated(grid[..., axis] - low[axis] - 0.5, at) for axis in (0, 1)]
         border = cv2.BORDER_CONSTANT
-        drawn = cv2.remap(part, maps[0], maps[1], cv2.INTER_LINEAR, borderMode=border, borderValue=NOTHING)
+        drawn = cv2.remap(part, maps[0], maps[1], cv2.INTER_LINEAR, borderMode=border, borderValue=OUTSIDE)
         return np.asarray(drawn, np.uint8)
 
     def _source(self, level: int, column: int, row: int) -> Matrix:
-        """Pixels of the whole picture at the corners of a tile's cells, shape (n, n, 2)."""
+        """Return pixels of the whole picture at the corners of a tile's cells, shape (n, n, 2)."""
         metres = self.finest_m * 2**level
         at = np.linspace(0.0, TILE_PX, _GRID + 1)
         x, y = np.meshgrid((column * TILE_PX + at) * metres, -(row * TILE_PX + at) * metres)
@@ -73,17 +73,17 @@ class Raster:
         return self._reference.pixels(places[:, 0], places[:, 1]).reshape(_GRID + 1, _GRID + 1, 2)
 
     def _place(self, east_m: float, north_m: float) -> tuple[float, float]:
-        # Beyond a thousand kilometres is nothing but the colour of nothing.
-        away = math.hypot(east_m, north_m)
-        share = min(1.0, 1e6 / away) if away else 1.0
+        # Positions beyond 1000 km may be outside the frame. They are outside the picture in any case.
+        distance_m = math.hypot(east_m, north_m)
+        share = min(1.0, 1e6 / distance_m) if distance_m else 1.0
         return self.frame.latlon(east_m * share, north_m * share)
 
     def _half(self, level: int) -> Picture:
-        """The picture, halved `level` times."""
+        """Return the picture, halved `level` times."""
         while len(self._halved) <= level:
             last = self._halved[-1]
             size = (max(-(-last.shape[1] // 2), 1), max(-(-last.shape[0] // 2), 1))
-            # The last row or column is repeated for odd sizes, so that pixels keep their position.
+            # For odd sizes, the last row or column is repeated, so that pixels keep their position.
             even = cv2.copyMakeBorder(
                 last, 0, 2 * size[1] - last.shape[0], 0, 2 * size[0] - last.shape[1], cv2.BORDER_REPLICATE
             )
@@ -110,7 +110,7 @@ def read_raster(path: Path, crs: str | None = None, origin: tuple[float, float] 
             _check_size(path, image.width, image.height)
             pixels = np.asarray(image.convert("RGB"))
     except (OSError, UnidentifiedImageError, Image.DecompressionBombError) as error:
-        raise GeoreferenceError(f"{path}: is not a picture that can be read: {error}") from error
+        raise GeoreferenceError(f"{path}: cannot be read as a picture: {error}") from error
     reference = read_world_file(path, parse_system(crs or "EPSG:4326", origin))
     return Raster(np.ascontiguousarray(pixels[..., ::-1]), reference)
 
@@ -124,7 +124,7 @@ def _read_tiff(path: Path, crs: str | None, origin: tuple[float, float] | None) 
             pixels = page.asarray()
             planar = int(page.planarconfig) == 2
     except (OSError, tifffile.TiffFileError, ValueError, IndexError, KeyError) as error:
-        raise GeoreferenceError(f"{path}: is not a TIFF that can be read: {error}") from error
+        raise GeoreferenceError(f"{path}: cannot be read as a TIFF: {error}") from error
     if pixels.dtype != np.uint8:
         raise GeoreferenceError(
             f"{path}: has {pixels.dtype} samples; convert them to 8 bits (gdal_translate -ot Byte -scale)"
@@ -141,12 +141,12 @@ def _read_tiff(path: Path, crs: str | None, origin: tuple[float, float] | None) 
         reference = read_world_file(path, parse_system(crs or "EPSG:4326", origin))
     picture = np.ascontiguousarray(pixels[..., 2::-1])
     if pixels.shape[2] == 4:
-        picture[pixels[..., 3] == 0] = NOTHING
+        picture[pixels[..., 3] == 0] = OUTSIDE
     return Raster(picture, reference)
 
 
 def _check_size(path: Path, width: int, height: int) -> None:
     if width * height > MAX_PIXELS:
         raise GeoreferenceError(
-            f"{path}: {width}x{height} is more than {MAX_PIXELS:,} pixels; make it smaller or cut it (gdal_translate)"
+            f"{path}: {width}x{height} is more than {MAX_PIXELS:,} pixels; reduce or cut it (gdal_translate)"
         )

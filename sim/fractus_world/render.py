@@ -16,7 +16,7 @@ from fractus_world.tiles import TILE_PX, Picture, TileStore, pixel_m
 Band = Literal["rgb", "ir"]
 
 CELL_PX = 16
-"""Detail and haze are worked out once for a cell of this many pixels."""
+"""Side of a cell in pixels. Detail and haze are computed once for each cell."""
 VISIBILITY_M = 9000.0
 FARTHEST_M = 25_000.0
 _SPARE_PX = 5_000_000
@@ -39,7 +39,7 @@ SKIES: dict[Band, Sky] = {
 
 
 def render_ground(view: View, store: TileStore, band: Band) -> Picture:
-    """The picture without anything that moves or stands, (height, width, 3), blue, green, red."""
+    """Return a picture of the ground and sky without objects, shape (height, width, 3); blue, green, red."""
     lens = view.intrinsics
     cells = _Cells.of(view, store)
     picture = np.empty((lens.height, lens.width, 3), np.uint8)
@@ -57,7 +57,7 @@ def render_ground(view: View, store: TileStore, band: Band) -> Picture:
 
 @dataclass(frozen=True, slots=True)
 class _Cells:
-    """Slowly varying values at the corners of cells: level of detail, distance, elevation of the ray."""
+    """Level of detail of each cell, and haze and elevation of the ray at its corners."""
 
     levels: NDArray[np.int64]
     haze: NDArray[np.float32]
@@ -77,7 +77,7 @@ class _Cells:
         flat = np.hypot(rays[..., 0], rays[..., 1])
         away = view.height_m * np.sqrt(flat**2 + down**2) / np.maximum(down, 1e-9)
         away = np.where(down > 1e-9, np.minimum(away, 1e7), 1e7)
-        # A pixel is h / f / down wide and h / f / down^2 long; the mean leans to its length, so that nothing flickers.
+        # A pixel is h / f / down wide and h / f / down^2 long. The exponent is close to its length, which avoids flicker.
         size_m = view.height_m / lens.focal_px / np.maximum(down, 1e-9) ** 1.75
         level = np.log2(np.maximum(size_m, 1e-9) / store.ground.finest_m) + _LEVEL_BIAS
         level = np.clip(np.floor(level), 0, store.ground.levels - 1).astype(np.int64)
@@ -121,7 +121,7 @@ def _warped(source: Picture, mapping: Matrix, size: tuple[int, int]) -> Picture:
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     border = cv2.BORDER_REPLICATE
     if float(np.abs(mapping[2, :2]).max()) * max(size) < 1e-9 * abs(float(mapping[2, 2])):
-        # Looking straight down: no perspective, and half the work.
+        # A view straight down has no perspective, and an affine transformation takes half the time.
         drawn = cv2.warpAffine(source, mapping[:2] / mapping[2, 2], size, flags=flags, borderMode=border)
     else:
         drawn = cv2.warpPerspective(source, mapping, size, flags=flags, borderMode=border)
@@ -131,8 +131,8 @@ def _warped(source: Picture, mapping: Matrix, size: tuple[int, int]) -> Picture:
 def _window(
     view: View, store: TileStore, level: int, marked: NDArray[np.bool_]
 ) -> tuple[tuple[int, int, int, int], int]:
-    """Return the level's pixels for the marked cells, or a coarser level if they would be too many."""
-    # The extremes of a visible plane are at the ends of rows.
+    """Return the window of a level for the marked cells. Use a coarser level if the window would be too large."""
+    # The farthest ground points are at the ends of rows of cells.
     rows = np.flatnonzero(marked.any(axis=1))
     first = marked[rows].argmax(axis=1)
     last = marked.shape[1] - marked[rows][:, ::-1].argmax(axis=1)
@@ -184,9 +184,9 @@ def _add_air(picture: Picture, cells: _Cells, sky: Sky) -> None:
 
 
 def _enlarged(corners: NDArray[Any]) -> NDArray[Any]:
-    """Values at the corners of cells, interpolated at every pixel."""
+    """Interpolate values at the corners of cells for every pixel."""
     size = (corners.shape[1] * CELL_PX, corners.shape[0] * CELL_PX)
     whole = cv2.resize(np.ascontiguousarray(corners), size, interpolation=cv2.INTER_LINEAR)
-    # Resizing puts a corner into the middle of a cell.
+    # `resize` places the value of a corner at the centre of a cell.
     half = CELL_PX // 2
     return np.asarray(whole)[half:-half, half:-half]

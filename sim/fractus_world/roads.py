@@ -1,4 +1,4 @@
-"""The road network of a seed: two families of winding lines that cross at the vertices of a jittered lattice."""
+"""Road network of a seed: two families of winding roads that cross at the vertices of an irregular lattice."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ TOWN_RADIUS_M = 480.0
 
 
 def centre(i: float, j: float) -> tuple[float, float]:
-    """The middle of a cell of the lattice, metres east and north of the world's origin."""
+    """Return the centre of a lattice cell in metres east and north of the world's origin."""
     return i * SPACING_M + SHIFT_M[0], j * SPACING_M + SHIFT_M[1]
 
 
 def cell(x: float, y: float) -> tuple[float, float]:
-    """Lattice coordinates of a place; the inverse of `centre`."""
+    """Return the lattice coordinates of a position. The inverse of `centre`."""
     return (x - SHIFT_M[0]) / SPACING_M, (y - SHIFT_M[1]) / SPACING_M
 
 
@@ -53,7 +53,7 @@ class Road:
         return self.index % _MAIN_EVERY == 1
 
     def vertex(self, step: int) -> tuple[int, int]:
-        """Lattice coordinates of its vertices."""
+        """Return the lattice coordinates of a vertex of the road."""
         return (step, self.index) if self.family == "east" else (self.index, step)
 
 
@@ -88,7 +88,7 @@ class Roads:
         return self.town(i, j) or (self.town(i, j - 1) if road.family == "east" else self.town(i - 1, j))
 
     def width_m(self, road: Road, step: int) -> float:
-        """Width of the carriageway from vertex `step` to the next."""
+        """Return the width of the carriageway from vertex `step` to the next."""
         if road.main:
             return 7.6
         return 6.0 if self.built_up(road, step) else 3.2
@@ -102,17 +102,17 @@ class Roads:
         t = along - step
         p = [self.vertex(*road.vertex(step + k)) for k in (-1, 0, 1, 2)]
         place = []
-        way = []
+        direction = []
         for a, b, c, d in zip(*p, strict=True):
             k1 = (c - a) / 2
             k2 = a - 2.5 * b + 2 * c - d / 2
             k3 = (d - a) / 2 + 1.5 * (b - c)
             place.append(b + t * (k1 + t * (k2 + t * k3)))
-            way.append(k1 + t * (2 * k2 + t * 3 * k3))
-        return place[0], place[1], way[0], way[1]
+            direction.append(k1 + t * (2 * k2 + t * 3 * k3))
+        return place[0], place[1], direction[0], direction[1]
 
     def along(self, road: Road, along: float) -> tuple[float, float, float, float]:
-        """The same as `at`, from the points that the road is painted with; twenty times faster."""
+        """Return the same as `at` with the precision of the drawn road, twenty times faster."""
         step = math.floor(along)
         share = (along - step) * (EDGE_POINTS - 1)
         k = min(int(share), EDGE_POINTS - 2)
@@ -123,7 +123,7 @@ class Roads:
         return ax + share * dx, ay + share * dy, dx * (EDGE_POINTS - 1), dy * (EDGE_POINTS - 1)
 
     def _edge(self, road: Road, step: int) -> Points:
-        """Points along a road from vertex `step` to the next: x, y and the unit normal to the left, shape (n, 4)."""
+        """Return points from vertex `step` to the next: x, y and the unit normal to the left, shape (n, 4)."""
         rows = []
         for k in range(EDGE_POINTS):
             x, y, dx, dy = self.at(road, step + k / (EDGE_POINTS - 1))
@@ -132,7 +132,7 @@ class Roads:
         return np.array(rows)
 
     def outline(self, i: int, j: int) -> Points:
-        """The middle lines of the four roads around block (i, j), counter-clockwise, shape (n, 2)."""
+        """Return the centre lines of the four roads around block (i, j), counter-clockwise, shape (n, 2)."""
         south = self.edge(Road("east", j), i)
         east = self.edge(Road("north", i + 1), j)
         north = self.edge(Road("east", j + 1), i)
@@ -141,14 +141,14 @@ class Roads:
 
 
 def strip(edge: Points, left_m: float, right_m: float) -> Points:
-    """The polygon between two parallels of a line; both distances count to the left."""
+    """Return the polygon between two parallels of a line. Both distances are positive to the left."""
     return np.vstack((edge[:, :2] + left_m * edge[:, 2:], (edge[:, :2] + right_m * edge[:, 2:])[::-1]))
 
 
 def lengthened(edge: Points, by_m: float) -> Points:
     """Extend a line at both ends, so that the segments of a crossing meet."""
     ends = []
-    for last, way in ((edge[0], edge[0] - edge[1]), (edge[-1], edge[-1] - edge[-2])):
-        step = way[:2] / math.hypot(way[0], way[1]) * by_m
+    for last, direction in ((edge[0], edge[0] - edge[1]), (edge[-1], edge[-1] - edge[-2])):
+        step = direction[:2] / math.hypot(direction[0], direction[1]) * by_m
         ends.append(np.concatenate((last[:2] + step, last[2:])))
     return np.vstack((ends[0], edge, ends[1]))

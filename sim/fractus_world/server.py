@@ -1,4 +1,4 @@
-"""The simulated world as an IP camera: the HTTP server, which no number of slow clients can stall."""
+"""HTTP server of the simulated camera. It limits clients, so that slow clients cannot block it."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ CLIENT_LIFE_S = 30.0
 
 
 class _Handler(BaseHTTPRequestHandler):
-    """One request per connection, so that idle clients hold no resources."""
+    """Handles one request per connection, so that idle clients use no resources."""
 
     server: CameraServer
     server_version = "fractus-camera-world"
@@ -29,21 +29,21 @@ class _Handler(BaseHTTPRequestHandler):
     timeout = CLIENT_TIMEOUT_S
 
     def do_GET(self) -> None:
-        if self._client_gone():
-            # A connection closed during a request looks like its end. Nobody waits for that picture.
+        if self._is_client_gone():
+            # The client closed the connection after its request, so nobody waits for the picture.
             self.close_connection = True
             return
         parts = urlsplit(self.path)
         try:
-            answer = self.server.api.answer(parts.path, dict(parse_qsl(parts.query, max_num_fields=16)))
-        except RequestError as refusal:
-            self._send(refusal.status, Response("text/plain; charset=utf-8", f"{refusal}\n".encode()))
+            response = self.server.api.handle(parts.path, dict(parse_qsl(parts.query, max_num_fields=16)))
+        except RequestError as error:
+            self._send(error.status, Response("text/plain; charset=utf-8", f"{error}\n".encode()))
         except ValueError as error:
             self._send(HTTPStatus.BAD_REQUEST, Response("text/plain; charset=utf-8", f"query: {error}\n".encode()))
         else:
-            self._send(HTTPStatus.OK, answer)
+            self._send(HTTPStatus.OK, response)
 
-    def _client_gone(self) -> bool:
+    def _is_client_gone(self) -> bool:
         """Return True if the client has disconnected."""
         self.connection.settimeout(0.0)
         try:
@@ -55,18 +55,18 @@ class _Handler(BaseHTTPRequestHandler):
         finally:
             self.connection.settimeout(self.timeout)
 
-    def _send(self, status: HTTPStatus, answer: Response) -> None:
+    def _send(self, status: HTTPStatus, response: Response) -> None:
         try:
             self.send_response(status)
-            self.send_header("Content-Type", answer.content_type)
-            self.send_header("Content-Length", str(len(answer.body)))
+            self.send_header("Content-Type", response.content_type)
+            self.send_header("Content-Length", str(len(response.body)))
             self.send_header("Cache-Control", "no-store")
-            for name, value in answer.headers:
+            for name, value in response.headers:
                 self.send_header(name, value)
             self.end_headers()
-            self.wfile.write(answer.body)
+            self.wfile.write(response.body)
         except OSError as error:
-            log.debug("camera world: client went away (error=%s)", error)
+            log.debug("camera world: client disconnected (error=%s)", error)
             self.close_connection = True
 
     def log_message(self, format: str, *args: object) -> None:
@@ -116,11 +116,11 @@ class CameraServer(ThreadingHTTPServer):
         super().shutdown_request(request)
 
     def service_actions(self) -> None:
-        """Cut off clients that have been connected for too long."""
+        """Disconnect clients that have been connected for too long."""
         now_s = time.monotonic()
         with self._lock:
-            old = [client for client, since_s in self._clients.items() if now_s - since_s > CLIENT_LIFE_S]
-        for client in old:
+            expired = [client for client, since_s in self._clients.items() if now_s - since_s > CLIENT_LIFE_S]
+        for client in expired:
             try:
                 client.shutdown(socket.SHUT_RDWR)
             except OSError as error:

@@ -20,10 +20,10 @@ class Sheet:
     """The area of a map.
 
     Attributes:
-        lat: Of its middle, degrees.
-        lon: Of its middle, degrees.
+        lat: Latitude of the centre, degrees.
+        lon: Longitude of the centre, degrees.
         metres: Length of a side.
-        pixels: Along a side.
+        pixels: Pixels along a side.
     """
 
     lat: float
@@ -33,7 +33,7 @@ class Sheet:
 
     def __post_init__(self) -> None:
         if not (abs(self.lat) <= 85.0 and abs(self.lon) <= 180.0):
-            raise ValueError("orthophoto: give lat from -85 to 85 and lon from -180 to 180")
+            raise ValueError("orthophoto: lat must be between -85 and 85, and lon between -180 and 180")
         if not 1.0 <= self.metres <= 20_000.0:
             raise ValueError(f"orthophoto: metres={self.metres:g} is not between 1 and 20000")
         if not 16 <= self.pixels <= 4096:
@@ -41,12 +41,12 @@ class Sheet:
 
     @property
     def step_deg(self) -> tuple[float, float]:
-        """Degrees of longitude and latitude of a pixel."""
+        """Width and height of a pixel in degrees of longitude and latitude."""
         metres = self.metres / self.pixels
         return metres / _METRES_PER_DEGREE / math.cos(math.radians(self.lat)), metres / _METRES_PER_DEGREE
 
     def world_file(self) -> str:
-        """The six lines of a world file; they refer to the middle of the first pixel."""
+        """Return the six lines of a world file. Its position is the centre of the first pixel."""
         east, north = self.step_deg
         half = (self.pixels - 1) / 2.0
         numbers = (east, 0.0, 0.0, -north, self.lon - half * east, self.lat + half * north)
@@ -54,7 +54,7 @@ class Sheet:
 
 
 def draw_sheet(sheet: Sheet, store: TileStore, frame: LocalFrame) -> Picture:
-    """The ground on a sheet, shape (pixels, pixels, 3)."""
+    """Return a picture of the ground on a sheet, shape (pixels, pixels, 3)."""
     east, north = sheet.step_deg
     count = -(-sheet.pixels // _GRID_PX) + 1
     at = np.arange(count) * float(_GRID_PX)

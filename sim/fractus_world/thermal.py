@@ -7,12 +7,12 @@ import numpy as np
 
 from fractus_world.tiles import Picture, TileStore
 
-# Grey value from blue, green, red: plants (green) are cool, asphalt and roofs (grey, red) are warmer, water is cold.
+# Weights of blue, green and red, and an offset: plants (green) are cool, asphalt and roofs (grey, red) warmer, water cold.
 _WEIGHTS = np.array([[-0.10, -0.28, 0.62, 62.0]] * 3)
 
 
 class ThermalGround:
-    """The warmth of another ground; see `tiles.Ground`.
+    """Thermal picture of another ground. See `tiles.Ground`.
 
     Args:
         daylight: Tiles of the other ground.
@@ -25,5 +25,5 @@ class ThermalGround:
         self.levels = daylight.ground.levels
 
     def tile(self, level: int, column: int, row: int) -> Picture:
-        """The warmth of one tile."""
+        """Return one tile as grey values."""
         return np.asarray(cv2.transform(self._daylight.tile(level, column, row), _WEIGHTS), np.uint8)

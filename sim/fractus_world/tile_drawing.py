@@ -65,10 +65,11 @@ class TileDrawing:
     """A square tile.
 
     Args:
-        left_m: East coordinate of its western edge.
-        top_m: North coordinate of its northern edge.
+        left_m: East coordinate of the western edge.
+        top_m: North coordinate of the northern edge.
         pixel_m: Size of a pixel.
         size: Pixels along an edge.
+        ground: Colour of the empty tile.
     """
 
     def __init__(self, left_m: float, top_m: float, pixel_m: float, size: int, ground: Colour) -> None:
@@ -95,14 +96,14 @@ class TileDrawing:
         return bool(x0 < east + margin_m and x1 > west - margin_m and y0 < north + margin_m and y1 > south - margin_m)
 
     def within(self, boxes: Points, margin_m: float = 0.0) -> NDArray[np.int64]:
-        """Return which boxes (west, south, east, north), shape (n, 4), touch the tile."""
+        """Return the indexes of the boxes (west, south, east, north), shape (n, 4), that touch the tile."""
         west, south, east, north = self.box
         touch = (boxes[:, 0] < east + margin_m) & (boxes[:, 2] > west - margin_m)
         touch &= (boxes[:, 1] < north + margin_m) & (boxes[:, 3] > south - margin_m)
         return np.flatnonzero(touch)
 
     def pixels(self, points: Points) -> NDArray[np.int32]:
-        """Points in metres as fixed-point pixel coordinates of OpenCV."""
+        """Convert points in metres to fixed-point pixel coordinates of OpenCV."""
         scaled = (points[:, :2] - [self.left_m, self.top_m]) * [1 / self.pixel_m, -1 / self.pixel_m] - 0.5
         return np.round(np.clip(scaled, -20_000, 20_000) * (1 << _SHIFT)).astype(np.int32)
 
@@ -114,13 +115,13 @@ class TileDrawing:
             cv2.fillPoly(self.rough, [corners], (rough,), cv2.LINE_8, _SHIFT)
 
     def mask(self, outline: Points) -> NDArray[np.uint8]:
-        """A picture that is 255 within a polygon."""
+        """Return a mask that is 255 inside a polygon."""
         mask = np.zeros((self.size, self.size), np.uint8)
         cv2.fillPoly(mask, [self.pixels(outline)], (255,), cv2.LINE_AA, _SHIFT)
         return mask
 
     def line(self, points: Points, colour: Colour, width_m: float) -> None:
-        """Draw a line; one much thinner than a pixel is left out."""
+        """Draw a line unless it is much thinner than a pixel."""
         thickness = width_m / self.pixel_m
         if thickness < 0.35:
             return
@@ -142,12 +143,12 @@ class TileDrawing:
 
     def round_shadow(self, x: float, y: float, radius_m: float, height_m: float) -> None:
         """Add the shadow of a tree crown."""
-        at = np.array([[x + SUN_SHADOW[0] * height_m, y + SUN_SHADOW[1] * height_m]])
-        centre = self.pixels(at)[0]
+        middle = np.array([[x + SUN_SHADOW[0] * height_m, y + SUN_SHADOW[1] * height_m]])
+        centre = self.pixels(middle)[0]
         radius = int(radius_m / self.pixel_m * (1 << _SHIFT))
         cv2.circle(self.shade, centre, max(radius, 8), (230,), -1, cv2.LINE_AA, _SHIFT)
 
-    def cast(self, depth: float) -> None:
+    def darken_shadows(self, depth: float) -> None:
         """Darken the added shadows. Half of the remaining light is bluish sky light."""
         if not self.shade.any():
             return
@@ -200,7 +201,7 @@ _CROWN_COLOURS: tuple[Colour, ...] = (
 
 @lru_cache(maxsize=_CROWNS)
 def _drawn_crown(kind: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """A crown in large: a dome of leaf clusters, lit from the south-east."""
+    """Return the colours and coverage of a large crown: a dome of leaf clusters, lit from the south-east."""
     random = np.random.default_rng(1000 + kind)
     half = _CROWN_PX / 2
     base = np.array(_CROWN_COLOURS[kind], np.float64)
@@ -210,10 +211,14 @@ def _drawn_crown(kind: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     clusters = []
     for _ in range(420):
         bearing = random.uniform(0, 2 * math.pi)
-        away = math.sqrt(random.uniform(0, 1)) * 0.86
+        radius_share = math.sqrt(random.uniform(0, 1)) * 0.86
         bulge = 1 + 0.12 * math.sin(3 * bearing + kind) + 0.07 * math.sin(5 * bearing + 2 * kind)
         clusters.append(
-            (away * bulge * math.cos(bearing), away * bulge * math.sin(bearing), random.uniform(0.05, 0.14))
+            (
+                radius_share * bulge * math.cos(bearing),
+                radius_share * bulge * math.sin(bearing),
+                random.uniform(0.05, 0.14),
+            )
         )
     clusters.sort(key=lambda cluster: math.hypot(cluster[0], cluster[1]), reverse=True)
     for x, y, radius in clusters:

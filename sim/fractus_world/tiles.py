@@ -1,4 +1,4 @@
-"""Tiles of a ground, made when a camera first sees them and kept while memory lasts."""
+"""Tiles of a ground, drawn when a camera first sees them, and a cache with a size limit."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Ground(Protocol):
 
 
 def pixel_m(ground: Ground, level: int) -> float:
-    """Size of a pixel of a level on the ground, metres."""
+    """Return the size of a pixel of a level on the ground, in metres."""
     return float(ground.finest_m * 2**level)
 
 
@@ -58,7 +58,7 @@ class TileStore:
         self._lock = threading.Lock()
 
     def mosaic(self, level: int, window: tuple[int, int, int, int]) -> tuple[Picture, int, int]:
-        """Tiles side by side that cover a window of a level's pixels (left, top, right, bottom; x east, y south).
+        """Return a picture of adjacent tiles that covers a window (left, top, right, bottom; x east, y south) of a level.
 
         Returns:
             The picture, and the level's pixel coordinates of its upper left corner.
@@ -67,9 +67,9 @@ class TileStore:
         top = window[1] // TILE_PX
         right = -(-window[2] // TILE_PX)
         bottom = -(-window[3] // TILE_PX)
-        wanted = (left, top, right, bottom)
+        needed = (left, top, right, bottom)
         known = self._mosaics.get(level)
-        if known is not None and _covers(known[0], wanted):
+        if known is not None and _covers(known[0], needed):
             return known[1], known[0][0] * TILE_PX, known[0][1] * TILE_PX
         picture = np.empty(((bottom - top) * TILE_PX, (right - left) * TILE_PX, 3), np.uint8)
         for row in range(top, bottom):
@@ -77,7 +77,7 @@ class TileStore:
                 y = (row - top) * TILE_PX
                 x = (column - left) * TILE_PX
                 picture[y : y + TILE_PX, x : x + TILE_PX] = self.tile(level, column, row)
-        self._keep(level, wanted, picture)
+        self._keep(level, needed, picture)
         return picture, left * TILE_PX, top * TILE_PX
 
     def _keep(self, level: int, window: tuple[int, int, int, int], picture: Picture) -> None:
@@ -104,7 +104,7 @@ class TileStore:
 
 
 def interpolated(grid: NDArray[np.float64], at: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
-    """A square grid's values at positions between its points, the same for rows and columns."""
+    """Interpolate a square grid at positions between its points, equal for rows and columns."""
     first = np.minimum(at.astype(int), len(grid) - 2)
     weights = np.zeros((len(at), len(grid)))
     weights[np.arange(len(at)), first] = 1.0 - (at - first)
@@ -112,5 +112,5 @@ def interpolated(grid: NDArray[np.float64], at: NDArray[np.floating[Any]]) -> ND
     return np.asarray(weights @ grid @ weights.T, np.float32)
 
 
-def _covers(have: tuple[int, int, int, int], wanted: tuple[int, int, int, int]) -> bool:
-    return have[0] <= wanted[0] and have[1] <= wanted[1] and have[2] >= wanted[2] and have[3] >= wanted[3]
+def _covers(outer: tuple[int, int, int, int], inner: tuple[int, int, int, int]) -> bool:
+    return outer[0] <= inner[0] and outer[1] <= inner[1] and outer[2] >= inner[2] and outer[3] >= inner[3]

@@ -92,7 +92,7 @@ class SeenFace:
 
 @dataclass(frozen=True, slots=True)
 class Truth:
-    """Content of a picture."""
+    """Visible content of a picture."""
 
     pose: Pose
     objects: tuple[Seen, ...]

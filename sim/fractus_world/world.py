@@ -26,12 +26,12 @@ class World:
 
     Args:
         ground: Appearance of the ground from above.
-        stage: Objects on the ground.
+        objects: Objects on the ground.
     """
 
-    def __init__(self, ground: Ground, stage: ObjectLayer) -> None:
+    def __init__(self, ground: Ground, objects: ObjectLayer) -> None:
         self.ground = ground
-        self._objects = stage
+        self._objects = objects
         self._store = TileStore(ground)
         self._warmth = TileStore(ThermalGround(self._store), 30_000_000)
         self._lock = threading.Lock()
@@ -39,7 +39,7 @@ class World:
 
     @classmethod
     def procedural(cls, lat: float, lon: float, seed: int = 7) -> World:
-        """A world made up from a seed, around a place."""
+        """Create a world from a seed, around a place."""
         land = Landscape(LocalFrame(lat, lon), seed)
         return cls(
             land, ObjectLayer(TownPopulation(land.roads, land.blocks), LandscapeBillboards(land.roads, land.blocks))
@@ -47,16 +47,16 @@ class World:
 
     @classmethod
     def on(cls, ground: Ground, seed: int = 7) -> World:
-        """A world on a ground of the user's, whose roads are unknown: billboards with faces near its middle, no traffic."""
+        """Create a world on a ground from the user. Its roads are unknown, so it has billboards near the origin but no traffic."""
         return cls(ground, ObjectLayer(Unpopulated(), BillboardsAroundOrigin(seed)))
 
     @property
     def frame(self) -> LocalFrame:
-        """Metres east and north of the world's origin."""
+        """Local frame in metres east and north of the world's origin."""
         return self.ground.frame
 
     def view(self, pose: Pose, intrinsics: Intrinsics, mount: Mount = DEFAULT_MOUNT) -> View:
-        """The geometry of a picture."""
+        """Return the geometry of a picture."""
         return View.of(pose, mount, intrinsics, self.frame)
 
     def render(
@@ -115,7 +115,7 @@ class WorldAround:
         self._lock = threading.Lock()
         self._world = world if origin is None or world is not None else World.procedural(*origin, seed)
 
-    def seen_from(self, pose: Pose | None) -> World | None:
+    def at(self, pose: Pose | None) -> World | None:
         """Return the world, or None if no position is known yet."""
         with self._lock:
             if self._world is None and pose is not None:

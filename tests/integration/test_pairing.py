@@ -112,7 +112,7 @@ class Air:
 
     def _carry(self) -> None:
         while not self._over.is_set():
-            self.radio.turn(0.02)
+            self.radio.step(0.02)
 
     def files(self, node: str, authority: Authority | None = None, now: datetime | None = None) -> Path:
         """Certificate, key and authority of a node, as its agent keeps them."""

@@ -59,7 +59,7 @@ class Air:
 
     def _carry(self) -> None:
         while not self._over.is_set():
-            self.radio.turn(0.05)
+            self.radio.step(0.05)
 
     def run(self, name: str, *words: str) -> None:
         subprocess.run(["nsenter", f"--net=/run/netns/{name}", *words], capture_output=True, timeout=30, check=True)

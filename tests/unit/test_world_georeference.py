@@ -12,7 +12,7 @@ from fractus_core.api.geometry import Point
 from fractus_core.geo import LocalFrame, geodesic_m
 from fractus_world.georeference import GeoreferenceError, Projected, parse_system, read_world_file
 from fractus_world.optics import Intrinsics, Pose
-from fractus_world.raster import NOTHING, read_raster
+from fractus_world.raster import OUTSIDE, read_raster
 from fractus_world.survey import Sheet
 from fractus_world.world import World
 
@@ -117,7 +117,7 @@ def test_ground_outside_the_picture_is_rendered_as_nothing(tmp_path: Path) -> No
     (tmp_path / "map.pgw").write_text(Sheet(50.0, 4.0, 50.0, 100).world_file())
     world = World.on(read_raster(tmp_path / "map.png"))
     far = world.frame.latlon(3000.0, 0.0)
-    assert tuple(world.render(Pose(*far, 50.0), LENS)[240, 320]) == NOTHING
+    assert tuple(world.render(Pose(*far, 50.0), LENS)[240, 320]) == OUTSIDE
     assert world.render(Pose(50.0, 4.0, 20.0), LENS, hidden=frozenset({"face-0"}))[240, 320].max() >= 198
 
 
@@ -139,8 +139,8 @@ def test_exported_map_matches_the_original_map(tmp_path: Path) -> None:
         ("map.png", "1\n2\n3\n", "six lines"),
         ("map.png", "0\n0\n0\n0\n4\n50\n", "no size on the ground"),
         ("map.png", "0.5\n0\n0\n-0.5\n533000\n5640000\n", "EPSG:4326"),
-        ("map.tif", None, "can be read"),
-        ("none.png", None, "can be read"),
+        ("map.tif", None, "cannot be read"),
+        ("none.png", None, "cannot be read"),
     ],
 )
 def test_invalid_picture_error_names_the_problem(tmp_path: Path, name: str, content: str | None, message: str) -> None:
@@ -156,7 +156,7 @@ def test_invalid_picture_error_names_the_problem(tmp_path: Path, name: str, cont
 
 @pytest.mark.parametrize(
     ("crs", "message"),
-    [("EPSG:999999", "no coordinate"), ("EPSG:4978", "not projected"), ("mercator", "expected local")],
+    [("EPSG:999999", "not a coordinate"), ("EPSG:4978", "not projected"), ("mercator", "expected local")],
 )
 def test_invalid_coordinate_system_is_refused(crs: str, message: str) -> None:
     with pytest.raises(GeoreferenceError, match=message):

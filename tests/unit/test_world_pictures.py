@@ -223,9 +223,9 @@ def test_shape_of_every_object_kind_fits_its_size() -> None:
 def test_nearby_cameras_share_a_world_origin() -> None:
     first_around = WorldAround(7)
     second_around = WorldAround(7)
-    assert first_around.seen_from(None) is None
-    first = first_around.seen_from(Pose(50.86, 4.67, 10.0))
-    second = second_around.seen_from(Pose(50.87, 4.66, 3.0))
+    assert first_around.at(None) is None
+    first = first_around.at(Pose(50.86, 4.67, 10.0))
+    second = second_around.at(Pose(50.87, 4.66, 3.0))
     assert first is not None
     assert second is not None
     assert (first.frame.lat, first.frame.lon) == (second.frame.lat, second.frame.lon)

@@ -1,6 +1,6 @@
 """Exponential back-off with jitter and a maximum.
 
-The SDK must not import this package and has a back-off of its own (`fractus.channel.backoff`).
+The SDK must not import this package, so it has a separate back-off (`fractus.channel.backoff`).
 """
 
 from __future__ import annotations

@@ -410,14 +410,14 @@ def test_found_return_is_distinguished_from_return_of_system() -> None:
         events.ArmingRequested("a", "A", (1.0, 2.0, 3.0)), events.VehicleObserved(replace(FLYING, mode=RTL))
     )
     recovered, _ = apply_events(events.VehicleFound(), state=replace(known, expected_mode=None))
-    assert recovered.task is not None and recovered.task.found
+    assert recovered.task is not None and recovered.task.begun_by_others
     again, _ = apply_events(events.VehicleFound(), state=recovered)
-    assert again.task is not None and again.task.found, "a reconnect does not change the owner"
+    assert again.task is not None and again.task.begun_by_others, "a reconnect does not change the owner"
     begun, _ = apply_events(
         events.TakeoverDemanded("returnToLaunch", "X", "x"), state=replace(known, expected_mode=RTL)
     )
     again, _ = apply_events(events.VehicleFound(), state=begun)
-    assert again.task is not None and not again.task.found
+    assert again.task is not None and not again.task.begun_by_others
 
 
 def test_found_failsafe_without_mission_belongs_to_system() -> None:

@@ -79,8 +79,8 @@ class Resources(Model):
         f"a resource must be {', '.join(_RESOURCES)}, or an extended resource such as fractus.dev/gpu",
     )
     def _known(self) -> Violation:
-        for field, given in (("requests", self.requests), ("limits", self.limits)):
-            for name in given:
+        for field, amounts in (("requests", self.requests), ("limits", self.limits)):
+            for name in amounts:
                 if name not in _RESOURCES and (len(name) > _NAME_LENGTH or not re.fullmatch(_EXTENDED, name)):
                     return field, f"not {name!r:.60}"
         return None
@@ -154,8 +154,8 @@ class Volume(Model):
         "give exactly one of emptyDir, configMap, secret and claim",
     )
     def _one_source(self) -> Violation:
-        given = [s for s in (self.empty_dir, self.config_map, self.secret, self.claim) if s is not None]
-        return "" if len(given) != 1 else None
+        sources = [s for s in (self.empty_dir, self.config_map, self.secret, self.claim) if s is not None]
+        return "" if len(sources) != 1 else None
 
     @rule(
         "!has(self.secret) || !self.secret.endsWith('-tls')",

@@ -179,8 +179,8 @@ class CameraLens(Model):
         "distortion coefficients belong to model brownConrady",
     )
     def _coefficients(self) -> Violation:
-        given = [name for name in ("k1", "k2", "k3", "p1", "p2") if getattr(self, name) is not None]
-        return given[0] if given and self.model != "brownConrady" else None
+        coefficients = [name for name in ("k1", "k2", "k3", "p1", "p2") if getattr(self, name) is not None]
+        return coefficients[0] if coefficients and self.model != "brownConrady" else None
 
 
 class CameraFeatures(Model):

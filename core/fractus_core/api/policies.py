@@ -169,8 +169,8 @@ def _only(message: str, applies: Callable[[PolicySpec], bool], cel: str, *fields
 
     @rule(cel, f"{message}; remove it, or correct the type")
     def only(self: PolicySpec) -> Violation:
-        given = (f for f in fields if getattr(self, to_snake(f)) != PolicySpec.model_fields[to_snake(f)].default)
-        return None if applies(self) else next(given, None)
+        changed = (f for f in fields if getattr(self, to_snake(f)) != PolicySpec.model_fields[to_snake(f)].default)
+        return None if applies(self) else next(changed, None)
 
     return only
 

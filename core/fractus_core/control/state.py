@@ -191,13 +191,13 @@ class SystemTask:
         task_id: Unique id.
         kind: Kind of the task.
         key: Key of the mission, for a mission over points of interest.
-        found: True if the autopilot was already coming down and the system did not cause it: a pilot may have chosen it.
+        begun_by_others: True if the system did not cause the descent of the autopilot, so a pilot may have chosen it.
     """
 
     task_id: int
     kind: TaskKind
     key: str = ""
-    found: bool = False
+    begun_by_others: bool = False
 
 
 @dataclass(frozen=True, slots=True)

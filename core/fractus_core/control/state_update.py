@@ -135,14 +135,14 @@ class StateUpdate:
 
     # The system
 
-    def start(self, kind: TaskKind, *, found: bool = False) -> None:
+    def start(self, kind: TaskKind, *, begun_by_others: bool = False) -> None:
         """Start a system task in place of the current one.
 
         A task that comes down counts as returning immediately, so that neither monitor nor supervisor intervenes before the
         task runs.
         """
         self.stop_task()
-        task = SystemTask(self.state.last_task_id + 1, kind, found=found)
+        task = SystemTask(self.state.last_task_id + 1, kind, begun_by_others=begun_by_others)
         self.set(task=task, last_task_id=task.task_id)
         self.set(returning=kind is not TaskKind.HOVER and self.state.vehicle.armed)
         self.act(StartSystemTask(task))
@@ -166,10 +166,10 @@ class StateUpdate:
         waits = mission.flown or self.state.vehicle.armed
         self.set(grace=Grace(until, mission.key, reason, code) if waits else None)
 
-    def follow_descent(self, kind: TaskKind, *, found: bool = False) -> None:
+    def follow_descent(self, kind: TaskKind, *, begun_by_others: bool = False) -> None:
         """Supervise a descent that the autopilot started without a command, and complete it if the autopilot stops."""
         self.set(authority=Authority.SYSTEM)
-        self.start(kind, found=found)
+        self.start(kind, begun_by_others=begun_by_others)
         self.set(returning=True)
 
     def take_back(self, mission: Mission) -> None:

@@ -141,8 +141,8 @@ def _find_vehicle(update: StateUpdate) -> None:
         update.end_mission(mission, OutcomeKind.FAILED, FLEW_HOME_ALONE)
         update.audit("takeover", "homeward", "system", f"found the drone in {vehicle.mode.name}")
         # Without a failsafe, a pilot may have chosen the return.
-        by_pilot = not vehicle.failsafe and (task is None or task.found)
-        update.follow_descent(_descent(vehicle.mode), found=by_pilot)
+        by_pilot = not vehicle.failsafe and (task is None or task.begun_by_others)
+        update.follow_descent(_descent(vehicle.mode), begun_by_others=by_pilot)
     else:
         update.set(authority=Authority.SYSTEM)
         update.audit("takeover", TaskKind.HOVER.value, "system", "found the drone in the air")

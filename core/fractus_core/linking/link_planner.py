@@ -81,8 +81,8 @@ def solve(horizon: Horizon) -> Solution:
     for step in range(horizon.steps - 1, -1, -1):
         after = values[-1]
         up = min(step + horizon.connect_steps, horizon.steps)
-        # All links cost the same to connect to, so the best target is the same from every state except from the target
-        # itself, where it is the second best.
+        # All links cost the same to connect to. So every state has the same best target, except for the target itself, whose
+        # best target is the second best.
         gains = {
             state: values[-(up - step)][state] + horizon.cloud * (up - step) - horizon.switch_cost
             for state in states[1:]

@@ -27,14 +27,14 @@ class Location:
         index: Index of the location in the component.
         nodes: Edge nodes in the location: current hosts first, then the nearest first.
         hosts: Selected nodes.
-        seen: Number of nodes at the beginning of `nodes` that were checked. None of them is free any more.
+        checked: Number of nodes at the beginning of `nodes` that were checked. None of them is free any more.
     """
 
     component: Component
     index: int
     nodes: tuple[str, ...]
     hosts: list[str] = field(default_factory=list)
-    seen: int = 0
+    checked: int = 0
 
     @property
     def spot(self) -> EdgeLocation:
@@ -86,7 +86,7 @@ def place_static(builder: PlanBuilder, locations: Sequence[Location]) -> None:
     matching.clear_bookings()
     for location in locations:
         chosen = set(location.hosts)
-        for name in location.nodes[: location.seen]:
+        for name in location.nodes[: location.checked]:
             if name in chosen:
                 builder.place(location.component, "static", name, location=location.index)
     _reject_unsuitable(builder, locations)
@@ -120,7 +120,7 @@ class _NodeMatching:
             for name in location.nodes:
                 if location.spot.instances != "*" and len(location.hosts) >= location.spot.instances:
                     break
-                location.seen = len(location.nodes)
+                location.checked = len(location.nodes)
                 if self._fits(location, name):
                     self._take(location, name)
 
@@ -129,7 +129,7 @@ class _NodeMatching:
         self.clear_bookings()
         for location in locations:
             location.hosts.clear()
-            location.seen = 0
+            location.checked = 0
         self._holders.clear()
 
     def clear_bookings(self) -> None:
@@ -140,9 +140,9 @@ class _NodeMatching:
 
     def _assign(self, location: Location, visited: set[Location], *, first: bool) -> bool:
         """Assign another node to a location. Return False if no node is left for it."""
-        while location.seen < len(location.nodes):
-            name = location.nodes[location.seen]
-            location.seen += 1
+        while location.checked < len(location.nodes):
+            name = location.nodes[location.checked]
+            location.checked += 1
             if self._fits(location, name):
                 self._take(location, name)
                 return True
@@ -183,7 +183,7 @@ def _first_empty(locations: Iterable[Location]) -> Location | None:
 def _reject_unsuitable(builder: PlanBuilder, locations: Iterable[Location]) -> None:
     """Store why checked nodes do not host the component."""
     for location in locations:
-        for name in location.nodes[: location.seen]:
+        for name in location.nodes[: location.checked]:
             if not builder.is_placed(location.component, name):
                 check = builder.check_edge(builder.inventory.edge_nodes[name], location.component)
                 if not check:

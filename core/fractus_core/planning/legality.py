@@ -150,11 +150,15 @@ class RouteJudge:
                 airframe=Airframe(retraces=True),
             )
             granted = flight_grant(self._application, drone, self._inventory, self._area)
-            own = compile_grant(granted, home, self._settings.flat_terrain)
+            grant = compile_grant(granted, home, self._settings.flat_terrain)
             # The system may use the whole corridor. A driver with partial control must stay in the operation area.
-            system = replace(own, operation_area=own.flight_area, operation_area_border=own.flight_area_border)
-            stays = replace(own, flight_area=own.operation_area, flight_area_border=own.operation_area_border)
-            flight = _Flight(now, system, stays if leader.control == "partial" else own, self._searches)
+            system = replace(grant, operation_area=grant.flight_area, operation_area_border=grant.flight_area_border)
+            driver = grant
+            if leader.control == "partial":
+                driver = replace(
+                    grant, flight_area=grant.operation_area, flight_area_border=grant.operation_area_border
+                )
+            flight = _Flight(now, system, driver, self._searches)
             flight.fly(list(mission_legs(self._application.spec, self._area, home, self._inventory.depots)))
             self._searches = flight.searches
             self._known[key] = flight.route(self._settings.climb_speed_mps, stay_minutes(self._application.spec))
@@ -185,7 +189,15 @@ def with_legality(
 
 @dataclass(slots=True)
 class _Flight:
-    """Simulated flight of a mission, leg by leg, as the policy engine permits it."""
+    """Simulated flight of a mission, leg by leg, as the policy engine permits it.
+
+    Attributes:
+        now: State of the drone after the legs so far.
+        grant: Grant of the system.
+        driver: Grant of the driver.
+        searches: Number of detour searches that are left.
+        recorded: Legs that are not flown as requested.
+    """
 
     now: Situation
     grant: CompiledGrant

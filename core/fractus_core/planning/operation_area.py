@@ -143,7 +143,7 @@ def start_of(point: ControlPoint, depots: Mapping[str, Depot]) -> Position | Non
         return point.point.position
     name = point.point.depot or ""
     if name not in depots:
-        known = ", ".join(sorted(depots)) or "there is none yet; apply one"
+        known = ", ".join(sorted(depots)) or "no Depot exists yet; apply one"
         raise InvalidObject("point.depot", f"there is no Depot {name} ({known})")
     location = depots[name].spec.location
     return Position(lat=location.lat, lon=location.lon)

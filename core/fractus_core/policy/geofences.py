@@ -204,7 +204,7 @@ def _check_exclusion(
 def _certain_path(leg: Leg, now: Situation) -> BaseGeometry:
     """Return the part of a leg that the drone certainly flies, even if it is already braking as hard as it can.
 
-    `Leg.braking_path` overestimates the way to rest. An overestimate must not permit legs past a fence.
+    `Leg.braking_path` overestimates the path to rest. An overestimate must not permit legs past a fence.
     """
     braking_s = math.hypot(now.north_mps, now.east_mps) / (2 * now.airframe.accel_mps2)
     end = leg.start[0] + now.east_mps * braking_s, leg.start[1] + now.north_mps * braking_s

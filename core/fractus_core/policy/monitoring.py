@@ -1,4 +1,4 @@
-"""Continuous check of a flying drone's state, including its way to the point where it can stop."""
+"""Continuous check of a flying drone: its state, and its path to the point of rest after a stop."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def monitor(
 ) -> Verdict | None:
     """Return what the system must do about a flying drone now.
 
-    The check covers the way from the present position to the point of rest after a stop commanded now, with the
+    The check covers the path from the present position to the point of rest after a stop commanded now, with the
     position error around it. This margin is smaller than that of permitted legs, so that a leg flown as permitted never
     triggers the monitor.
 
@@ -74,7 +74,7 @@ def monitor(
         now: State of the drone.
         grant: Permissions and restrictions that apply.
         system_flies: True if the system or the autopilot already flies the drone. Only a deterioration counts then, because
-            the system's way leads back from the wrong side of a fence or from above a limit.
+            the system's route leads back from the wrong side of a fence or from above a limit.
         fences_changed: True if other fences may have been in force when the drone's motion was judged. An accelerating drone
             is faster when it receives a stop, and the room for that has not been judged, so it is stopped early. A leg
             whose remaining part is no longer legal is stopped too.
@@ -111,7 +111,7 @@ def monitor(
     if worst is not None:
         return replace(worst, brake_first=worst.action == "takeover" and now.is_moving)
     for outcome_position, outcome in outlooks:
-        # The drone's way may end before the fence. It is stopped now, and taken over only if it really goes too far.
+        # The drone may come to rest before the fence. It is stopped now, and taken over only if it does go too far.
         further = _stopping_path(
             outcome,
             outcome_position,
@@ -141,7 +141,7 @@ def monitor(
 
 
 def _worst(findings: list[tuple[int, Verdict]]) -> Verdict | None:
-    """Return the verdict that takes most control from the application. Among equals the one of highest priority."""
+    """Return the verdict that takes most control from the application. Equal verdicts are ordered by priority."""
     ranked = [
         (-SEVERITY[v.takeover] if v.action == "takeover" and v.takeover is not None else 0, -priority, i)
         for i, (priority, v) in enumerate(findings)
@@ -202,8 +202,8 @@ def _altitude_after_stop_m(now: Situation, rest_m: float) -> float:
 def must_stop_first(now: Situation, grant: CompiledGrant) -> bool:
     """Return True if a moving drone must come to rest before it begins anything else, even a legal motion.
 
-    This is the case if its way to rest comes so close to a fence that the monitor may stop it on the new course, too.
-    The check uses the margin of legs, and ignores braking that has begun, because a new command may interrupt it.
+    This is the case if its path to rest comes so close to a fence that the monitor could stop it on the new course as well.
+    The check uses the margin of legs. It ignores braking that has begun, because a new command may interrupt it.
     """
     position = grant.locate(now)
     if position is None or not now.in_air or not now.is_moving:
@@ -245,7 +245,7 @@ def _rest_of_leg(now: Situation, grant: CompiledGrant, start: XY, leg: GotoArgs,
 
 @dataclass(frozen=True, slots=True)
 class _StoppingPath:
-    """Way to the point where the drone can stop, with its ends and their altitudes above home."""
+    """Path to the point of rest after a stop, with its ends and their altitudes above home."""
 
     air: AirVolume
     present: BaseGeometry

@@ -49,7 +49,7 @@ def bench(tmp_path: Path) -> IdentityBench:
 async def test_certificate_is_requested_signed_and_stored(bench: IdentityBench) -> None:
     await bench.identity.step()
     assert bench.identity.ready.is_set()
-    assert bench.identity.condition.is_true
+    assert bench.identity.condition.status == "True"
     assert (bench.directory / "tls.key").stat().st_mode & 0o777 == 0o600
     certificate = x509.load_pem_x509_certificate(bench.files()["tls.crt"])
     names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
@@ -101,7 +101,7 @@ async def test_failed_renewal_keeps_the_certificate_in_use(bench: IdentityBench)
     with pytest.raises(KubeError):
         await bench.identity.step()
     assert bench.files() == before
-    assert bench.identity.condition.is_true
+    assert bench.identity.condition.status == "True"
 
 
 async def test_expired_certificate_is_replaced(bench: IdentityBench) -> None:
@@ -110,7 +110,7 @@ async def test_expired_certificate_is_replaced(bench: IdentityBench) -> None:
     bench.signer.sign_with = {"begin": bench.clock.now}
     await bench.identity.step()
     assert bench.signer.request_count == 2
-    assert bench.identity.condition.is_true
+    assert bench.identity.condition.status == "True"
 
 
 async def test_rotation_to_a_bundle_keeps_the_certificate(bench: IdentityBench) -> None:
@@ -205,7 +205,7 @@ async def test_denied_renewal_keeps_the_node_certified(bench: IdentityBench) -> 
         task.cancel()
         with contextlib.suppress(asyncio.CancelledError):
             await task
-    assert identity.condition.is_true
+    assert identity.condition.status == "True"
     assert bench.signer.request_count == 2
 
 
@@ -232,7 +232,7 @@ async def test_clock_before_the_validity_requests_nothing_and_recovers(bench: Id
     assert bench.signer.request_count == 1
     bench.clock.now = now
     await bench.identity.step()
-    assert bench.identity.condition.is_true
+    assert bench.identity.condition.status == "True"
 
 
 async def test_clock_after_the_validity_is_reported_and_recovers(bench: IdentityBench) -> None:
@@ -243,5 +243,5 @@ async def test_clock_after_the_validity_is_reported_and_recovers(bench: Identity
     assert refusal.value.reason == "ClockSkew"
     bench.clock.now = now
     await bench.identity.step()
-    assert bench.identity.condition.is_true
+    assert bench.identity.condition.status == "True"
     assert bench.signer.request_count == 1

@@ -1,4 +1,4 @@
-"""An interrupted chaos run ends immediately. It runs as a process of its own."""
+"""A chaos run in a separate process ends immediately when it is interrupted."""
 
 from __future__ import annotations
 

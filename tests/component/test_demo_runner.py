@@ -1,4 +1,4 @@
-"""The demo follows a mission, assigns nodes, and collects the data of its own mission."""
+"""The demo follows a mission, assigns nodes, and collects only the data of this mission."""
 
 from __future__ import annotations
 

@@ -80,10 +80,10 @@ class VehicleEntry(Model):
         return self
 
     def names(self) -> tuple[str, ...]:
-        """Names of the vehicles of this entry."""
-        return (
-            (self.name,) if self.count == 1 else tuple(f"{self.name}-{number}" for number in range(1, self.count + 1))
-        )
+        """Return the names of the vehicles of this entry."""
+        if self.count == 1:
+            return (self.name,)
+        return tuple(f"{self.name}-{number}" for number in range(1, self.count + 1))
 
 
 class NamedZone(Model):

@@ -130,7 +130,7 @@ def _pictures_section(record: FlightRecord) -> str:
     head = []
     for name in record.pictures:
         time_s = picture_time_s(name)
-        nearest = min(record.samples, key=lambda sample: abs(sample.time_s - time_s), default=None)
+        nearest = record.track.sample_at(time_s)
         altitude_m = nearest.place.alt_m if nearest is not None else 0.0
         head.append(f"{_utc(time_s)}, {altitude_m:.0f} m above home")
     row = [f"![from the drone]({PICTURES}/{name})" for name in record.pictures]
@@ -334,9 +334,9 @@ def decision_requests(decisions: Sequence[JudgedCall]) -> Iterable[Request]:
 def _link_lines(record: FlightRecord, nodes: Mapping[str, XY]) -> Iterable[tuple[XY, XY]]:
     """Yield lines between the drone and the node at each change of traffic to a direct link."""
     for change in record.links:
-        if change.direct and change.node in nodes and record.samples:
-            place = min(record.samples, key=lambda sample: abs(sample.time_s - change.time_s)).place
-            yield record.frame.xy(place.lat, place.lon), nodes[change.node]
+        sample = record.track.sample_at(change.time_s)
+        if change.direct and change.node in nodes and sample is not None:
+            yield record.frame.xy(sample.place.lat, sample.place.lon), nodes[change.node]
 
 
 def _wifi_range_m(node: EdgeNode) -> float | None:

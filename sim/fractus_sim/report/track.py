@@ -69,6 +69,10 @@ class Track:
         first = next((i for i, s in enumerate(self.samples) if s.in_air), None)
         return self.samples[max(first - 1, 0)].place if first is not None else None
 
+    def sample_at(self, time_s: float) -> Sample | None:
+        """Return the sample closest to a time. None if there are no samples."""
+        return min(self.samples, key=lambda sample: abs(sample.time_s - time_s), default=None)
+
     @property
     def distance_m(self) -> float:
         """Horizontal distance flown, metres. Steps below MIN_STEP_M are ignored as position noise."""

@@ -17,7 +17,7 @@ from fractus_sim.report.flight_map import DrawnZone, FlightMap, Mark, draw_map
 from fractus_sim.report.flight_profile import Limit, Profile, Span, draw_profile
 from fractus_sim.report.mission_report import decision_marks, decision_requests, decisions_section
 from fractus_sim.report.report_files import RESULTS, format_duration, rounded, table, write_report
-from fractus_sim.report.track import Sample, Track
+from fractus_sim.report.track import Track
 from fractus_sim.runner.experiment_runner import Event, Outcome
 from fractus_sim.runner.fault_injection import Occurrence
 
@@ -52,9 +52,9 @@ def experiment_map(outcome: Outcome) -> FlightMap:
     frame = LocalFrame(first.lat, first.lon)
     zones = tuple(DrawnZone(z.name, z.kind, area_polygon(frame, z.area)) for z in outcome.experiment.zones)
     marks: list[Mark] = []
-    for letter, occurrence in _lettered(outcome):
+    for letter, occurrence in _faults_with_letters(outcome):
         for track in tracks:
-            sample = _sample_at(track, occurrence.begin_s)
+            sample = track.sample_at(occurrence.begin_s)
             affected = not occurrence.vehicle or track.name in _affected_vehicles(outcome, occurrence)
             if sample is not None and affected:
                 position = frame.xy(sample.place.lat, sample.place.lon)
@@ -75,7 +75,7 @@ def experiment_profile(outcome: Outcome) -> Profile:
     end_s = max(track.samples[-1].time_s for track in tracks)
     spans = [
         Span(o.begin_s, o.end_s if o.end_s is not None else end_s, f"{letter} {o.title}", fault=True)
-        for letter, o in _lettered(outcome)
+        for letter, o in _faults_with_letters(outcome)
     ]
     has_battery_fault = any(o.kind == "batteryDrop" for o in outcome.occurrences)
     limits: list[Limit] = []
@@ -134,7 +134,7 @@ def experiment_results(outcome: Outcome) -> dict[str, Any]:
             {"check": v.check, "vehicle": v.vehicle or None, "holds": v.holds, "found": v.observed}
             for v in outcome.verdicts
         ],
-        "vehicles": {name: _vehicle_results(track, outcome) for name, track in _by_name(outcome).items()},
+        "vehicles": {name: _vehicle_results(track, outcome) for name, track in _tracks_by_name(outcome).items()},
         "faults": [
             {
                 "fault": o.kind, "title": o.title, "vehicle": o.vehicle or None, "begin_s": round(o.begin_s, 2),
@@ -160,8 +160,8 @@ def experiment_geojson(outcome: Outcome) -> dict[str, Any]:
         shape = multipolygon_geojson(frame, area_polygon(frame, zone.area))
         features.append(feature(shape, what="zone", name=zone.name, kind=zone.kind))
     for occurrence in outcome.occurrences:
-        track = _by_name(outcome).get(occurrence.vehicle)
-        sample = _sample_at(track, occurrence.begin_s) if track is not None else None
+        track = _tracks_by_name(outcome).get(occurrence.vehicle)
+        sample = track.sample_at(occurrence.begin_s) if track is not None else None
         if sample is not None:
             fields = {"fault": occurrence.kind, "title": occurrence.title, "drone": occurrence.vehicle}
             time_s = round(occurrence.begin_s, 3)
@@ -178,12 +178,12 @@ def _first_position(outcome: Outcome) -> tuple[float, float]:
     return (home.lat, home.lon) if home is not None else (0.0, 0.0)
 
 
-def _by_name(outcome: Outcome) -> dict[str, Track]:
+def _tracks_by_name(outcome: Outcome) -> dict[str, Track]:
     return {name: flight.track for name, flight in outcome.flights.items()}
 
 
 def _tracks(outcome: Outcome) -> tuple[Track, ...]:
-    return tuple(track for track in _by_name(outcome).values() if len(track.samples) > 1)
+    return tuple(track for track in _tracks_by_name(outcome).values() if len(track.samples) > 1)
 
 
 def _distance_words(tracks: Sequence[Track]) -> str:
@@ -192,7 +192,7 @@ def _distance_words(tracks: Sequence[Track]) -> str:
     return f"{len(tracks)} vehicles, {sum(track.distance_m for track in tracks):.0f} m flown"
 
 
-def _lettered(outcome: Outcome) -> list[tuple[str, Occurrence]]:
+def _faults_with_letters(outcome: Outcome) -> list[tuple[str, Occurrence]]:
     """Assign letters to faults. A fault that affects several vehicles at the same time gets one letter."""
     first: dict[tuple[str, float], Occurrence] = {}
     for occurrence in sorted(outcome.occurrences, key=lambda o: o.begin_s):
@@ -205,10 +205,6 @@ def _affected_vehicles(outcome: Outcome, occurrence: Occurrence) -> set[str]:
     """Return the vehicles on which a fault was injected at the same time."""
     key = (occurrence.title, round(occurrence.begin_s))
     return {o.vehicle for o in outcome.occurrences if (o.title, round(o.begin_s)) == key}
-
-
-def _sample_at(track: Track, time_s: float) -> Sample | None:
-    return min(track.samples, key=lambda s: abs(s.time_s - time_s), default=None)
 
 
 def _headline(outcome: Outcome) -> str:
@@ -260,7 +256,7 @@ def _vehicle_results(track: Track, outcome: Outcome) -> dict[str, Any]:
 
 def _flights_section(outcome: Outcome) -> str:
     rows = []
-    for track in _by_name(outcome).values():
+    for track in _tracks_by_name(outcome).values():
         battery = f"{100 * track.samples[-1].battery:.0f} %" if track.samples else "-"
         rows.append(
             (
@@ -274,7 +270,7 @@ def _flights_section(outcome: Outcome) -> str:
 
 
 def _events_section(outcome: Outcome) -> str:
-    letters = {(o.title, round(o.begin_s)): letter for letter, o in _lettered(outcome)}
+    letters = {(o.title, round(o.begin_s)): letter for letter, o in _faults_with_letters(outcome)}
     events = list(outcome.events)
     if len(outcome.flights) <= _MAX_VEHICLES_WITH_MODES:
         for flight in outcome.flights.values():

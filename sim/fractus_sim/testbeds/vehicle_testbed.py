@@ -24,11 +24,13 @@ from fractus_sim.testbeds.tlog import TlogWriter
 
 STEPS_PER_TICK = 2
 MAX_BEHIND_S = 1.0
+"""Real time that the simulation catches up after a delay of this process. Longer delays slow the simulation down."""
+
 CONNECT_S = 20.0
 
 
 class VehicleTestbed(Testbed):
-    """Vehicles without services."""
+    """Simulated vehicles in this process, or running autopilots, without services."""
 
     def __init__(self, experiment: Experiment, folder: Path, base: Path, report: Callable[[str], None]) -> None:
         super().__init__(experiment, folder, base, report)

@@ -31,7 +31,10 @@ OUTSIDE_POSITIONS_M = {"WP-E1": (62.0, 130.0), "WP-E2": (226.0, 60.0)}
 """Positions outside of the operation area that the violating program requests, metres east and north of home."""
 
 ABOVE_STRIPE = "WP-S"
-"""Hover position above the no-photo stripe. Each run hovers there for longer than the picture interval, so that at least one picture is requested."""
+"""Hover position above the no-photo stripe.
+
+Each run hovers there for longer than the picture interval, so that at least one picture is requested.
+"""
 
 ALTITUDE_M = 10.0
 Position = tuple[float, float, float]

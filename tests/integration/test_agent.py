@@ -230,12 +230,12 @@ def test_agent_of_drone_registers_reports_and_stores_grants(server: ApiServer, d
     assert body["status"]["flightState"] == "inactive"
     assert body["status"]["position"]["lat"] == 39.36
 
-    seen = scraped(drone.metrics)
-    assert seen["fractus_agent_grants", "stored"] == 1
-    assert 0 <= seen["fractus_agent_watch_age_seconds", "nodegrants"] < 100
-    assert 0 <= seen["fractus_agent_report_age_seconds",] < 100
-    assert 0 <= seen["fractus_telemetry_age_seconds",] < 100
-    assert seen["fractus_certificate_expiry_timestamp_seconds",] > time.time()
+    samples = scraped(drone.metrics)
+    assert samples["fractus_agent_grants", "stored"] == 1
+    assert 0 <= samples["fractus_agent_watch_age_seconds", "nodegrants"] < 100
+    assert 0 <= samples["fractus_agent_report_age_seconds",] < 100
+    assert 0 <= samples["fractus_telemetry_age_seconds",] < 100
+    assert samples["fractus_certificate_expiry_timestamp_seconds",] > time.time()
 
     drone.mobility.now.flight_state = "flying"
     drone.mobility.now.in_air = True

@@ -97,8 +97,8 @@ def test_killed_write_set_leaves_all_old_or_all_new_files(tmp_path: Path, before
             (directory() / "tls.crt").symlink_to("..data/tls.crt")
 
     def check(done: bool) -> None:
-        found = read_set(directory(), tuple(old))
-        assert found == new or (not done and found == (old if before == "a set" else None))
+        stored = read_set(directory(), tuple(old))
+        assert stored == new or (not done and stored == (old if before == "a set" else None))
         write_set(directory(), new)
         assert {name: (directory() / name).read_bytes() for name in old} == new
         assert (directory() / "tls.key").stat().st_mode & 0o777 == 0o600

@@ -129,8 +129,8 @@ def test_agent_has_no_rights_on_grants(world: World, agents: dict[str, BlockingC
 
 def token_request(node: str = "drone-1", **spec: Any) -> Body:
     bound = {"kind": "Node", "apiVersion": "v1", "name": node}
-    given = {"expirationSeconds": 3600, "boundObjectRef": bound} | spec
-    return {"apiVersion": "authentication.k8s.io/v1", "kind": "TokenRequest", "spec": given}
+    request_spec = {"expirationSeconds": 3600, "boundObjectRef": bound} | spec
+    return {"apiVersion": "authentication.k8s.io/v1", "kind": "TokenRequest", "spec": request_spec}
 
 
 def token_path(node: str, namespace: str = NODES) -> str:
@@ -149,9 +149,9 @@ def accounts(control_plane: ControlPlane, world: World, agents: dict[str, Blocki
 
 def node_objects(node: str) -> dict[str, Body]:
     """Return the objects that the operator creates for a node, by the path of their collection."""
-    made = {kind.path(NODES): account_object(kind, node) for kind in ACCOUNT_KINDS}
+    objects = {kind.path(NODES): account_object(kind, node) for kind in ACCOUNT_KINDS}
     spec = {"count": 0, "packed": pack(())}
-    return made | {NODE_GRANTS.path(NODES): header(NODE_GRANTS, node) | {"spec": spec}}
+    return objects | {NODE_GRANTS.path(NODES): header(NODE_GRANTS, node) | {"spec": spec}}
 
 
 def test_agent_reads_and_updates_only_node_grants_of_its_node(
@@ -320,20 +320,20 @@ def _direct_link(world: World, drone: str, node: str) -> str:
 
 
 def test_agent_writes_status_of_direct_links_of_its_node_only(world: World, agents: dict[str, BlockingClient]) -> None:
-    ours = _direct_link(world, "drone-1", "edge-1")
+    link = _direct_link(world, "drone-1", "edge-1")
     other = _direct_link(world, "drone-2", "edge-1")
-    agents["drone-1"].merge(f"{ours}/status", {"status": {"phase": "Up"}, "spec": {"range": 1000}})
-    agents["edge-1"].merge(f"{ours}/status", {"status": {"switches": 1}})
+    agents["drone-1"].merge(f"{link}/status", {"status": {"phase": "Up"}, "spec": {"range": 1000}})
+    agents["edge-1"].merge(f"{link}/status", {"status": {"switches": 1}})
     agents["edge-1"].merge(f"{other}/status", {"status": {"phase": "Idle"}})
-    written = world.api.get(ours)
+    written = world.api.get(link)
     assert written is not None
     assert (written["status"], written["spec"]["range"]) == ({"phase": "Up", "switches": 1}, 120)
     denied(
         lambda: agents["drone-1"].merge(f"{other}/status", {"status": {"phase": "Up"}}),
         "only on direct links of drone-1",
     )
-    denied(lambda: agents["drone-1"].merge(ours, {"spec": {"range": 1000}}), "cannot patch")
-    denied(lambda: agents["drone-1"].delete(ours), "cannot delete")
+    denied(lambda: agents["drone-1"].merge(link, {"spec": {"range": 1000}}), "cannot patch")
+    denied(lambda: agents["drone-1"].delete(link), "cannot delete")
 
 
 def test_token_without_bound_node_writes_nothing(

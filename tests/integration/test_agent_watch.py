@@ -86,10 +86,10 @@ async def following(events: AsyncIterator[WatchItem]) -> WatchItem:
     return await asyncio.wait_for(anext(events), WAIT_TIMEOUT_S)
 
 
-async def until(events: AsyncIterator[WatchEvent], wanted: type[WatchEvent]) -> WatchEvent:
+async def until(events: AsyncIterator[WatchEvent], kind: type[WatchEvent]) -> WatchEvent:
     async with asyncio.timeout(WAIT_TIMEOUT_S):
         async for event in events:
-            if isinstance(event, wanted):
+            if isinstance(event, kind):
                 return event
     raise AssertionError("the events ended")
 
@@ -125,8 +125,8 @@ async def test_watch_yields_a_list_and_then_changes_of_this_node_only(server: Ap
 
 async def test_expired_resource_version_leads_to_a_new_list(server: ApiServer) -> None:
     async with store() as watched:
-        own = {"fieldSelector": "spec.drone=drone-1"}
-        links = store_module._WatchTarget(watched._client, store_module._KINDS["DirectLink"], own)
+        selector = {"fieldSelector": "spec.drone=drone-1"}
+        links = store_module._WatchTarget(watched._client, store_module._KINDS["DirectLink"], selector)
         _, old = await watched._list(links)
         for number in range(3):
             server.post(f"{FRACTUS}/directlinks", link(f"g{number}"))
@@ -201,7 +201,7 @@ async def test_watch_ended_by_the_server_continues_without_a_list(server: ApiSer
 
 
 async def nothing_from(granted: AsyncIterator[GrantList], for_s: float = 2.0) -> asyncio.Future[GrantList]:
-    """Return the next event as a future, after checking that there is none for a while."""
+    """Check that no event arrives for some time. Return a future of the next event."""
     waiting = asyncio.ensure_future(anext(granted))
     done, _ = await asyncio.wait([waiting], timeout=for_s)
     assert not done

@@ -131,15 +131,15 @@ CASES = {
 @pytest.fixture(scope="session")
 def promtool() -> str:
     """Return the path of promtool from Debian's package, which is unpacked but not installed, because installing it would start a server."""
-    found = shutil.which("promtool") or str(CACHE / "usr/bin/promtool")
-    if not Path(found).exists():
+    program = shutil.which("promtool") or str(CACHE / "usr/bin/promtool")
+    if not Path(program).exists():
         CACHE.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=CACHE.parent) as unpacked:
             for argv in (["apt-get", "download", "-q", "prometheus"], ["sh", "-c", "dpkg -x prometheus_*.deb root"]):
                 subprocess.run(argv, cwd=unpacked, check=True, timeout=240, stdout=subprocess.DEVNULL)
             with contextlib.suppress(OSError):  # another test was quicker
                 (Path(unpacked) / "root").rename(CACHE)
-    return found
+    return program
 
 
 def judge(promtool: str, directory: Path, tests: list[dict[str, Any]]) -> str:
@@ -147,11 +147,11 @@ def judge(promtool: str, directory: Path, tests: list[dict[str, Any]]) -> str:
     # Without annotations, which a test would have to repeat word for word.
     bare = [{key: value for key, value in rule.items() if key != "annotations"} for rule in RULES]
     (directory / "rules.yaml").write_text(yaml.safe_dump({"groups": [{"name": "fractus", "rules": bare}]}))
-    told = {"rule_files": ["rules.yaml"], "evaluation_interval": "15s", "tests": tests}
-    (directory / "tests.yaml").write_text(yaml.safe_dump(told))
+    test_file = {"rule_files": ["rules.yaml"], "evaluation_interval": "15s", "tests": tests}
+    (directory / "tests.yaml").write_text(yaml.safe_dump(test_file))
     argv = [promtool, "test", "rules", "tests.yaml"]
-    done = subprocess.run(argv, cwd=directory, capture_output=True, text=True, timeout=120, check=False)
-    return "" if done.returncode == 0 else done.stdout + done.stderr
+    result = subprocess.run(argv, cwd=directory, capture_output=True, text=True, timeout=120, check=False)
+    return "" if result.returncode == 0 else result.stdout + result.stderr
 
 
 def series(rows: tuple[tuple[str, str], ...]) -> list[dict[str, str]]:
@@ -162,7 +162,7 @@ def silent(alert: str, at: str) -> dict[str, Any]:
     return {"alertname": alert, "eval_time": at, "exp_alerts": []}
 
 
-def asked(rows: tuple[tuple[str, str], ...], *checks: dict[str, Any]) -> dict[str, Any]:
+def test_case(rows: tuple[tuple[str, str], ...], *checks: dict[str, Any]) -> dict[str, Any]:
     return {"interval": "15s", "input_series": series(rows), "alert_rule_test": list(checks)}
 
 
@@ -178,13 +178,15 @@ def test_alerts_have_a_case_and_a_section_in_the_docs() -> None:
 
 def test_alerts_fire_in_their_situation(promtool: str, tmp_path: Path) -> None:
     # With which labels is its own affair, so the opposite is claimed of each, and must be wrong.
-    said = judge(promtool, tmp_path, [asked(case.series, silent(alert, case.at)) for alert, case in CASES.items()])
-    assert set(re.findall(r"alertname:\s*(\w+)", said)) == set(CASES), said
+    output = judge(
+        promtool, tmp_path, [test_case(case.series, silent(alert, case.at)) for alert, case in CASES.items()]
+    )
+    assert set(re.findall(r"alertname:\s*(\w+)", output)) == set(CASES), output
 
 
 def test_alerts_do_not_fire_in_normal_operation(promtool: str, tmp_path: Path) -> None:
-    healthy = asked(HEALTHY, *(silent(alert, at) for alert in CASES for at in ("1m", "10m", "14m")))
-    well = [asked(case.well, silent(alert, case.at)) for alert, case in CASES.items() if case.well]
+    healthy = test_case(HEALTHY, *(silent(alert, at) for alert in CASES for at in ("1m", "10m", "14m")))
+    well = [test_case(case.well, silent(alert, case.at)) for alert, case in CASES.items() if case.well]
     assert judge(promtool, tmp_path, [healthy, *well]) == ""
 
 
@@ -198,9 +200,9 @@ def test_alert_rules_are_accepted_by_promtool(promtool: str, tmp_path: Path) -> 
 
 def test_alerts_and_dashboard_use_existing_metrics() -> None:
     known = set(documented())
-    (found,) = [body for body in render("--set", "metrics.dashboard.enabled=true") if body["kind"] == "ConfigMap"]
-    assert found["metadata"]["labels"]["grafana_dashboard"] == "1"
-    dashboard = json.loads(found["data"]["fractus.json"])
+    (config_map,) = [body for body in render("--set", "metrics.dashboard.enabled=true") if body["kind"] == "ConfigMap"]
+    assert config_map["metadata"]["labels"]["grafana_dashboard"] == "1"
+    dashboard = json.loads(config_map["data"]["fractus.json"])
     panels = [target["expr"] for panel in dashboard["panels"] for target in panel.get("targets", ())]
     assert len(panels) > 10
     for expression in [*panels, *(rule["expr"] for rule in RULES)]:

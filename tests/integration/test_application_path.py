@@ -89,7 +89,7 @@ class PathRecorder:
 
     @contextlib.contextmanager
     def recording(self) -> Iterator[None]:
-        """Record while the context lasts, in this thread and in those that start meanwhile."""
+        """Record calls until the block ends, in this thread and in threads that start during the block."""
         threading.setprofile(self.profile)
         sys.setprofile(self.profile)
         try:

@@ -62,10 +62,10 @@ async def flying(rig: Rig, *policies: dict[str, Any]) -> Driver:
     return driver
 
 
-async def until(condition: Callable[[], object], what: str, timeout_s: float = 15.0) -> None:
+async def until(condition: Callable[[], object], description: str, timeout_s: float = 15.0) -> None:
     deadline = time.monotonic() + timeout_s
     while not condition():
-        assert time.monotonic() < deadline, what
+        assert time.monotonic() < deadline, description
         await asyncio.sleep(0.05)
 
 
@@ -77,23 +77,23 @@ async def test_attack_with_foreign_certificate_is_refused(rig: Rig) -> None:
     rig.start_service()
     stub = await served(rig)
 
-    async def asked(identity: str, **how: Any) -> tuple[grpc.StatusCode, str]:
-        code, why = await denied(rig.stub(identity, **how).GetSpeed(ASK, timeout=5))
+    async def call(identity: str, **options: Any) -> tuple[grpc.StatusCode, str]:
+        code, why = await denied(rig.stub(identity, **options).GetSpeed(ASK, timeout=5))
         return code, why.code
 
     stranger = Authority(rig.directory, "ca")
-    assert (await asked(DRIVER, authority=stranger))[0] == Status.UNAVAILABLE, "of an authority of the same name"
-    assert (await asked(DRIVER, seconds=-10.0, begun=-3600.0))[0] == Status.UNAVAILABLE, "expired"
-    assert (await asked(DRIVER, begun=1800.0))[0] == Status.UNAVAILABLE, "not valid yet"
+    assert (await call(DRIVER, authority=stranger))[0] == Status.UNAVAILABLE, "of an authority of the same name"
+    assert (await call(DRIVER, seconds=-10.0, begun=-3600.0))[0] == Status.UNAVAILABLE, "expired"
+    assert (await call(DRIVER, begun=1800.0))[0] == Status.UNAVAILABLE, "not valid yet"
     no_grant = (Status.PERMISSION_DENIED, "NoGrant")
-    assert await asked(DRIVER.replace("/ns/default/", "/ns/tenant-b/")) == no_grant
-    assert await asked(DRIVER.replace("/app/app/", "/app/other/")) == no_grant
-    assert await asked(DRIVER.replace("instance/app-navigator", "instance/app-navigator-2")) == no_grant
-    assert await asked(DRIVER + "/") == no_grant
-    assert await asked(DRIVER.upper().replace("SPIFFE://FRACTUS.DEV", "spiffe://fractus.dev")) == no_grant
-    assert await asked(node_identity("drone-2")) == no_grant
-    assert await asked(OPERATOR_IDENTITY) == no_grant, "the operator has no Grant"
-    assert (await asked("https://fractus.dev/operator"))[0] == Status.UNAUTHENTICATED, "no SPIFFE id"
+    assert await call(DRIVER.replace("/ns/default/", "/ns/tenant-b/")) == no_grant
+    assert await call(DRIVER.replace("/app/app/", "/app/other/")) == no_grant
+    assert await call(DRIVER.replace("instance/app-navigator", "instance/app-navigator-2")) == no_grant
+    assert await call(DRIVER + "/") == no_grant
+    assert await call(DRIVER.upper().replace("SPIFFE://FRACTUS.DEV", "spiffe://fractus.dev")) == no_grant
+    assert await call(node_identity("drone-2")) == no_grant
+    assert await call(OPERATOR_IDENTITY) == no_grant, "the operator has no Grant"
+    assert (await call("https://fractus.dev/operator"))[0] == Status.UNAUTHENTICATED, "no SPIFFE id"
     await stub.GetSpeed(ASK, timeout=5)
 
 
@@ -350,22 +350,22 @@ async def test_attack_with_flood_of_calls_does_not_affect_others(rig: Rig) -> No
     attacker = await asyncio.create_subprocess_exec(
         sys.executable, __file__, rig.address, str(rig.directory / "flood"), "3.0", stdout=asyncio.subprocess.PIPE
     )
-    answers = []
+    latencies_s = []
     while attacker.returncode is None:
         begun = time.monotonic()
         await stub.GetSpeed(ASK, timeout=20)
-        answers.append(time.monotonic() - begun)
+        latencies_s.append(time.monotonic() - begun)
         await asyncio.sleep(0.05)
     output, _ = await attacker.communicate()
     result = json.loads(output)
-    print(f"flood {result}; the other's calls {len(answers)}, slowest {max(answers) * 1000:.0f} ms")
+    print(f"flood {result}; the other's calls {len(latencies_s)}, slowest {max(latencies_s) * 1000:.0f} ms")
     assert result["sent"] > FLOOD_PER_S
     ended = result["ended"]
     assert set(ended) <= {"OK", "RESOURCE_EXHAUSTED", "SHED"}
     assert sum(ended.values()) == result["sent"]
     assert 0 < ended["OK"] <= CALL_BURST + CALLS_PER_S * result["seconds"] + 1, "at most the limit of each caller"
     assert result["hints"] == ended["RESOURCE_EXHAUSTED"] > 0, "each refusal contains a retry delay"
-    assert len(answers) > 10
+    assert len(latencies_s) > 10
 
 
 async def test_attack_with_flood_of_connections_does_not_affect_others(rig: Rig) -> None:
@@ -397,10 +397,10 @@ async def test_attack_with_flood_of_connections_does_not_affect_others(rig: Rig)
                     continue
         await stub.GetSpeed(ASK, timeout=5)
         await served(rig)
-        await until(lambda: _closed(silent[-1]), "the end of a connection that says nothing", 20)
+        await until(lambda: _closed(silent[-1]), "the end of a connection that sends nothing", 20)
     finally:
-        for one in silent:
-            one.close()
+        for connection in silent:
+            connection.close()
 
 
 async def test_attack_with_calls_without_request_is_limited(rig: Rig) -> None:

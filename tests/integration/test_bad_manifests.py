@@ -219,7 +219,7 @@ def test_every_validation_rule_has_a_bad_manifest() -> None:
 
 @pytest.fixture(scope="module")
 def https(control_plane: ControlPlane) -> urllib.request.OpenerDirector:
-    """What sends text to the API server as it is; its YAML is read there."""
+    """HTTPS client that sends YAML text unchanged, so that the API server parses it."""
     credential = control_plane.authority.issue("corpus", common_name="corpus", organizations=("system:masters",))
     context = ssl.create_default_context(cafile=control_plane.ca)
     context.load_cert_chain(credential.certificate, credential.key)
@@ -229,7 +229,7 @@ def https(control_plane: ControlPlane) -> urllib.request.OpenerDirector:
 def test_corpus_verdicts_of_api_server_equal_those_of_plan_command(
     control_plane: ControlPlane, https: urllib.request.OpenerDirector
 ) -> None:
-    """Verdicts are those of the unit tests."""
+    """The unit tests of the corpus check the same verdicts with `fractus plan`."""
     taken = {case: all(not _refusal(control_plane, https, text) for text in case.documents) for case in CASES}
     assert [case for case, was in taken.items() if was == bool(case.refused)] == []
 
@@ -238,7 +238,7 @@ TOKENS = [
     *["0178", "9", "x", "o", "b", "_", ".", "e", "E", "+", "-", ":", "n", "y", "Y", "~", "T", "Z", "a", "#", "&", "*", ",", "%", "@", "=", "0x", "0b", "0o"], "on", "true", "null", "inf", "nan",
     "2026-01-01", "00:00:00", "<<", " ", "'", '"', "|", "<",
 ]  # fmt: skip
-"""What plain scalars are made of; tags of others are refused by `fractus plan` alone."""
+"""Parts of random plain scalars. Other scalars are omitted, because `fractus plan` refuses their tags and the API server does not."""
 
 
 def test_yaml_scalars_have_same_types_as_in_api_server(
@@ -252,15 +252,15 @@ def test_yaml_scalars_have_same_types_as_in_api_server(
         scalar = "".join(rng.choices(TOKENS, k=rng.randint(1, 4)))
         for note, radius in ((scalar, "5"), ('"t"', scalar)):
             text = f"{head}{note}\nspec:\n  location: {{lat: 1, lon: 2}}\n  radius: {radius}\n"
-            ours = judged(text, tmp_path / "m.yaml")
-            theirs = _refusal(control_plane, https, text)
-            assert bool(ours) == bool(theirs), (scalar, ours, theirs)
-            taken += not ours
+            command_verdict = judged(text, tmp_path / "m.yaml")
+            server_verdict = _refusal(control_plane, https, text)
+            assert bool(command_verdict) == bool(server_verdict), (scalar, command_verdict, server_verdict)
+            taken += not command_verdict
     assert 100 < taken < 500
 
 
 def judged(text: str, file: Path) -> str:
-    """What `fractus plan` says against a manifest."""
+    """Return the reason for which `fractus plan` refuses a manifest, or an empty string."""
     file.write_text(text)
     try:
         read_manifests([file])
@@ -344,7 +344,7 @@ CHOICES: dict[str, list[Any]] = {
     "limits": [{"cpu": "1.5"}, {"cpu": 1}, {"a.b/c": "1"}, {"a.b/c": "0.5"}, {"memory": "1G"}],
     "mount": [{"height": 5}, {"pitch": -90}, {"gimbal": True}], "mobility": [{"maxSpeed": 5}], "resolution": ["640x480", "640"],
 }  # fmt: skip
-"""What a field may become: allowed or not, alone or with what is beside it."""
+"""Replacement values by field. They may be valid or invalid, alone or in combination with other fields."""
 
 ODD: list[Any] = [
     "5",
@@ -364,7 +364,7 @@ ODD: list[Any] = [
     {"a": 1},
     "2026-01-01T00:00:00Z",
 ]
-"""What any field may become: of another type, empty, too large."""
+"""Replacement values for every field: values of another type, empty values, and values that are too large."""
 
 
 def objects(value: Any) -> Iterator[Body]:
@@ -392,12 +392,12 @@ def mutated(rng: random.Random, manifest: Body) -> Body:
 
 
 def schema_of(place: Body) -> set[str]:
-    """The fields of the kinds of object that this one may be: those that have all that it has."""
-    found: set[str] = set()
+    """Return the possible fields of an object: the fields of all shapes that have every field of the object."""
+    keys: set[str] = set()
     for fields in SHAPES:
         if place.keys() <= fields:
-            found |= fields
-    return found
+            keys |= fields
+    return keys
 
 
 def shapes(schema: Body) -> Iterator[set[str]]:
@@ -424,15 +424,15 @@ def test_api_server_and_models_refuse_same_random_manifests(control_plane: Contr
     model = MODELS[GOOD[seed]["kind"]]
     place = f"{API}/namespaces/default/{model.PLURAL}" if model.NAMESPACED else f"{API}/{model.PLURAL}"
     for manifest in [GOOD[seed], *(mutated(rng, GOOD[seed]) for _ in range(150))]:
-        ours = theirs = ""
+        model_verdict = server_verdict = ""
         try:
             model.from_body(manifest)
         except InvalidObject as error:
-            ours = str(error)
+            model_verdict = str(error)
         try:
             control_plane.admin.call("POST", place, manifest, params={"dryRun": "All", "fieldValidation": "Strict"})
         except KubeError as error:
-            theirs = str(error)
-        assert bool(ours) == bool(theirs), (manifest, ours, theirs)
-        refused += bool(ours)
+            server_verdict = str(error)
+        assert bool(model_verdict) == bool(server_verdict), (manifest, model_verdict, server_verdict)
+        refused += bool(model_verdict)
     assert 10 < refused < 151

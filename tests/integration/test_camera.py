@@ -241,7 +241,7 @@ async def test_changed_grant_ends_capture_in_progress(rig: Rig, noise_url: str, 
 
     path = write()
     address = rig.start_camera("--camera", noise_url, description=EDGE)
-    # A client's gRPC library reads megabytes ahead of the program on a fast link, unless told not to.
+    # Without this option, the gRPC library of the client reads megabytes ahead of the program on a fast link.
     camera = camera_pb2_grpc.CameraServiceStub(
         rig.channel(PASSENGER, address=address, options=(("grpc.http2.bdp_probe", 0),))
     )
@@ -270,19 +270,19 @@ async def test_changed_grant_ends_capture_in_progress(rig: Rig, noise_url: str, 
         return
     status, why = await denied(rest())
     assert (status, why.code) == (grpc.StatusCode.PERMISSION_DENIED, code)
-    assert received < 1_000_000, "what was in buffers when the grant changed, and no more"
+    assert received < 1_000_000, "the service sent more than its buffers contained when the Grant changed"
 
 
 async def test_ip_camera_is_used_again_after_failure(rig: Rig) -> None:
     viewer = passenger_grant(services=CAMERA, operationArea=[], **{"class": None})
     rig.write_grant(viewer)
-    asked: list[str] = []
+    requests: list[str] = []
 
     class Snapshots(http.server.BaseHTTPRequestHandler):
         broken = ""
 
         def do_GET(self) -> None:
-            asked.append(self.path)
+            requests.append(self.path)
             if self.broken == "503":
                 self.send_error(503, "no pose")
                 return
@@ -301,7 +301,7 @@ async def test_ip_camera_is_used_again_after_failure(rig: Rig) -> None:
         url = f"http://user:secret@127.0.0.1:{server.server_address[1]}/snapshot.jpg"
         camera = stub(rig, rig.start_camera("--camera", url, description=EDGE))
         taken = await capture(camera, width=320, height=320)
-        assert asked == ["/snapshot.jpg?width=427&height=320"], "in the camera's own proportions"
+        assert requests == ["/snapshot.jpg?width=427&height=320"], "in the camera's own proportions"
         data = await retrieve(camera, taken.image.name)
         shown = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
         assert shown.shape == (320, 320, 3)
@@ -418,6 +418,6 @@ async def test_drone_camera_is_refused_over_privacy_zone(rig: Rig) -> None:
             for shot in (await camera.ListImages(camera_pb2.ListImagesRequest(), timeout=5)).images:
                 await camera.DeleteImage(camera_pb2.DeleteImageRequest(name=shot.name), timeout=5)
             await asyncio.sleep(0.1)  # well below the limit on calls a second
-        raise AssertionError("pictures go on without a position")
+        raise AssertionError("the service still takes pictures without a position")
 
     assert (await until_unknown()).code in {"PositionUnknown", "PrivacyZone"}

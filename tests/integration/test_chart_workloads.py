@@ -55,9 +55,9 @@ def templates(*arguments: str, chart: str = "fractus") -> dict[str, Body]:
 
 
 def everything() -> dict[str, Body]:
-    asked = [f"--set-json={name}={json.dumps(FOR_THE_CLOUD)}" for name in IN_THE_CLOUD]
-    asked += [f"--set-json={name}={json.dumps(FOR_PLACED)}" for name in ON_NODES]
-    return templates(*asked, "--set=view.enabled=true", "--set=uninstall.wipeNodes=true", "--is-upgrade")
+    settings = [f"--set-json={name}={json.dumps(FOR_THE_CLOUD)}" for name in IN_THE_CLOUD]
+    settings += [f"--set-json={name}={json.dumps(FOR_PLACED)}" for name in ON_NODES]
+    return templates(*settings, "--set=view.enabled=true", "--set=uninstall.wipeNodes=true", "--is-upgrade")
 
 
 def plain() -> dict[str, Body]:
@@ -72,11 +72,11 @@ def refusal(*arguments: str, chart: str = "fractus") -> str:
 
 @pytest.mark.parametrize("part", [*WORKLOADS, "uninstall", "removal", "wipe"])
 def test_workload_has_additional_labels_and_annotations(part: str) -> None:
-    ours = plain()[part]["metadata"]["labels"]
+    labels = plain()[part]["metadata"]["labels"]
     assert everything()[part]["metadata"] == {
-        "labels": ours | FOR_ALL["podLabels"], "annotations": FOR_ALL["podAnnotations"],
+        "labels": labels | FOR_ALL["podLabels"], "annotations": FOR_ALL["podAnnotations"],
     }  # fmt: skip
-    assert ours["app.kubernetes.io/component"] == part
+    assert labels["app.kubernetes.io/component"] == part
 
 
 @pytest.mark.parametrize("part", WORKLOADS)
@@ -94,15 +94,15 @@ def test_workload_placement_combines_required_and_configured_rules(part: str) ->
     needed = before["affinity"]["nodeAffinity"][WHERE]["nodeSelectorTerms"]
     assert [term["matchExpressions"][0]["key"].partition("/")[0] for term in needed] == ["fractus.dev"] * len(needed)
     assert pod["affinity"]["nodeAffinity"][WHERE]["nodeSelectorTerms"] == [
-        {"matchExpressions": [*term["matchExpressions"], asked], **fields}
+        {"matchExpressions": [*term["matchExpressions"], configured], **fields}
         for term in needed
-        for asked, fields in ((SSD, {"matchFields": [NAMED]}), (BIG, {}))
+        for configured, fields in ((SSD, {"matchFields": [NAMED]}), (BIG, {}))
     ]
-    asked = FOR_PLACED["affinity"]
-    assert pod["affinity"]["nodeAffinity"][RATHER] == asked["nodeAffinity"][RATHER]
-    assert pod["affinity"]["podAffinity"] == asked["podAffinity"]
-    ours = before["affinity"].get("podAntiAffinity", {})
-    assert pod["affinity"]["podAntiAffinity"] == ours | asked["podAntiAffinity"]
+    configured = FOR_PLACED["affinity"]
+    assert pod["affinity"]["nodeAffinity"][RATHER] == configured["nodeAffinity"][RATHER]
+    assert pod["affinity"]["podAffinity"] == configured["podAffinity"]
+    required = before["affinity"].get("podAntiAffinity", {})
+    assert pod["affinity"]["podAntiAffinity"] == required | configured["podAntiAffinity"]
 
 
 @pytest.mark.parametrize("part", [*IN_THE_CLOUD, "uninstall", "removal"])
@@ -119,9 +119,9 @@ def test_cloud_workload_has_configured_spread_and_tolerations(part: str) -> None
 
 
 def test_topology_spread_constraint_keeps_its_label_selector() -> None:
-    asked = FOR_THE_CLOUD["topologySpreadConstraints"][0] | {"labelSelector": {"matchLabels": {"team": "birds"}}}
-    pods = templates(f"--set-json=operator.topologySpreadConstraints={json.dumps([asked])}")
-    assert pods["operator"]["spec"]["topologySpreadConstraints"] == [asked]
+    constraint = FOR_THE_CLOUD["topologySpreadConstraints"][0] | {"labelSelector": {"matchLabels": {"team": "birds"}}}
+    pods = templates(f"--set-json=operator.topologySpreadConstraints={json.dumps([constraint])}")
+    assert pods["operator"]["spec"]["topologySpreadConstraints"] == [constraint]
 
 
 @pytest.mark.parametrize("part", ON_NODES)
@@ -134,23 +134,23 @@ def test_node_workload_has_node_priority_and_tolerates_all_taints(part: str) -> 
 
 
 def test_operator_replicas_prefer_different_nodes() -> None:
-    found = plain()["operator"]["spec"]["affinity"]["podAntiAffinity"]
-    assert set(found) == {RATHER}, "two replicas on one node are better than one replica"
-    assert {term["podAffinityTerm"]["topologyKey"]: term["weight"] for term in found[RATHER]} == {
+    anti_affinity = plain()["operator"]["spec"]["affinity"]["podAntiAffinity"]
+    assert set(anti_affinity) == {RATHER}, "two replicas on one node are better than one replica"
+    assert {term["podAffinityTerm"]["topologyKey"]: term["weight"] for term in anti_affinity[RATHER]} == {
         "kubernetes.io/hostname": 100,
         "topology.kubernetes.io/zone": 50,
     }
 
 
 def test_view_inherits_placement_of_operator_unless_configured() -> None:
-    said = [
+    settings = [
         "--set=view.enabled=true",
         "--set=operator.nodeSelector.pool=a",
         "--set=operator.tolerations[0].operator=Exists",
     ]
-    pod = templates(*said)["view"]["spec"]
+    pod = templates(*settings)["view"]["spec"]
     assert (pod["nodeSelector"], pod["tolerations"]) == ({"pool": "a"}, [{"operator": "Exists"}])
-    assert templates(*said, "--set=view.nodeSelector.pool=b")["view"]["spec"]["nodeSelector"]["pool"] == "b"
+    assert templates(*settings, "--set=view.nodeSelector.pool=b")["view"]["spec"]["nodeSelector"]["pool"] == "b"
 
 
 RESERVED = (
@@ -168,8 +168,8 @@ RESERVED = (
 @pytest.mark.parametrize("name", RESERVED)
 def test_reserved_pod_label_is_refused(name: str) -> None:
     for part in ("operator", "mobility"):
-        said = refusal(f"--set-json={part}.podLabels={json.dumps({name: 'x'})}", "--skip-schema-validation")
-        assert f"{part}.podLabels: the label {name} is reserved" in said
+        message = refusal(f"--set-json={part}.podLabels={json.dumps({name: 'x'})}", "--skip-schema-validation")
+        assert f"{part}.podLabels: the label {name} is reserved" in message
     assert name in refusal(DRONE, f"--set-json=vehicle.podLabels={json.dumps({name: 'x'})}", chart="fractus-demo")
 
 
@@ -184,14 +184,14 @@ def test_invalid_image_tag_is_refused(chart: str, more: tuple[str, ...]) -> None
 
 @pytest.mark.parametrize("part", WORKLOADS)
 def test_reserved_environment_variable_is_refused(part: str) -> None:
-    said = refusal(f"--set={part}.extraEnv[0].name=FRACTUS_NODE", "--set=view.enabled=true")
-    assert f"{part}.extraEnv: FRACTUS_NODE is reserved" in said
+    message = refusal(f"--set={part}.extraEnv[0].name=FRACTUS_NODE", "--set=view.enabled=true")
+    assert f"{part}.extraEnv: FRACTUS_NODE is reserved" in message
 
 
 def test_demo_vehicle_has_additional_pod_settings() -> None:
     before = templates(DRONE, chart="fractus-demo")["vehicle"]
-    asked = FOR_ALL | {"priorityClassName": "fractus-node"}
-    after = templates(DRONE, f"--set-json=vehicle={json.dumps(asked)}", chart="fractus-demo")["vehicle"]
+    settings = FOR_ALL | {"priorityClassName": "fractus-node"}
+    after = templates(DRONE, f"--set-json=vehicle={json.dumps(settings)}", chart="fractus-demo")["vehicle"]
     assert after["metadata"] == {
         "labels": before["metadata"]["labels"] | FOR_ALL["podLabels"], "annotations": FOR_ALL["podAnnotations"],
     }  # fmt: skip
@@ -201,13 +201,13 @@ def test_demo_vehicle_has_additional_pod_settings() -> None:
     assert container["resources"]["requests"]["cpu"] == "1m"
 
 
-@pytest.mark.parametrize(("said", "host"), [((), "127.0.0.1"), (("--set=metrics.nodes.address=node",), None)])
-def test_agent_readiness_probe_requests_metrics(said: tuple[str, ...], host: str | None) -> None:
-    (container,) = templates(*said)["agent"]["spec"]["containers"]
-    asked = container["readinessProbe"]["httpGet"]
-    assert (asked["path"], asked.get("host")) == ("/metrics", host)
-    (listens,) = (one["value"] for one in container["env"] if one["name"] == "FRACTUS_METRICS")
-    assert listens == f"{host or '$(FRACTUS_HOST)'}:{asked['port']}"
+@pytest.mark.parametrize(("settings", "host"), [((), "127.0.0.1"), (("--set=metrics.nodes.address=node",), None)])
+def test_agent_readiness_probe_requests_metrics(settings: tuple[str, ...], host: str | None) -> None:
+    (container,) = templates(*settings)["agent"]["spec"]["containers"]
+    probe = container["readinessProbe"]["httpGet"]
+    assert (probe["path"], probe.get("host")) == ("/metrics", host)
+    (listens,) = (variable["value"] for variable in container["env"] if variable["name"] == "FRACTUS_METRICS")
+    assert listens == f"{host or '$(FRACTUS_HOST)'}:{probe['port']}"
 
 
 def test_agent_has_no_readiness_probe_without_metrics() -> None:

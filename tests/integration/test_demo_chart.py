@@ -50,8 +50,8 @@ def test_demo_chart_omits_vehicle_if_disabled() -> None:
 
 def applications(*values: str) -> dict[str, dict[str, Any]]:
     """The applications that the chart keeps, by their names."""
-    kept = objects("drone=d", *values)["ConfigMap", "demo-applications"]["data"]
-    return {name: yaml.safe_load(text) for name, text in kept.items()}
+    data = objects("drone=d", *values)["ConfigMap", "demo-applications"]["data"]
+    return {name: yaml.safe_load(text) for name, text in data.items()}
 
 
 def containers(application: dict[str, Any]) -> list[dict[str, Any]]:
@@ -82,15 +82,15 @@ def test_demo_chart_applications_have_configured_resources() -> None:
 
 def test_demo_chart_notes_name_existing_application() -> None:
     notes = (CHARTS / "fractus-demo" / "templates" / "NOTES.txt").read_text()
-    found = re.search(r"get configmap \{\{ \.Release\.Name \}\}-applications -o jsonpath='\{\.data\.([\w-]+)\}'", notes)
-    assert found is not None
-    assert found[1] in applications()
+    match = re.search(r"get configmap \{\{ \.Release\.Name \}\}-applications -o jsonpath='\{\.data\.([\w-]+)\}'", notes)
+    assert match is not None
+    assert match[1] in applications()
 
 
 def test_demo_chart_without_drone_node_fails_with_remedy() -> None:
-    done = template()
-    assert done.returncode != 0
-    assert "no node has the label fractus.dev/class=drone; label one" in done.stderr
+    result = template()
+    assert result.returncode != 0
+    assert "no node has the label fractus.dev/class=drone; label one" in result.stderr
 
 
 def test_demo_chart_refuses_invalid_values() -> None:
@@ -99,6 +99,6 @@ def test_demo_chart_refuses_invalid_values() -> None:
         ("edgeNodes={a,b,c,d}", "edgeNodes"),
         ("dron=x", "dron"),
     ):
-        done = template("drone=d", value)
-        assert done.returncode != 0
-        assert named in done.stderr
+        result = template("drone=d", value)
+        assert result.returncode != 0
+        assert named in result.stderr

@@ -86,7 +86,7 @@ def test_documented_commands_show_the_state_of_the_cluster(
         names = {"dlk": link["metadata"]["name"], "grant": grant["metadata"]["name"], "drone": "drone-1"}
         outputs: dict[str, str] = {}
         for line, pattern in COMMANDS.items():
-            chosen = re.sub(r"(\w+) NAME", lambda found: f"{found[1]} {names[found[1]]}", line).replace("APP", NAME)
+            chosen = re.sub(r"(\w+) NAME", lambda match: f"{match[1]} {names[match[1]]}", line).replace("APP", NAME)
             outputs[chosen] = outputs.get(chosen) or shell.type(chosen)
             assert re.search(pattern, outputs[chosen]), f"{chosen} does not show {pattern}:\n{outputs[chosen]}"
         assert_plan_names_refused_field(shell, tmp_path)

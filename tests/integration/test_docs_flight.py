@@ -46,9 +46,9 @@ class Flown:
 
 def command_in_sentence(beginning: str) -> str:
     """Return the command between backticks with this beginning."""
-    found = re.search(rf"`({beginning}[^`]*)`", TEXT)
-    assert found is not None, beginning
-    return found[1]
+    match = re.search(rf"`({beginning}[^`]*)`", TEXT)
+    assert match is not None, beginning
+    return match[1]
 
 
 @contextlib.contextmanager
@@ -71,8 +71,8 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Flown:
     shell = Shell(folder)
     ports = {known: str(free_port()) for known in ("50051", "50052", "5760")}
 
-    def own(line: str) -> str:
-        return re.sub("|".join(ports), lambda found: ports[found[0]], line)
+    def with_free_ports(line: str) -> str:
+        return re.sub("|".join(ports), lambda match: ports[match[0]], line)
 
     def listens(port: str) -> str:
         return f" --listen 127.0.0.1:{ports[port]} --description none.yaml"
@@ -85,7 +85,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Flown:
     vehicle = (
         f"{command_in_sentence('fractus vehicle')} --listen tcp:127.0.0.1:{ports['5760']} --ready-after 2 --speedup 3"
     )
-    mobility = re.sub(r"--autopilot \S+", own(command_in_sentence("--autopilot tcp")), MOBILITY)
+    mobility = re.sub(r"--autopilot \S+", with_free_ports(command_in_sentence("--autopilot tcp")), MOBILITY)
     with (
         serving_process(shell, folder, vehicle),
         serving_process(shell, folder, f"{mobility} --recordings recordings/mobility{listens('50051')}"),
@@ -94,13 +94,13 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Flown:
             f"{CAMERA} --recordings recordings/camera --mobility 127.0.0.1:{ports['50051']}{listens('50052')}",
         ),
     ):  # fmt: skip
-        done = subprocess.run(
-            ["bash", "-c", own(FLY)], cwd=folder, env=shell.environment, capture_output=True, text=True,
+        result = subprocess.run(
+            ["bash", "-c", with_free_ports(FLY)], cwd=folder, env=shell.environment, capture_output=True, text=True,
             timeout=FLIGHT_TIMEOUT_S, check=False,
         )  # fmt: skip
     logs = "".join((folder / f"{name}.log").read_text() for name in ("vehicle", "mobility", "camera"))
-    assert done.returncode == 0, done.stdout + done.stderr + logs
-    return Flown(folder, done.stdout + done.stderr)
+    assert result.returncode == 0, result.stdout + result.stderr + logs
+    return Flown(folder, result.stdout + result.stderr)
 
 
 def test_component_reports_corrected_and_denied_calls(flown: Flown) -> None:
@@ -153,9 +153,9 @@ def test_view_shows_the_recordings(flown: Flown, line: str, monkeypatch: pytest.
     monkeypatch.chdir(flown.folder)
     folder = flown.folder / "recordings"
     for name, recorded in (("flight", "mobility"), ("camera", "camera")):
-        (found,) = (folder / recorded).glob("*.mcap")
-        shutil.copy(found, f"{name}.mcap")
-        found.touch()
+        (recording,) = (folder / recorded).glob("*.mcap")
+        shutil.copy(recording, f"{name}.mcap")
+        recording.touch()
     words = [word.replace("/var/lib/fractus/recordings", str(folder)) for word in shlex.split(line, comments=True)]
     with serving(*words[2:]) as address:
         wait_for_events(address, '"drone-1"', '"verdict"', "InsideExclusionZone", '"picture"')

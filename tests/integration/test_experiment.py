@@ -164,8 +164,8 @@ def test_interrupted_experiment_leaves_no_process(tmp_path: Path) -> None:
     finally:
         runner.kill()
         runner.wait(10)
-    left = subprocess.run(["pgrep", "-f", str(tmp_path)], capture_output=True, check=False, text=True)
-    assert not left.stdout
+    remaining = subprocess.run(["pgrep", "-f", str(tmp_path)], capture_output=True, check=False, text=True)
+    assert not remaining.stdout
 
 
 def test_processes_are_killed_if_they_ignore_sigterm(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -182,8 +182,8 @@ def test_processes_are_killed_if_they_ignore_sigterm(tmp_path: Path, monkeypatch
 
 def test_child_processes_end_with_their_program(tmp_path: Path) -> None:
     processes = Processes(tmp_path)
-    left = f"sleep 600; : {tmp_path}"
-    processes.start("leader", ["/bin/sh", "-c", f"/bin/sh -c '{left}' & exit 3"], {"PATH": os.environ["PATH"]})
+    child = f"sleep 600; : {tmp_path}"
+    processes.start("leader", ["/bin/sh", "-c", f"/bin/sh -c '{child}' & exit 3"], {"PATH": os.environ["PATH"]})
     assert processes.wait_end("leader", 20) == 3
     assert all_ended(tmp_path)
     processes.stop_all()

@@ -21,24 +21,24 @@ from pymavlink import mavutil
 
 
 def messages(directory: Path) -> dict[str, list[Any]]:
-    found: dict[str, list[Any]] = {}
+    by_topic: dict[str, list[Any]] = {}
     for path in sorted(directory.glob("*.mcap")):
         with path.open("rb") as file:
             for schema, channel, message in make_reader(file, validate_crcs=True).iter_messages():
                 assert schema is not None
-                found.setdefault(f"{channel.topic} {schema.name}", []).append(json.loads(message.data))
-    return found
+                by_topic.setdefault(f"{channel.topic} {schema.name}", []).append(json.loads(message.data))
+    return by_topic
 
 
 def frames(directory: Path) -> set[tuple[str, int]]:
     """Types of messages with the systems that sent them."""
-    found = set()
+    names = set()
     for path in directory.glob("*.tlog"):
         log = mavutil.mavlink_connection(str(path))
         while (message := log.recv_match()) is not None:
-            found.add((message.get_type(), message.get_srcSystem()))
+            names.add((message.get_type(), message.get_srcSystem()))
         log.close()
-    return found
+    return names
 
 
 def sizes(directory: Path) -> list[int]:
@@ -59,7 +59,7 @@ def indexed(directory: Path) -> bool:
 
 
 async def completed(directory: Path) -> None:
-    """Wait until what was recorded before the last start has its index."""
+    """Wait until the recordings of earlier runs of the service have an index."""
     async with asyncio.timeout(120):
         while True:
             if indexed(directory):
@@ -92,20 +92,20 @@ async def test_recording_has_flight_and_pictures_and_survives_kill(rig: Rig) -> 
     rig.kill("camera", signal.SIGTERM)
 
     assert len(sizes(mobility)) >= 2
-    found = messages(mobility)
-    fixes = found[f"/{NODE}/location foxglove.LocationFix"]
+    recorded = messages(mobility)
+    fixes = recorded[f"/{NODE}/location foxglove.LocationFix"]
     assert max(fix["altitude"] for fix in fixes) == pytest.approx(HOME[2] + 15.0, abs=2.0)
-    assert {"AltitudeAboveLimit"} <= {one["code"] for one in found[f"/{NODE}/decisions fractus.Decision"]}
-    zones = [json.loads(one["geojson"]) for one in found[f"/{NODE}/zones foxglove.GeoJSON"]]
-    names = {f["properties"]["name"] for one in zones for f in one["features"]}
+    assert {"AltitudeAboveLimit"} <= {message["code"] for message in recorded[f"/{NODE}/decisions fractus.Decision"]}
+    zones = [json.loads(message["geojson"]) for message in recorded[f"/{NODE}/zones foxglove.GeoJSON"]]
+    names = {f["properties"]["name"] for message in zones for f in message["features"]}
     assert {"no-fly-zone", "operationArea"} <= names
-    assert found[f"/{NODE}/attitude fractus.Attitude"]
-    assert {"GUIDED"} <= {one["mode"] for one in found[f"/{NODE}/state fractus.State"]}
-    heard = frames(mobility)
-    assert {("HEARTBEAT", 1), ("HEARTBEAT", 244), ("GLOBAL_POSITION_INT", 1), ("COMMAND_ACK", 1)} <= heard
+    assert recorded[f"/{NODE}/attitude fractus.Attitude"]
+    assert {"GUIDED"} <= {message["mode"] for message in recorded[f"/{NODE}/state fractus.State"]}
+    frame_names = frames(mobility)
+    assert {("HEARTBEAT", 1), ("HEARTBEAT", 244), ("GLOBAL_POSITION_INT", 1), ("COMMAND_ACK", 1)} <= frame_names
     taken = messages(pictures)
     assert taken[f"/{NODE}/picture foxglove.CompressedImage"]
-    callers = {one["caller"] for one in taken[f"/{NODE}/decisions fractus.Decision"]}
+    callers = {message["caller"] for message in taken[f"/{NODE}/decisions fractus.Decision"]}
     assert component_identity("default", "app", "AerialViewer", "app-aerial-viewer") in callers
 
 
@@ -141,9 +141,11 @@ async def test_recording_into_directory_of_another_service_is_reported(rig: Rig)
 
 
 def test_chart_value_enables_recordings() -> None:
-    def arguments(part: str, *given: str) -> list[str]:
+    def arguments(part: str, *settings: str) -> list[str]:
         (body,) = (
-            b for b in chart.render(*given) if b["kind"] == "DaemonSet" and b["metadata"]["name"] == f"fractus-{part}"
+            b
+            for b in chart.render(*settings)
+            if b["kind"] == "DaemonSet" and b["metadata"]["name"] == f"fractus-{part}"
         )
         (container,) = body["spec"]["template"]["spec"]["containers"]
         args: list[str] = container["args"]

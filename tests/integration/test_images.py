@@ -56,42 +56,42 @@ def test_image_imports_all_modules_of_its_program(image: tuple[str, str]) -> Non
     target, container = image
     packages = PACKAGES.get(target, ["fractus"])
     words = ["buildah", "run", "--isolation", "chroot", container, "--", "python3", "-", *packages]
-    done = subprocess.run(words, input=PROGRAM, capture_output=True, text=True, timeout=300, check=False)
-    assert done.returncode == 0, done.stderr
+    result = subprocess.run(words, input=PROGRAM, capture_output=True, text=True, timeout=300, check=False)
+    assert result.returncode == 0, result.stderr
 
 
 @pytest.mark.parametrize("image", TARGETS, indirect=True)
 def test_image_has_only_locked_distributions(image: tuple[str, str]) -> None:
     target, container = image
     root = Path(run(["buildah", "mount", container]).stdout.strip())
-    found = list(distributions(path=[str(root / SITE_PACKAGES)]))
+    installed = list(distributions(path=[str(root / SITE_PACKAGES)]))
     locked = {(each["name"], each["version"]) for each in tomllib.loads((ROOT / "uv.lock").read_text())["package"]}
-    named = {(re.sub(r"[-_.]+", "-", each.metadata["Name"]).lower(), each.version) for each in found}
+    named = {(re.sub(r"[-_.]+", "-", each.metadata["Name"]).lower(), each.version) for each in installed}
     assert named <= locked
     lacking = LACKING.get(target, set())
     assert not [name for name in lacking if (root / SITE_PACKAGES / name).exists()]
-    lost = {str(file) for each in found for file in each.files or () if not Path(file.locate()).exists()}
+    lost = {str(file) for each in installed for file in each.files or () if not Path(file.locate()).exists()}
     assert {name for name in lost if not name.endswith("uv_cache.json")} == set()
 
 
 def test_equal_sources_give_equal_layers(tmp_path: Path) -> None:
     checkout = tmp_path / "elsewhere"
     for line in (ROOT / ".dockerignore").read_text().splitlines():
-        here = ROOT / line.removeprefix("!")
-        there = checkout / line.removeprefix("!")
-        if line.startswith("!") and here.is_dir():
-            shutil.copytree(here, there, ignore=shutil.ignore_patterns("node_modules"))
+        source = ROOT / line.removeprefix("!")
+        copy = checkout / line.removeprefix("!")
+        if line.startswith("!") and source.is_dir():
+            shutil.copytree(source, copy, ignore=shutil.ignore_patterns("node_modules"))
         elif line.startswith("!"):
-            there.parent.mkdir(exist_ok=True)
-            shutil.copy2(here, there)
+            copy.parent.mkdir(exist_ok=True)
+            shutil.copy2(source, copy)
     for name in ("Dockerfile", ".dockerignore"):
         shutil.copy(ROOT / name, checkout)
     # This file is in no image. It keeps the second build from using the cached steps of the first.
     (checkout / "examples" / "another.txt").write_text(f"{time.time_ns()}\n")
-    [one] = build_images(ROOT, targets=["component"], report=print)
+    [image] = build_images(ROOT, targets=["component"], report=print)
     try:
         [other] = build_images(checkout, targets=["component"], tag="elsewhere", report=print)
-        assert layers(other) == layers(one)
+        assert layers(other) == layers(image)
     finally:
         run(["buildah", "rmi", image_name("component", "elsewhere")], check=False)
 
@@ -99,9 +99,9 @@ def test_equal_sources_give_equal_layers(tmp_path: Path) -> None:
 def layers(image: str) -> list[str]:
     """The digests of an image's layers."""
     described = json.loads(run(["buildah", "inspect", "--type", "image", image]).stdout)
-    found: list[str] = described["OCIv1"]["rootfs"]["diff_ids"]
-    assert len(found) > 2
-    return found
+    digests: list[str] = described["OCIv1"]["rootfs"]["diff_ids"]
+    assert len(digests) > 2
+    return digests
 
 
 def test_bill_of_materials_names_packages_of_debian_and_python() -> None:

@@ -1,4 +1,4 @@
-"""Rights of a kubelet's or a component's certificate: those of NodeRestriction, and no access to Fractus."""
+"""Permissions of the certificates of kubelets and components: NodeRestriction, and no access to objects of Fractus."""
 
 from __future__ import annotations
 
@@ -74,14 +74,14 @@ def test_kubelet_gets_only_tokens_of_its_agent(
         request = TOKENS | {"spec": {"expirationSeconds": 600, "boundObjectRef": bound}}
         return kubelet.call("POST", f"/api/v1/namespaces/{place}/serviceaccounts/{account}/token", request)
 
-    mine, theirs = (pod_on(node, SYSTEM, serviceAccountName="fractus-node") for node in ("drone-1", "edge-1"))
+    own_pod, other_pod = (pod_on(node, SYSTEM, serviceAccountName="fractus-node") for node in ("drone-1", "edge-1"))
     operator = pod_on("cloud-1", SYSTEM, serviceAccountName="fractus-operator")
-    assert token("fractus-node", mine)
-    denied(lambda: token("fractus-node", theirs), "pod")
+    assert token("fractus-node", own_pod)
+    denied(lambda: token("fractus-node", other_pod), "pod")
     denied(lambda: token("fractus-operator", operator), "forbidden")
-    denied(lambda: token("fractus-operator", mine), "forbidden")
-    # What an agent asks for its node's own account with, the kubelet cannot: none of its pods runs under it.
-    denied(lambda: token("drone-1", mine, NODES), "forbidden")
+    denied(lambda: token("fractus-operator", own_pod), "forbidden")
+    # An agent may request a token of its node's account. The kubelet may not, because none of its pods uses this account.
+    denied(lambda: token("drone-1", own_pod, NODES), "forbidden")
     node = {"kind": "Node", "apiVersion": "v1", "name": "drone-1"}
     loose = TOKENS | {"spec": {"boundObjectRef": node}}
     denied(

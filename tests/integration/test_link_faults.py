@@ -25,27 +25,27 @@ pytestmark = [pytest.mark.root, pytest.mark.timeout(300)]
 
 @pytest.fixture
 def world(tmp_path: Path) -> Iterator[World]:
-    with linked_world(tmp_path) as found:
-        yield found
+    with linked_world(tmp_path) as world:
+        yield world
 
 
-@pytest.mark.parametrize("left", ["nothing", "half"])
-def test_nodes_recover_after_power_loss_during_a_link(world: World, left: str) -> None:
+@pytest.mark.parametrize("restored", ["nothing", "half"])
+def test_nodes_recover_after_power_loss_during_a_link(world: World, restored: str) -> None:
     edge = world.edge("e1", 20.0)
     drone = world.drone()
     before = world.states()
     start_drone(world, edge)
     client = world.client(drone, 100_000, 0.1)
-    until(lambda: client.last_server == "e1", "an answer over the link", world)
+    until(lambda: client.last_server == "e1", "a response over the link", world)
     for agent in (drone, edge):
         rules = agent.run("nft", "list", "ruleset")
         agent.lose_power()
-        # The API server may be out of reach: only what is on disk is known.
+        # The agent restarts without an API server, so it knows only its stored files.
         (agent.folder / "links.json").unlink()
-        if left == "nothing":
+        if restored == "nothing":
             agent.run("nft", "-f", "-", text=FOREIGN)
             continue
-        # What an operating system may bring back: rules as they were saved, and a device that is up with some address.
+        # Some operating systems restore saved nftables rules, and bring the device up with another address.
         agent.run("nft", "-f", "-", text=rules)
         agent.run("ip", "address", "add", "169.254.9.9/16", "dev", "wlan0")
         agent.run("ip", "link", "set", "wlan0", "up")
@@ -54,14 +54,14 @@ def test_nodes_recover_after_power_loss_during_a_link(world: World, left: str) -
     client = world.client(drone, 100_000, 0.1)
     for agent in (edge, drone):
         agent.start()
-    until(lambda: client.last_server == "e1", "an answer over the link again", world)
-    if left == "nothing":
+    until(lambda: client.last_server == "e1", "a response over the link again", world)
+    if restored == "nothing":
         assert not client.failed
     assert "restored from disk" in drone.log()
     assert len(drone.redirects()) == len(edge.redirects()) == 1
     for agent in (drone, edge):
         assert agent.addresses() == [f"{link_address(agent.name)}/16"]
-    if left == "half":  # a device that was up stays up, without addresses
+    if restored == "half":  # a device that was up stays up, without addresses
         for agent in (drone, edge):
             agent.plan()
             until(lambda agent=agent: not agent.tables(), "no table of ours", world)
@@ -101,7 +101,7 @@ def test_peer_that_stops_after_pairing_is_left(world: World, fault: str) -> None
     other = world.edge("e2", 30.0)
     drone = world.drone()
     before = {name: state for name, state in world.states().items() if name != "e1"}
-    # The bad one promises more, and so it is asked first.
+    # The unresponsive edge node declares more bandwidth, so the drone tries it first.
     links = [world.link(drone, bad, bandwidth=13.0), world.link(drone, other)]
     world.serve()
     client = world.client(drone, 100_000, 0.1)
@@ -113,8 +113,8 @@ def test_peer_that_stops_after_pairing_is_left(world: World, fault: str) -> None
     until(lambda: ["paired"] in peer.responses, "that the bad one paired", world)
     other.plan(links[1])
     other.start()
-    until(lambda: client.last_server == "e2", "an answer over the link to the honest node", world)
-    assert "e1" not in {answer[1] for answer in client.responses}
+    until(lambda: client.last_server == "e2", "a response over the link to the working node", world)
+    assert "e1" not in {response[1] for response in client.responses}
     assert not client.failed
     check_restored(world, before)
 
@@ -140,25 +140,25 @@ def test_node_with_the_address_of_the_peer_gets_no_traffic(world: World) -> None
     before = {name: state for name, state in world.states().items() if name != "e9"}
     start_drone(world, edge)
     client = world.client(drone, 100_000, 0.05)
-    until(lambda: client.last_server == "e1", "an answer over the link", world)
+    until(lambda: client.last_server == "e1", "a response over the link", world)
     address = str(link_address("e1"))
     port = int(next(iter(edge.redirects())).split(" . ")[2])
-    # It takes calls where the edge node does, and pairs with the certificate that it has.
+    # The other node serves calls on the address and port of the edge node, and pairs with its own certificate.
     stranger.join(address)
     stranger.plan(world.link(drone, edge))
     world.python("e9", SERVER, "stranger", f"{address}:{port}", 0.005)
     paired = Client(world.python("e9", BAD_PEER, "e1", address, stranger.folder / "tls", "no routes"))
     world.python("e9", STRANGER, "wlan0", address, stranger.hardware.hex())
     until(lambda: drone.log().count("does not have its certificate") > 3, "refusals", world)
-    until(lambda: client.last_server == "cloud", "an answer of the cloud", world)
+    until(lambda: client.last_server == "cloud", "a response from the cloud", world)
     led = len(client.responses)
-    until(lambda: len(client.responses) > led + 60, "more answers", world)
-    assert "stranger" not in {answer[1] for answer in client.responses[led:]}
+    until(lambda: len(client.responses) > led + 60, "more responses", world)
+    assert "stranger" not in {response[1] for response in client.responses[led:]}
     assert not paired.responses
-    # Gone, it is not asked any more, though the drone was told that the address is there.
+    # After the other node has left, traffic returns to the edge node, although the drone's ARP table had the other node's address.
     world.end("e9")
     stranger.run("ip", "link", "set", "wlan0", "down")
-    took_s = until(lambda: client.last_server == "e1", "an answer over the link", world, timeout_s=20.0)
+    took_s = until(lambda: client.last_server == "e1", "a response over the link", world, timeout_s=20.0)
     print("from the stranger's end to the first answer:", took_s)
     check_restored(world, before)
 
@@ -170,19 +170,19 @@ def test_long_stream_is_reopened_without_lost_or_repeated_replies(world: World, 
     before = world.states()
     start_drone(world, edge)
     stream = Client(world.python("d1p", STREAM, f"{VIP.address}:{VIP.port}"))
-    until(lambda: stream.last_server == "e1", "an answer over the link", world)
+    until(lambda: stream.last_server == "e1", "a response over the link", world)
     for _ in range(2):
         if loss == "planned":
             drone.fly(-57.0, velocity=(-3.0, 0.0, 0.0))
         else:
             world.command(station="d1", off=True)
-        until(lambda: stream.last_server == "cloud", "an answer of the cloud", world)
+        until(lambda: stream.last_server == "cloud", "a response from the cloud", world)
         drone.fly(0.0)
         world.command(station="d1", off=False)
-        until(lambda: stream.last_server == "e1", "an answer over the link again", world)
-    answered = [int(answer[0]) for answer in stream.responses if answer[1] in {"cloud", "e1"}]
-    assert answered == list(range(len(answered)))
-    ends = [answer[2] for answer in stream.responses if answer[1] == "REOPENED"]
+        until(lambda: stream.last_server == "e1", "a response over the link again", world)
+    numbers = [int(response[0]) for response in stream.responses if response[1] in {"cloud", "e1"}]
+    assert numbers == list(range(len(numbers)))
+    ends = [response[2] for response in stream.responses if response[1] == "REOPENED"]
     assert ends
     assert set(ends) <= {"UNAVAILABLE"}, "a status after which gRPC's clients try again"
     check_restored(world, before)

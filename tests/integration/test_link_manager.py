@@ -14,8 +14,8 @@ pytestmark = [pytest.mark.root, pytest.mark.timeout(300)]
 
 @pytest.fixture
 def world(tmp_path: Path) -> Iterator[World]:
-    with linked_world(tmp_path) as found:
-        yield found
+    with linked_world(tmp_path) as world:
+        yield world
 
 
 def test_traffic_moves_to_the_link_and_back_before_the_link_ends(world: World) -> None:
@@ -79,8 +79,8 @@ def test_traffic_returns_to_the_cloud_within_a_second_after_link_loss(world: Wor
     drone = start_drone(world, edge)
     client = world.client(drone, 100_000, 0.02)
     until(lambda: client.last_server == "e1", "a reply over the link", world)
-    who = [answer[1] for answer in client.responses]
-    assert "FAILED" not in who, "the planned switch to the link loses no call"
+    servers = [response[1] for response in client.responses]
+    assert "FAILED" not in servers, "the planned switch to the link loses no call"
     switched = []
     gaps = []
     # The loss is detected after 0.6 s, and the switch takes a millisecond. Several losses, because the machine may be busy.
@@ -90,11 +90,11 @@ def test_traffic_returns_to_the_cloud_within_a_second_after_link_loss(world: Wor
         world.command(station="d1", off=True)
         until(lambda: client.last_server == "cloud", "a reply of the cloud", world)
         assert not drone.redirects()
-        answers = client.responses[begun:]
-        led = next(number for number, answer in enumerate(answers) if answer[1] == "cloud")
-        gaps.append(float(answers[led][2]) - max(float(a[2]) for a in answers[:led] if a[1] == "e1"))
+        received = client.responses[begun:]
+        led = next(number for number, response in enumerate(received) if response[1] == "cloud")
+        gaps.append(float(received[led][2]) - max(float(a[2]) for a in received[:led] if a[1] == "e1"))
         # This client does not repeat calls: the call that was cut fails.
-        assert sum(answer[1] == "FAILED" for answer in answers) <= 1
+        assert sum(response[1] == "FAILED" for response in received) <= 1
         switched.append(next(at for at in drone.cut_at() if at > lost_at) - lost_at)
         until(lambda: drone.status("app-d1-e1").get("traffic") == "cloud", "the status", world)
         # Traffic returns to the link when the radio works again.
@@ -185,7 +185,7 @@ def test_second_drone_waits_for_a_busy_edge_node(world: World) -> None:
     first.plan(links[0])
     first.start()
     clients = [world.client(drone, 100_000, 0.1) for drone in (first, second)]
-    until(lambda: clients[0].last_server == "e1", "the first drone's answer over the link", world)
+    until(lambda: clients[0].last_server == "e1", "the first drone's response over the link", world)
     second.plan(links[1])
     second.start()
     until(lambda: second.status("app-d2-e1").get("reason") == "PairingFailed", "a refusal", world)
@@ -193,7 +193,7 @@ def test_second_drone_waits_for_a_busy_edge_node(world: World) -> None:
     assert clients[0].last_server == "e1"
     assert edge.condition("app-d2-e1", "PeerReady")["reason"] == "Busy"
     first.plan()
-    until(lambda: clients[1].last_server == "e1", "the second drone's answer over the link", world)
+    until(lambda: clients[1].last_server == "e1", "the second drone's response over the link", world)
     assert clients[0].last_server == "cloud"
     assert not [client.failed for client in clients if client.failed]
     check_restored(world, before)
@@ -216,11 +216,11 @@ def test_peer_that_does_not_pair_costs_no_calls(world: World, fault: str) -> Non
     drone.plan(*links)
     drone.start()
     client = world.client(drone, 100_000, 0.1)
-    if fault == "silent":  # it was heard, and then answers no more
+    if fault == "silent":  # the drone received beacons of the node, which then stops responding
         until(lambda: "pairing" in drone.log(), "an attempt", world)
         world.command(station="e1", silent=True)
-    until(lambda: client.last_server == "e2", "an answer over the link to the honest node", world)
-    assert "e1" not in {answer[1] for answer in client.responses}
+    until(lambda: client.last_server == "e2", "a response over the link to the working node", world)
+    assert "e1" not in {response[1] for response in client.responses}
     assert len(client.failed) <= 1  # in the planned switch, by a client that repeats nothing
 
 
@@ -300,7 +300,7 @@ def test_uplink_loss_does_not_affect_direct_traffic(world: World) -> None:
         agent.api(up=False)
     before = len(client.responses)
     until(lambda: len(client.responses) > before + 200, "answers", world)
-    assert {answer[1] for answer in client.responses[before + 1 :]} == {"e1"}
+    assert {response[1] for response in client.responses[before + 1 :]} == {"e1"}
     assert drone.addresses() == [f"{link_address('d1')}/16"]
     drone.uplink(up=True)
     for agent in (drone, edge):
@@ -321,15 +321,19 @@ def test_unreachable_cloud_path_is_left_even_if_it_was_better(world: World) -> N
     drone.uplink(up=False)
     for agent in (drone, edge):
         agent.api(up=False)
-    until(lambda: client.last_server == "e1", "an answer over the link, though the cloud path declares more", world)
+    until(
+        lambda: client.last_server == "e1",
+        "a response over the link, although the cloud path declares more bandwidth",
+        world,
+    )
     cut = len(client.responses)
     until(lambda: len(client.responses) > cut + 100, "more of them", world)
-    assert {answer[1] for answer in client.responses[cut:]} == {"e1"}
+    assert {response[1] for response in client.responses[cut:]} == {"e1"}
     drone.uplink(up=True)
     for agent in (drone, edge):
         agent.api(up=True)
-    until(lambda: client.last_server == "cloud", "an answer of the cloud, which is the better path again", world)
-    assert "FAILED" not in {answer[1] for answer in client.responses[cut:]}
+    until(lambda: client.last_server == "cloud", "a response from the cloud, which is the better path again", world)
+    assert "FAILED" not in {response[1] for response in client.responses[cut:]}
     until(lambda: drone.status("app-d1-e1").get("traffic") == "cloud", "the status", world)
 
 

@@ -29,15 +29,15 @@ def test_operator_serves_metrics_of_a_running_rollout(
     try:
         world.put(traffic(namespace))
         world.phase(namespace, "Deploying")
-        seen = wait_for(
+        metrics_text = wait_for(
             lambda: (samples := scraped(port)).get(("fractus_applications", "Deploying")) and samples, operator.log
         )
-        assert seen["fractus_operator_lease_left_seconds",] > 0
-        assert seen["fractus_operator_watch_open", "drones"] == 1
-        assert 0 <= seen["fractus_operator_watch_age_seconds", "pods"] < 300
-        assert seen["fractus_operator_reconcile_seconds_count", "application"] > 0
-        assert seen["fractus_operator_plan_phase_seconds_count", "plan"] > 0
-        assert seen["fractus_drones", "inactive"] == 1
+        assert metrics_text["fractus_operator_lease_left_seconds",] > 0
+        assert metrics_text["fractus_operator_watch_open", "drones"] == 1
+        assert 0 <= metrics_text["fractus_operator_watch_age_seconds", "pods"] < 300
+        assert metrics_text["fractus_operator_reconcile_seconds_count", "application"] > 0
+        assert metrics_text["fractus_operator_plan_phase_seconds_count", "plan"] > 0
+        assert metrics_text["fractus_drones", "inactive"] == 1
         with urllib.request.urlopen(operator.health, timeout=20) as response:
             assert response.status == 200
         assert json.loads(operator.log().splitlines()[-1])["level"]

@@ -72,8 +72,8 @@ async def test_mobility_mission_applies_corrections_and_denials(rig: Rig) -> Non
     assert why.code == "InvalidArgument"
 
     passenger = rig.stub(PASSENGER)
-    where = await passenger.GetPosition(pb.GetPositionRequest(), timeout=5)
-    assert math.dist(xy(where.position), (0, 40)) < 2.0
+    reported = await passenger.GetPosition(pb.GetPositionRequest(), timeout=5)
+    assert math.dist(xy(reported.position), (0, 40)) < 2.0
     code, why = await denied(passenger.Hover(pb.HoverRequest(), timeout=5))
     assert (code, why.code) == (grpc.StatusCode.PERMISSION_DENIED, "NotADriver")
 
@@ -84,16 +84,19 @@ async def test_mobility_mission_applies_corrections_and_denials(rig: Rig) -> Non
     code, why = await denied(driver.stub.Disarm(pb.DisarmRequest(), timeout=5))
     assert why.code == "InAir"
 
-    seen = await asyncio.to_thread(scraped, port)
+    samples = await asyncio.to_thread(scraped, port)
     assert (
-        seen["fractus_in_air",] == seen["fractus_control_authority", "driver"] == seen["fractus_companion_alive",] == 1
+        samples["fractus_in_air",]
+        == samples["fractus_control_authority", "driver"]
+        == samples["fractus_companion_alive",]
+        == 1
     )
-    assert seen["fractus_policy_verdicts_total", "correct", "altitudes"] >= 1
-    assert seen["fractus_policy_verdicts_total", "deny", "no-fly"] >= 1
-    assert seen["fractus_verdicts_total", "deny", "NotADriver"] == 1
-    assert 0 <= seen["fractus_telemetry_age_seconds",] < 10
-    assert seen["fractus_audit_sequence",] > 10
-    assert seen["fractus_certificate_expiry_timestamp_seconds",] > time.time()
+    assert samples["fractus_policy_verdicts_total", "correct", "altitudes"] >= 1
+    assert samples["fractus_policy_verdicts_total", "deny", "no-fly"] >= 1
+    assert samples["fractus_verdicts_total", "deny", "NotADriver"] == 1
+    assert 0 <= samples["fractus_telemetry_age_seconds",] < 10
+    assert samples["fractus_audit_sequence",] > 10
+    assert samples["fractus_certificate_expiry_timestamp_seconds",] > time.time()
 
     await _return_and_land(rig, driver)
     _check_audit(rig)

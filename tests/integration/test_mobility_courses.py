@@ -40,7 +40,7 @@ WALL = (-40.0, 25.0, 40.0, 40.0)
 
 
 class Trace:
-    """Where the drone was, 20 times a second."""
+    """Positions of the drone, 20 per second."""
 
     def __init__(self, rig: Rig) -> None:
         self.points: list[tuple[float, float]] = []
@@ -187,9 +187,9 @@ async def test_check_call_returns_verdict_without_effect(rig: Rig) -> None:
         code, why = await denied(check(**bad))
         assert (code, why.code) == (grpc.StatusCode.INVALID_ARGUMENT, "InvalidArgument")
     state = await rig.telemetry()
-    assert state.controller.startswith("spiffe://"), "the driver has the drone as before"
+    assert state.controller.startswith("spiffe://"), "a dry run took control from the driver"
     assert math.dist(xy(state.position), (0, 0)) < 2.0
-    # The log is written by a thread, in order: what was written by now comes before this state.
+    # A thread writes the audit log, so entries appear with a delay.
     await rig.until(
         lambda _: {e["action"] for e in rig.entries("check")} >= {"correct", "takeover", "deny"}, 20, "the audit log"
     )
@@ -224,7 +224,7 @@ async def test_vehicle_fence_returns_drone_without_service(rig: Rig) -> None:
             if pilot.vehicle.lat is not None and FRAME.xy(pilot.vehicle.lat, pilot.vehicle.lon or 0)[1] > 80:
                 pilot.fly(8.0, 0.0, 0.0)
     north = FRAME.xy(pilot.vehicle.lat or 0, pilot.vehicle.lon or 0)[1]
-    assert 105 < north < 125, "ten metres beyond what is granted"
+    assert 105 < north < 125, "the fence is not ten metres outside the operation area"
     assert pilot.vehicle.failsafe_text == "Polygon fence breached"
     task.cancel()
 

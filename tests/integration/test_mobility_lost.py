@@ -313,7 +313,7 @@ async def test_service_without_journal_returns_flying_drone_home(rig: Rig) -> No
     for path in (rig.directory / "state").glob("journal*"):
         path.unlink()
     rig.start_service()
-    # A service that takes more than five seconds to start finds the drone on its failsafe's way home, or landed by it.
+    # If the start takes more than five seconds, the failsafe already flies the drone home, or has landed it.
     state = await rig.until(lambda t: t.mode in {"RTL", "SMART_RTL"}, 60, "return")
     assert state.controller == "system"
     await rig.until(lambda t: not t.armed, 90, "landing")

@@ -35,10 +35,10 @@ from mobility_rig import (
 T = TypeVar("T")
 
 
-def endpoint(rig: Rig, identity: str = DRIVER, **how: float) -> Endpoint:
+def endpoint(rig: Rig, identity: str = DRIVER, **validity: float) -> Endpoint:
     folder = rig.directory / f"tls-{identity.rpartition('/')[2]}"
     folder.mkdir(exist_ok=True)
-    key, certificate = rig.authority.issue(identity, **how)
+    key, certificate = rig.authority.issue(identity, **validity)
     for name, data in (("tls.key", key), ("tls.crt", certificate), ("ca.crt", rig.authority.pem)):
         fresh = folder / f".{name}"
         fresh.write_bytes(data)
@@ -74,8 +74,8 @@ async def test_sdk_mission_survives_service_restart_and_takeover(rig: Rig) -> No
                 up = await drone.takeoff(20)
                 assert up.corrected
                 lat, lon = FRAME.latlon(0, 8)
-                there = await drone.goto(lat, lon, 7)
-                assert not there.corrected
+                reached = await drone.goto(lat, lon, 7)
+                assert not reached.corrected
                 with pytest.raises(PolicyDenied) as refused:
                     await drone.goto(*FRAME.latlon(-50, 0), 7)
                 assert refused.value.code == "InsideExclusionZone"
@@ -99,8 +99,8 @@ async def test_sdk_returns_control_and_mission_completes(rig: Rig) -> None:
         async with drone.control() as control:
             await drone.arm()
             await drone.takeoff(10)
-            here = (await drone.position()).position
-            await drone.goto(here.lat, here.lon, 12.0)
+            position = (await drone.position()).position
+            await drone.goto(position.lat, position.lon, 12.0)
         assert control.mission_complete
         await rig.until(lambda t: not t.armed, 90, "landing")
         with pytest.raises(MissionComplete):
@@ -114,9 +114,9 @@ async def test_sdk_watch_streams_report_vehicle_state(rig: Rig) -> None:
     rig.start_vehicle()
     async with Mobility(endpoint(rig)) as drone, asyncio.timeout(60):
         async with contextlib.aclosing(drone.watch.health()) as healths:
-            told = [health async for health in _until(healths, lambda health: health.ready)]
-        assert all(health.problem for health in told[:-1])
-        assert told[-1].problem == ""
+            health_reports = [health async for health in _until(healths, lambda health: health.ready)]
+        assert all(health.problem for health in health_reports[:-1])
+        assert health_reports[-1].problem == ""
         assert (await anext(drone.watch.gps())).satellites >= 6
         assert (await anext(drone.watch.battery())).voltage_v > 10
         assert abs((await anext(drone.watch.attitude())).roll_deg) < 5
@@ -140,7 +140,7 @@ async def test_sdk_dry_runs_and_passenger_poi_mission(rig: Rig) -> None:
     rig.start_vehicle()
     await rig.until(lambda t: t.HasField("position") and t.HasField("home"), 30)
     async with Mobility(endpoint(rig)) as drone:
-        # A position alone answers nothing: the delay of the link must be measured too.
+        # A known position is not sufficient for a call: the delay of the link must be measured too.
         async with asyncio.timeout(60), contextlib.aclosing(drone.watch.health()) as healths:
             async for _ in _until(healths, lambda health: health.ready):
                 pass
@@ -189,7 +189,7 @@ LIFE_S = 8.0
 
 
 async def test_sdk_calls_succeed_during_certificate_renewal(rig: Rig) -> None:
-    """Of server and client, of mobility and camera, with control of the drone held all the while."""
+    """Certificates of services and client are renewed while the client holds control of the drone."""
     rig.write_grant(
         grant(services=[{"service": "mobility", "methods": ALL}, {"service": "camera", "methods": ["ListImages"]}])
     )
@@ -199,13 +199,13 @@ async def test_sdk_calls_succeed_during_certificate_renewal(rig: Rig) -> None:
     await rig.until(lambda t: t.ready and t.HasField("position"), 40)
     clock = asyncio.get_running_loop()
     rig.write_tls(seconds=LIFE_S)
-    told = endpoint(rig, seconds=LIFE_S)
+    client_endpoint = endpoint(rig, seconds=LIFE_S)
     expiry_s = clock.time() + LIFE_S
-    async with Mobility(told) as drone, Camera(replace(told, address=camera_address)) as camera:
+    async with Mobility(client_endpoint) as drone, Camera(replace(client_endpoint, address=camera_address)) as camera:
         calls: list[asyncio.Task[object]] = []
 
         async def call_until(end_s: float) -> None:
-            # At a fixed rate, whatever becomes of the calls before: one that stalls holds none back.
+            # Start calls at a fixed rate, so that a stalled call does not delay later calls.
             while clock.time() < end_s:
                 calls.extend(map(asyncio.ensure_future, (drone.position(), camera.list())))
                 await asyncio.sleep(CALL_EVERY_S)
@@ -217,7 +217,7 @@ async def test_sdk_calls_succeed_during_certificate_renewal(rig: Rig) -> None:
             endpoint(rig)
             await call_until(expiry_s + 2.0)
             ended = await asyncio.gather(*calls, return_exceptions=True)
-            assert [one for one in ended if isinstance(one, BaseException)] == []
+            assert [result for result in ended if isinstance(result, BaseException)] == []
             assert control.lost is None
             assert (await rig.telemetry()).controller == DRIVER
     assert len(calls) > 20 * LIFE_S

@@ -40,11 +40,11 @@ def operator(control_plane: ControlPlane, world: World, chart: None, tmp_path: P
 
 def carried(world: World, node: str) -> dict[str, Body] | None:
     """The Grants that a node's object carries, by name; None without one."""
-    found = world.api.get(f"{NODE_GRANTS}/{node}")
+    body = world.api.get(f"{NODE_GRANTS}/{node}")
     return (
         None
-        if found is None
-        else {g["metadata"]["name"]: g for g in unpack(found["spec"]["packed"], found["spec"]["count"])}
+        if body is None
+        else {g["metadata"]["name"]: g for g in unpack(body["spec"]["packed"], body["spec"]["count"])}
     )
 
 
@@ -67,14 +67,14 @@ def test_node_grants_object_follows_grants_and_returns_reports(
         return (world.api.get(f"{FRACTUS}/grants/{name}") or {}).get("status") or {}
 
     def report(node: str, phase: str, message: str = "") -> None:
-        said = {"uid": grant["metadata"]["uid"], "name": name, "phase": phase, "message": message}
-        reports = {"observedGeneration": 1, "grants": [said | {"observedGeneration": 1}]}
+        report_body = {"uid": grant["metadata"]["uid"], "name": name, "phase": phase, "message": message}
+        reports = {"observedGeneration": 1, "grants": [report_body | {"observedGeneration": 1}]}
         world.api.merge(f"{NODE_GRANTS}/{node}/status", {"status": reports})
 
     report("drone-1", "Active")
     wait_for(lambda: status() == {"phase": "Active", "message": "", "observedGeneration": 1}, "the status")
 
-    # What happens while no operator acts, the next one makes good.
+    # The next operator processes reports that arrived while no operator ran.
     operator.stop()
     report("edge-1", "Failed", "not its own")
     report("drone-1", "Complete", "flown")

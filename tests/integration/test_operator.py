@@ -40,14 +40,16 @@ def running(world: World, namespace: str) -> dict[str, Any]:
 
 def versions(world: World, namespace: str) -> dict[str, str]:
     """The resource versions of all that the operator writes for the example."""
-    found = {name: body["metadata"]["resourceVersion"] for name, body in world.children(namespace).items()}
-    found = {name: version for name, version in found.items() if not name.startswith("deployments/")}
+    versions_by_name = {name: body["metadata"]["resourceVersion"] for name, body in world.children(namespace).items()}
+    versions_by_name = {
+        name: version for name, version in versions_by_name.items() if not name.startswith("deployments/")
+    }
     for name, body in world.children(namespace).items():
         if name.startswith("deployments/"):
-            found[name] = str(body["metadata"]["generation"])
+            versions_by_name[name] = str(body["metadata"]["generation"])
     application = world.application(namespace)
     assert application is not None
-    return found | {"application": application["metadata"]["resourceVersion"]}
+    return versions_by_name | {"application": application["metadata"]["resourceVersion"]}
 
 
 def end_mission(world: World, namespace: str, phase: str, message: str) -> None:
@@ -57,8 +59,8 @@ def end_mission(world: World, namespace: str, phase: str, message: str) -> None:
 
 
 def gone(world: World, namespace: str) -> bool:
-    left = world.children(namespace)
-    return world.application(namespace) is None and not left
+    children = world.children(namespace)
+    return world.application(namespace) is None and not children
 
 
 def test_application_gets_plan_grants_and_pods(world: World, operator: OperatorProcess, namespace: str) -> None:
@@ -98,7 +100,7 @@ def test_application_gets_plan_grants_and_pods(world: World, operator: OperatorP
     found = world.api.list(f"/api/v1/namespaces/{namespace}/events")
     (planned,) = (e["message"] for e in found if e["reason"] == "Planned")
     for stage in ("Planned", "Granted", "Deployed"):
-        assert world.condition(namespace, stage)["message"] in planned, "nothing that the conditions say is lost"
+        assert world.condition(namespace, stage)["message"] in planned, "the Event lacks the message of a condition"
 
 
 def events(world: World, namespace: str) -> list[str]:
@@ -133,9 +135,9 @@ def test_unchanged_application_causes_no_writes(world: World, operator: Operator
     stored = world.api.get(world.path(traffic(namespace)))
     assert stored is not None
     assert not [name for name in stored["metadata"].get("annotations", {}) if "kopf" in name], (
-        "each is a write of its own"
+        "kopf writes annotations, each with a separate request"
     )
-    # The depot's radius is part of the drone's corridor: its grants follow, and nothing else.
+    # The depot's radius is part of the drone's corridor, so only the Grants change.
     changed = {name for name in before if before[name] != after[name]}
     assert changed <= {f"grants/{namespace}.traffic-navigator", f"grants/{namespace}.traffic-aerial-viewer"}
 
@@ -145,13 +147,15 @@ def _geohash(world: World, node: str) -> str | None:
     return labels.get("fractus.dev/geohash")
 
 
-@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGTERM])
-def test_restarted_operator_changes_nothing(world: World, operator: OperatorProcess, namespace: str, how: int) -> None:
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
+def test_restarted_operator_changes_nothing(
+    world: World, operator: OperatorProcess, namespace: str, number: int
+) -> None:
     running(world, namespace)
     before = versions(world, namespace)
-    operator.stop(how)
+    operator.stop(number)
     operator.start()
-    # A new zone's condition tells that the new operator is at work; then it has long seen the application.
+    # When the restarted operator has set the condition of a new zone, it has also received the Application.
     world.put(fractus_object("Zone", "beacon", {"area": {"circle": {"center": at(0, 0), "radius": 10}}}))
     wait_for(lambda: _ready(world, "zones", "beacon") == "True", "the restarted operator")
     world.put(fractus_object("Application", "second", traffic(namespace)["spec"], namespace))
@@ -212,10 +216,10 @@ def test_complete_mission_keeps_only_its_plan(world: World, operator: OperatorPr
 def flight_events(world: World) -> list[str]:
     """The Events on the present Drone drone-1, in the order in which they were posted."""
     drone = world.api.get("/apis/fractus.dev/v1alpha1/drones/drone-1") or {}
-    found = world.api.list("/api/v1/namespaces/default/events")
-    ours = [e for e in found if e["involvedObject"].get("uid") == drone["metadata"]["uid"]]
-    ours.sort(key=lambda event: int(event["metadata"]["resourceVersion"]))
-    return [f"{event['reason']}: {event['message']}" for event in ours]
+    all_events = world.api.list("/api/v1/namespaces/default/events")
+    drone_events = [e for e in all_events if e["involvedObject"].get("uid") == drone["metadata"]["uid"]]
+    drone_events.sort(key=lambda event: int(event["metadata"]["resourceVersion"]))
+    return [f"{event['reason']}: {event['message']}" for event in drone_events]
 
 
 def test_finished_pods_stay_stopped_for_their_logs(world: World, operator: OperatorProcess, namespace: str) -> None:
@@ -227,17 +231,17 @@ def test_finished_pods_stay_stopped_for_their_logs(world: World, operator: Opera
     workloads = [f"/apis/apps/v1/namespaces/{namespace}/{kind}" for kind in ("deployments", "replicasets")]
     wait_for(lambda: not any(world.api.list(path) for path in workloads), "what would start pods again to go")
     wait_for(lambda: all("fractus.dev/finished" in labels_of(pod) for pod in world.pods(namespace)), "pods to be kept")
-    kept = world.pods(namespace)
-    assert {pod["metadata"]["uid"] for pod in kept} == before
-    for pod in kept:
+    stopped = world.pods(namespace)
+    assert {pod["metadata"]["uid"] for pod in stopped} == before
+    for pod in stopped:
         assert pod["spec"]["activeDeadlineSeconds"] == 1
         assert [(o["kind"], o["uid"]) for o in pod["metadata"]["ownerReferences"]] == [("Application", uid)]
     # A time that has not come keeps no pod.
-    first = kept[0]["metadata"]
+    first = stopped[0]["metadata"]
     path = f"/api/v1/namespaces/{namespace}/pods/{first['name']}"
     world.api.merge(path, {"metadata": {"labels": {"fractus.dev/finished": "29990101T000000Z"}}})
     wait_for(lambda: first["uid"] not in {p["metadata"]["uid"] for p in world.pods(namespace)}, "that pod to go")
-    # No label of a finished pod counts for the next mission, which has pods of its own.
+    # The next mission has new pods and ignores labels of finished pods.
     manifest = traffic(namespace)
     manifest["spec"]["ttlAfterFinished"] = 0
     manifest["spec"]["components"][0]["container"]["env"] = [{"name": "COLOUR", "value": "red"}]
@@ -284,7 +288,7 @@ def test_changed_ttl_of_finished_pods_starts_no_mission(
     keep_for(3)
     wait_for(lambda: not world.pods(namespace), "the pods to go")
     operator.stop(signal.SIGKILL)
-    # An earlier release left plans that do not say which mission they are of.
+    # Plans of an earlier release do not contain the digest of their mission.
     plan = f"{FRACTUS}/namespaces/{namespace}/deploymentplans/traffic"
     world.api.merge(plan, {"spec": {"applicationDigest": None}})
     operator.start()
@@ -366,7 +370,9 @@ def test_failed_component_is_reported_with_last_log_lines(
     running(world, namespace)
     pod = next(pod for pod in world.pods(namespace) if labels_of(pod)["fractus.dev/component"] == "Navigator")
     (container,) = pod["spec"]["containers"]
-    assert container["terminationMessagePolicy"] == "FallbackToLogsOnError", "the kubelet says what was printed last"
+    assert container["terminationMessagePolicy"] == "FallbackToLogsOnError", (
+        "the kubelet does not report the last output"
+    )
     ended = {"exitCode": 1, "reason": "Error", "message": "flies\nno route to the river\n"}
     told = {
         "name": container["name"], "image": container["image"], "imageID": "", "ready": False, "restartCount": 1,
@@ -382,7 +388,7 @@ def test_failed_component_is_reported_with_last_log_lines(
 
 
 def test_refused_pods_are_reported(world: World, operator: OperatorProcess, namespace: str) -> None:
-    """As where it has a quota or limits, or enforces Pod Security: no pod is there that could say why."""
+    """A quota, limits or Pod Security of the namespace refuse the pods, so no pod has a status with the reason."""
     path = f"/api/v1/namespaces/{namespace}/limitranges/small"
     limits = {"limits": [{"type": "Container", "max": {"cpu": "50m"}}]}
     head = {"apiVersion": "v1", "kind": "LimitRange", "metadata": {"name": "small", "namespace": namespace}}
@@ -481,7 +487,7 @@ def test_upgraded_operator_restarts_no_pod_in_flight(world: World, operator: Ope
     running(world, namespace)
     world.drone_status("drone-1", "flying")
     operator.stop()
-    # What an older operator would have built: something else than this one wants.
+    # Simulate Deployments of an older operator, which differ from those of this operator.
     root = f"/apis/apps/v1/namespaces/{namespace}/deployments"
     for name in ("traffic-navigator", "traffic-data-store"):
         world.api.merge(f"{root}/{name}", {"spec": {"template": {"spec": {"terminationGracePeriodSeconds": 11}}}})
@@ -569,9 +575,9 @@ def test_recreated_application_gets_new_plan(world: World, operator: OperatorPro
 
 
 def test_object_of_another_owner_is_not_taken_over(world: World, operator: OperatorProcess, namespace: str) -> None:
-    theirs = {"apiVersion": "v1", "kind": "Service", "metadata": {"name": "traffic-data-store", "namespace": namespace},
+    foreign = {"apiVersion": "v1", "kind": "Service", "metadata": {"name": "traffic-data-store", "namespace": namespace},
               "spec": {"ports": [{"port": 1}]}}  # fmt: skip
-    world.api.apply(f"/api/v1/namespaces/{namespace}/services/traffic-data-store", theirs)
+    world.api.apply(f"/api/v1/namespaces/{namespace}/services/traffic-data-store", foreign)
     world.put(traffic(namespace))
     wait_for(lambda: world.condition(namespace, "Ready").get("reason") == "NameTaken", "the conflict")
     service = world.api.get(f"/api/v1/namespaces/{namespace}/services/traffic-data-store")
@@ -623,10 +629,10 @@ def test_grant_with_modified_signature_is_signed_again(world: World, operator: O
     path = f"{FRACTUS}/grants/{namespace}.traffic-navigator"
 
     def issued() -> datetime:
-        seen.append(world.api.get(path) or {})
-        return datetime.fromisoformat(seen[-1]["spec"]["issuedAt"])
+        observed.append(world.api.get(path) or {})
+        return datetime.fromisoformat(observed[-1]["spec"]["issuedAt"])
 
-    seen: list[dict[str, Any]] = []
+    observed: list[dict[str, Any]] = []
     first = issued()
     world.api.merge(path, {"metadata": {"annotations": {SIGNATURE_ANNOTATION: "bm9uc2Vuc2U="}}})
     assert not sound()
@@ -635,7 +641,7 @@ def test_grant_with_modified_signature_is_signed_again(world: World, operator: O
     assert second > first
     world.api.merge(path, {"spec": {"limits": {"maxSpeed": 300}}})
     wait_for(lambda: issued() > second and sound(), "what was granted")
-    assert seen[-1]["spec"]["limits"]["maxSpeed"] < 300, "what another wrote is never signed"
+    assert observed[-1]["spec"]["limits"]["maxSpeed"] < 300, "what another wrote is never signed"
 
 
 def test_nodes_get_location_labels(world: World, operator: OperatorProcess) -> None:
@@ -743,7 +749,7 @@ def test_change_pending_at_end_of_mission_starts_another_mission(
 
 
 def test_field_removed_from_spec_is_removed(world: World, operator: OperatorProcess, namespace: str) -> None:
-    """Also from what was created: a field of no other owner goes with the apply that lacks it."""
+    """The operator created the field by POST. A later apply without the field must remove it."""
     manifest = traffic(namespace)
     container = manifest["spec"]["components"][4]["container"]
     container["env"] = [{"name": "COLOUR", "value": "red"}, {"name": "SIZE", "value": "large"}]
@@ -767,8 +773,8 @@ def test_field_removed_from_spec_is_removed(world: World, operator: OperatorProc
     metadata = (world.api.get(path) or {})["metadata"]
     assert metadata["generation"] == generation + 1
     assert metadata["annotations"]["their.org/note"] == "kept"
-    ours = [e for e in metadata["managedFields"] if e["manager"] == "fractus-operator"]
-    assert [entry["operation"] for entry in ours] == ["Apply"]
+    operator_entries = [e for e in metadata["managedFields"] if e["manager"] == "fractus-operator"]
+    assert [entry["operation"] for entry in operator_entries] == ["Apply"]
 
 
 def test_removed_passenger_is_deleted(world: World, operator: OperatorProcess, namespace: str) -> None:

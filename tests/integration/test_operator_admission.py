@@ -179,7 +179,7 @@ def test_pod_with_node_name_of_drone_is_refused(world: World, chart: None, names
     wait_for(lambda: refused("drone-1"), "the admission policy to be in force")
     denied(named("edge-1"), "edge-1 is a drone or an edge node, for which the scheduler places pods")
     named("cloud-1")()
-    # One machine that is all at once, to try it out; and one whose kubelet sees to it, which no policy need look for in each pod.
+    # The policy ignores a node that is also a cloud node, and a guarded node, whose kubelet enforces the taint itself.
     for label in ("fractus.dev/cloud", "fractus.dev/guarded"):
         world.api.merge(drone, {"metadata": {"labels": {label: "true"}}})
         try:
@@ -217,27 +217,27 @@ def test_operator_reads_no_secret(control_plane: ControlPlane, world: World, cha
 def test_operator_writes_only_objects_that_it_has_created(
     control_plane: ControlPlane, world: World, chart: None, namespace: str
 ) -> None:
-    theirs = f"/api/v1/namespaces/{namespace}/secrets/theirs"
+    foreign_path = f"/api/v1/namespaces/{namespace}/secrets/theirs"
     body = {"apiVersion": "v1", "kind": "Secret", "metadata": {"name": "theirs", "namespace": namespace}}
-    world.api.apply(theirs, body)
+    world.api.apply(foreign_path, body)
     ours_too = {"metadata": {"labels": {"app.kubernetes.io/managed-by": "fractus"}}}
     client = control_plane.with_token(operator_token(world))
-    made = "may write only secrets that it has created"
+    message = "may write only secrets that it has created"
     try:
         wait_for(lambda: _probe_refused(client), "the admission policy to be in force")
-        secrets = theirs.rpartition("/")[0]
+        secrets = foreign_path.rpartition("/")[0]
         labelled = body | {"metadata": body["metadata"] | ours_too["metadata"], "type": "Opaque"}
-        denied(lambda: client.call("PUT", theirs, labelled), made)
-        denied(lambda: client.delete(theirs), made)
-        denied(lambda: client.call("POST", secrets, body | {"metadata": {"name": "fresh"}}), made)
+        denied(lambda: client.call("PUT", foreign_path, labelled), message)
+        denied(lambda: client.delete(foreign_path), message)
+        denied(lambda: client.call("POST", secrets, body | {"metadata": {"name": "fresh"}}), message)
         container = {"name": "main", "image": "registry.test/theirs:1"}
         pod = {"apiVersion": "v1", "kind": "Pod", "metadata": {"name": "theirs"}, "spec": {"containers": [container]}}
         pods = f"/api/v1/namespaces/{namespace}/pods"
         world.api.apply(f"{pods}/theirs", pod)
-        made = made.replace("secrets", "pods")
-        denied(lambda: client.merge(f"{pods}/theirs", {"spec": {"activeDeadlineSeconds": 1}}), made)
-        denied(lambda: client.merge(f"{pods}/theirs", ours_too), made)
-        denied(lambda: client.delete(f"{pods}/theirs"), made)
+        message = message.replace("secrets", "pods")
+        denied(lambda: client.merge(f"{pods}/theirs", {"spec": {"activeDeadlineSeconds": 1}}), message)
+        denied(lambda: client.merge(f"{pods}/theirs", ours_too), message)
+        denied(lambda: client.delete(f"{pods}/theirs"), message)
         world.api.apply(f"{pods}/ours", pod | {"metadata": {"name": "ours", **ours_too["metadata"]}})
         other = [{"op": "replace", "path": "/spec/containers/0/image", "value": "registry.test/other:1"}]
         change = ContentType.JSON_PATCH
@@ -250,7 +250,7 @@ def test_operator_writes_only_objects_that_it_has_created(
         denied(lambda: client.merge(node, {"spec": {"unschedulable": True}}), labels)
         denied(lambda: client.merge(node, {"metadata": {"labels": {"fractus.dev/class": "cloud"}}}), labels)
         denied(lambda: client.merge(node, {"metadata": {"labels": {"kubernetes.io/os": "x"}}}), labels)
-        # What network plugins and others go by, and what would keep a Node or have it collected.
+        # Annotations are used by network plugins. Finalizers would keep a Node, and owner references could delete it.
         for field, value in (
             ("annotations", {"flannel.alpha.coreos.com/public-ip": "192.0.2.1"}),
             ("finalizers", ["a/b"]),
@@ -322,7 +322,7 @@ def test_operator_token_cannot_escalate_with_pods_or_secrets(
     root = {"runAsNonRoot": True, "runAsUser": 0, "seccompProfile": {"type": "RuntimeDefault"}}
     try:
         wait_for(lambda: _probe_refused(client), "the admission policy to be in force")
-        # As it is, it would be let in: what follows is refused for what it says.
+        # The unchanged objects are accepted, so each refusal below is caused by the changed field.
         deployment()()
         secret("traffic-navigator-tls")()
         for place in ("kube-system", SYSTEM, NODES):
@@ -343,13 +343,13 @@ def test_operator_token_cannot_escalate_with_pods_or_secrets(
             denied(deployment(**pod), "do not share resources of the node")
         for pod in ({"securityContext": root}, {"initContainers": [{"name": "first", "image": "x"}]}):
             denied(deployment(**pod), "one unprivileged container")
-        for given in (
+        for spec_change in (
             {"privileged": True},
             {"allowPrivilegeEscalation": False},
             {"allowPrivilegeEscalation": False, "readOnlyRootFilesystem": True, "capabilities": {"drop": ["ALL"], "add": ["NET_RAW"]}},
             {"allowPrivilegeEscalation": False, "readOnlyRootFilesystem": True, "capabilities": {"drop": ["ALL"]}, "runAsUser": 0},
         ):  # fmt: skip
-            denied(deployment(container={"securityContext": given}), "one unprivileged container")
+            denied(deployment(container={"securityContext": spec_change}), "one unprivileged container")
         confined = {"runAsNonRoot": True, "runAsUser": 10001, "seccompProfile": {"type": "RuntimeDefault"}}
         for more in ({"seLinuxOptions": {"type": "spc_t"}}, {"appArmorProfile": {"type": "Unconfined"}}):
             denied(deployment(securityContext=confined | more), "only confined pods")
@@ -412,17 +412,17 @@ def test_operator_token_cannot_redirect_foreign_traffic(
         found = [{"addresses": ["10.1.2.3"], "targetRef": target}]
         return made("EndpointSlice", {}, addressType="IPv4", endpoints=found, labels=names)
 
-    own = {"fractus.dev/application": "a"}
+    own_labels = {"fractus.dev/application": "a"}
     try:
         wait_for(lambda: _probe_refused(client), "the admission policy to be in force")
         ports = [{"port": 80}]
-        for selector in ({"selector": own}, {}):
+        for selector in ({"selector": own_labels}, {}):
             made("Service", {"ports": ports, **selector})()
         for spec in (
             {"ports": ports, "selector": {"app": "bank"}},
-            {"ports": ports, "selector": own, "type": "LoadBalancer"},
-            {"ports": ports, "selector": own, "type": "NodePort"},
-            {"ports": ports, "selector": own, "externalIPs": ["192.0.2.1"]},
+            {"ports": ports, "selector": own_labels, "type": "LoadBalancer"},
+            {"ports": ports, "selector": own_labels, "type": "NodePort"},
+            {"ports": ports, "selector": own_labels, "externalIPs": ["192.0.2.1"]},
             {"type": "ExternalName", "externalName": "bank.test"},
         ):
             denied(made("Service", spec), "cluster-internal Services for pods of applications")
@@ -441,17 +441,20 @@ def test_operator_token_cannot_redirect_foreign_traffic(
         ):
             denied(endpoints(**changed), "EndpointSlices for pods of applications")
         _leads_no_other_s_traffic(world, client, namespace)
-        made("NetworkPolicy", {"podSelector": {"matchLabels": own}, "policyTypes": ["Ingress"]})()
+        made("NetworkPolicy", {"podSelector": {"matchLabels": own_labels}, "policyTypes": ["Ingress"]})()
         for spec in (
             {"podSelector": {}, "policyTypes": ["Ingress"]},
             {"podSelector": {"matchLabels": {"app": "bank"}}, "policyTypes": ["Ingress"]},
-            {"podSelector": {"matchLabels": own}, "policyTypes": ["Egress"]},
+            {"podSelector": {"matchLabels": own_labels}, "policyTypes": ["Egress"]},
         ):
             denied(made("NetworkPolicy", spec), "NetworkPolicies for pods of applications")
-        made("PodDisruptionBudget", {"maxUnavailable": 0, "selector": {"matchLabels": own}})()
+        made("PodDisruptionBudget", {"maxUnavailable": 0, "selector": {"matchLabels": own_labels}})()
         every = {"maxUnavailable": 0, "selector": {"matchLabels": {"app": "bank"}}}
         denied(made("PodDisruptionBudget", every), "PodDisruptionBudgets for pods of applications")
-        denied(made("Service", {"ports": ports, "selector": own}, "kube-system"), "may not run pods in the namespace")
+        denied(
+            made("Service", {"ports": ports, "selector": own_labels}, "kube-system"),
+            "may not run pods in the namespace",
+        )
     finally:
         client.close()
 
@@ -488,7 +491,7 @@ def _leads_no_other_s_traffic(world: World, client: BlockingClient, namespace: s
         world.api.call("POST", services, body)
     wait_for(lambda: refused("bank"), "the Service to be known")
     lead("ours")
-    # What was made before the Service was someone's is not led elsewhere afterwards.
+    # EndpointSlices that the operator created before the Service got another owner cannot be changed to other addresses.
     world.api.merge(f"{services}/ours", {"metadata": {"labels": {"app.kubernetes.io/managed-by": "helm"}}})
     wait_for(lambda: refused("ours"), "the Service to be another's")
     elsewhere = {"endpoints": ends("10.1.2.4")}

@@ -95,7 +95,7 @@ def test_guest_leaves_host_with_changed_path(world: World, operator: OperatorPro
     manifest = traffic(namespace)
     manifest["spec"]["components"][0]["controlPoints"][0]["path"] = [at(0, 0, alt=10), at(60, 0, alt=20)]
     world.put(manifest)
-    wait_for(lambda: drone_of(world, namespace, "guest").get("node") == "drone-2", "a drone of its own")
+    wait_for(lambda: drone_of(world, namespace, "guest").get("node") == "drone-2", "another drone for the guest")
     assert world.status(namespace)["drone"] == "drone-1"
 
 
@@ -158,7 +158,7 @@ def test_new_node_scales_up_the_plan(world: World, operator: OperatorProcess, na
     assert before.items() <= after.items()
     deployed(world, namespace, pods=2)
     wait_for(
-        lambda: world.status(namespace)["pods"] == "2/2", lambda: f"both pods to be told: {world.status(namespace)}"
+        lambda: world.status(namespace)["pods"] == "2/2", lambda: f"both pods in the status: {world.status(namespace)}"
     )
 
 
@@ -170,10 +170,10 @@ def test_policy_conflict_is_reported_before_takeoff_until_policy_is_deleted(
     world.put(fractus_object("Zone", "across", {"area": {"circle": {"center": at(30, 30), "radius": 5}}}))
     policy = fractus_object("Policy", "across", fence)
     world.put(policy)
-    told = wait_for(lambda: world.condition(namespace, "PolicyConflict"), "the condition PolicyConflict")
-    assert told["status"] == "True"
-    assert "crosses zone across for 10.0 m of policy across" in told["message"]
-    wait_for(lambda: "policyConflict" in drone_of(world, namespace, "traffic"), "the plan to say so")
+    conflict = wait_for(lambda: world.condition(namespace, "PolicyConflict"), "the condition PolicyConflict")
+    assert conflict["status"] == "True"
+    assert "crosses zone across for 10.0 m of policy across" in conflict["message"]
+    wait_for(lambda: "policyConflict" in drone_of(world, namespace, "traffic"), "the conflict in the plan")
     leg = drone_of(world, namespace, "traffic")["legality"][0]
     assert (leg["flownBy"], leg["outcome"], leg["policies"]) == ("driver", "Denied", ["across"])
     assert world.status(namespace)["phase"] == "Waiting"
@@ -265,7 +265,7 @@ def test_second_operator_takes_over_within_15_s_of_killed_leader(
 
 def healthy(operator: OperatorProcess) -> bool:
     try:
-        with urllib.request.urlopen(operator.health, timeout=5) as answer:
-            return bool(answer.status == 200)
+        with urllib.request.urlopen(operator.health, timeout=5) as response:
+            return bool(response.status == 200)
     except OSError:
         return False

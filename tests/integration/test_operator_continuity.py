@@ -17,7 +17,7 @@ from test_operator import deployed, end_mission, gone, running
 Body = dict[str, Any]
 LOW = {"type": "LimitControl", "kind": "altitude", "upperLimit": 15}
 UNREADABLE = LOW | {"validFrom": "0000-01-01T00:00:00Z"}
-"""What an older release let in: a year 0."""
+"""Policy with the year 0, which an older release accepted."""
 
 
 def granted(world: World, namespace: str, instance: str = "traffic-navigator") -> list[str]:
@@ -26,19 +26,19 @@ def granted(world: World, namespace: str, instance: str = "traffic-navigator") -
     return [policy["name"] for policy in grant["spec"].get("policies", [])]
 
 
-def reason(world: World, namespace: str, wanted: str, name: str = "traffic") -> Body:
+def reason(world: World, namespace: str, expected: str, name: str = "traffic") -> Body:
     """The Ready condition, once it has this reason."""
 
     def reached() -> Body | None:
         condition = world.condition(namespace, "Ready", name)
-        return condition if condition.get("reason") == wanted else None
+        return condition if condition.get("reason") == expected else None
 
-    return wait_for(reached, lambda: f"{wanted}, but it is {world.status(namespace, name)}")
+    return wait_for(reached, lambda: f"{expected}, but it is {world.status(namespace, name)}")
 
 
 @contextmanager
 def older_policies(world: World) -> Iterator[None]:
-    """Policies of an older release, whose times were not looked at."""
+    """Install the kind Policy of an older release, which did not validate times."""
     path = "/apis/apiextensions.k8s.io/v1/customresourcedefinitions/policies.fractus.dev"
     present = world.api.get(path)
     assert present is not None
@@ -200,7 +200,10 @@ def test_refreshed_grant_keeps_previous_version_of_broken_policy(
     )
     assert (condition["reason"], "validFrom" in condition["message"]) == ("Invalid", True)
     world.put(fractus_object("Policy", "slow", {"type": "LimitControl", "kind": "speed", "upperLimit": 3}))
-    wait_for(lambda: granted(world, namespace) == ["fence", "odd", "slow"], "the third policy beside the broken ones")
+    wait_for(
+        lambda: granted(world, namespace) == ["fence", "odd", "slow"],
+        "the new policy in addition to the policies in the Grant",
+    )
     assert world.status(namespace)["phase"] == "Waiting"
     # A new Application gets no grant while the scope of the unreadable policy is unknown.
     world.add_drone("drone-2")
@@ -270,7 +273,7 @@ def test_plan_with_older_grant_keeps_drone_of_two_plans(
 
 
 def reconciled(world: World, namespace: str) -> None:
-    """Wait for the end of a whole reconcile: what was changed by hand is corrected by its last step."""
+    """Wait for the end of a reconciliation, whose last step reverts a manual change of this function."""
     path = f"/apis/apps/v1/namespaces/{namespace}/deployments/traffic-data-store"
     world.api.merge(path, {"spec": {"replicas": 3}})
     wait_for(lambda: (world.api.get(path) or {})["spec"]["replicas"] == 1, "the number of replicas")

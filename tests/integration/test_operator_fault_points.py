@@ -1,4 +1,4 @@
-"""The operator is killed at each step of its work: after each kind of write has taken effect, before it hears of it."""
+"""The operator is killed after each kind of write, when the write has taken effect but before the operator gets the response."""
 
 from __future__ import annotations
 
@@ -76,26 +76,28 @@ class FaultPoints:
             thread.join(30)
 
     async def _forward(self, session: aiohttp.ClientSession, request: web.Request) -> web.StreamResponse:
-        kept = {name: value for name, value in request.headers.items() if name.lower() in {"accept", "content-type"}}
+        headers = {name: value for name, value in request.headers.items() if name.lower() in {"accept", "content-type"}}
         body = await request.read()
         timeout = aiohttp.ClientTimeout(total=None)
         url = f"{self._server}{request.raw_path}"
-        async with session.request(request.method, url, data=body or None, headers=kept, timeout=timeout) as answer:
+        async with session.request(
+            request.method, url, data=body or None, headers=headers, timeout=timeout
+        ) as upstream:
             step = _step(request)
-            if step is not None and step not in self.reached and answer.ok:
+            if step is not None and step not in self.reached and upstream.ok:
                 self.reached.append(step)
                 self._operator.kill()
                 return web.Response(status=503)
-            response = web.StreamResponse(status=answer.status)
-            response.content_type = answer.content_type
+            response = web.StreamResponse(status=upstream.status)
+            response.content_type = upstream.content_type
             await response.prepare(request)
-            async for chunk in answer.content.iter_any():
+            async for chunk in upstream.content.iter_any():
                 await response.write(chunk)
         return response
 
 
 def _step(request: web.Request) -> str | None:
-    """What kind of write a request is: its method, the kind, and its subresource; None for what is no step of the work."""
+    """Return method, kind and subresource of a write request, or None for requests that are not part of a reconciliation."""
     if request.method == "GET":
         return None
     parts = request.path.strip("/").split("/")

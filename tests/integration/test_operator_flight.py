@@ -62,7 +62,7 @@ def service(world: World, part: str, node: str, revision: str = "old") -> None:
 
 
 def refusal(attempt: Callable[[], object]) -> str:
-    """What the API server says against it; empty when it lets it pass."""
+    """Return the API server's reason for refusing a request, or an empty string if it accepts the request."""
     try:
         attempt()
     except KubeError as error:
@@ -85,7 +85,7 @@ def evict(world: World, pod: str) -> object:
 
 
 def attempts(world: World, drone: str) -> dict[str, Callable[[], object]]:
-    """What would take a service from a drone, or end it; none is carried out."""
+    """Return requests (dry runs) that would remove or end a service of a drone."""
     api = world.api
     pod = f"{PODS}/fractus-mobility-{drone}"
     node = f"/api/v1/nodes/{drone}"
@@ -116,7 +116,7 @@ def attempts(world: World, drone: str) -> dict[str, Callable[[], object]]:
 
 
 def together(world: World) -> dict[str, Callable[[], object]]:
-    """What would take services from all drones."""
+    """Return requests (dry runs) that would remove services of all drones."""
     api = world.api
     dry = "?dryRun=All"
     camera = f"{DAEMON_SETS}/fractus-camera{dry}"
@@ -141,8 +141,8 @@ def together(world: World) -> dict[str, Callable[[], object]]:
 
 def test_services_of_drone_in_flight_cannot_be_removed(guarded: World) -> None:
     for name, attempt in {**attempts(guarded, "drone-1"), **together(guarded)}.items():
-        said = refusal(attempt)
-        assert "drone-1 is in the air: wait until it has landed" in said, name
+        message = refusal(attempt)
+        assert "drone-1 is in the air: wait until it has landed" in message, name
     for name, attempt in attempts(guarded, "drone-2").items():
         if name != "delete all pods":
             assert not refusal(attempt), name
@@ -178,24 +178,24 @@ def test_services_of_drone_on_ground_can_be_removed(guarded: World) -> None:
 def test_stale_drone_counts_as_in_flight_until_annotated_as_grounded(guarded: World, tmp_path: Path) -> None:
     (line,) = (typed for typed in shell_lines("docs/upgrades.md") if "fractus.dev/grounded" in typed)
     path = f"{FRACTUS}/drones/drone-1"
-    seen = "2026-01-01T00:00:00Z"
-    status = {"flightState": "unknown", "lastFlightState": "landing", "lastSeen": seen}
+    last_seen = "2026-01-01T00:00:00Z"
+    status = {"flightState": "unknown", "lastFlightState": "landing", "lastSeen": last_seen}
     guarded.api.merge(f"{path}/status", {"status": status})
     attempt = attempts(guarded, "drone-1")["delete a pod"]
-    told = wait_for(lambda: "at its last report" in refusal(attempt) and refusal(attempt), "the silence to be known")
-    assert line in told
+    message = wait_for(lambda: "at its last report" in refusal(attempt) and refusal(attempt), "the silence to be known")
+    assert line in message
     guarded.api.merge(path, {"metadata": {"annotations": {"fractus.dev/grounded": "2025-12-31T00:00:00Z"}}})
     assert refusal(attempt), "the annotation refers to an earlier flight"
     Shell(tmp_path, guarded.plane).type(line)
     wait_for(lambda: not refusal(attempt), "the annotation to count")
     guarded.api.merge(f"{path}/status", {"status": {"lastSeen": "2026-01-01T00:00:05Z"}})
-    wait_for(lambda: refusal(attempt), "the drone to be heard of again")
+    wait_for(lambda: refusal(attempt), "the annotation to become void after a new report")
 
 
 def test_node_class_cannot_be_changed_through_status(guarded: World) -> None:
     change = {"metadata": {"labels": {"fractus.dev/class": None}}}
-    told = wait_for(lambda: refusal(lambda: guarded.api.merge(f"{NODE}/status?dryRun=All", change)), "the policy")
-    assert "kubectl label node" in told
+    message = wait_for(lambda: refusal(lambda: guarded.api.merge(f"{NODE}/status?dryRun=All", change)), "the policy")
+    assert "kubectl label node" in message
 
 
 @pytest.mark.parametrize("drone", ["drone-1", "drone-2"])
@@ -233,14 +233,14 @@ def test_services_of_drone_with_mission_cannot_be_removed(guarded: World) -> Non
     guarded.drone_status("drone-1", "inactive")
     attempt = attempts(guarded, "drone-1")["delete a pod"]
     wait_for(lambda: not refusal(attempt), "the landing to be known")
-    seen = "2026-01-01T00:00:00Z"
-    for said in ("True", "Unknown"):
-        mission = {"type": "OnMission", "status": said, "reason": "Granted", "lastTransitionTime": seen}
-        status = {"conditions": [mission], "lastSeen": seen}
+    last_seen = "2026-01-01T00:00:00Z"
+    for on_mission in ("True", "Unknown"):
+        mission = {"type": "OnMission", "status": on_mission, "reason": "Granted", "lastTransitionTime": last_seen}
+        status = {"conditions": [mission], "lastSeen": last_seen}
         guarded.api.merge(f"{FRACTUS}/drones/drone-1/status", {"status": status})
-        told = wait_for(lambda: refusal(attempt), "the mission to be known")
-        assert f"drone-1 has a mission and may have taken off since {seen}" in told
-    annotation = {"metadata": {"annotations": {"fractus.dev/grounded": seen}}}
+        message = wait_for(lambda: refusal(attempt), "the mission to be known")
+        assert f"drone-1 has a mission and may have taken off since {last_seen}" in message
+    annotation = {"metadata": {"annotations": {"fractus.dev/grounded": last_seen}}}
     guarded.api.merge(f"{FRACTUS}/drones/drone-1", annotation)
     wait_for(lambda: not refusal(attempt), "the annotation to count")
 
@@ -256,8 +256,8 @@ def test_services_of_drone_without_reports_can_be_replaced(guarded: World) -> No
 
 
 def condition(world: World, drone: str, type_: str) -> Body:
-    found = world.api.get(f"{FRACTUS}/drones/{drone}") or {}
-    return next((c for c in found.get("status", {}).get("conditions", ()) if c["type"] == type_), {})
+    body = world.api.get(f"{FRACTUS}/drones/{drone}") or {}
+    return next((c for c in body.get("status", {}).get("conditions", ()) if c["type"] == type_), {})
 
 
 @pytest.fixture
@@ -276,7 +276,7 @@ def permitted(control_plane: ControlPlane, guarded: World, tmp_path: Path) -> It
 
 
 def release(world: World, number: int, revision: str) -> None:
-    """What the controller of DaemonSets does with a new template: it keeps it, under the next number."""
+    """Create a ControllerRevision for a new template like the DaemonSet controller."""
     owner = world.api.get(f"{DAEMON_SETS}/fractus-mobility") or {}
     reference = {"apiVersion": "apps/v1", "kind": "DaemonSet", "name": "fractus-mobility", "controller": True}
     metadata = {
@@ -352,11 +352,11 @@ def test_operator_cannot_report_landing(control_plane: ControlPlane, guarded: Wo
 def test_operator_cannot_reset_time_of_last_report(control_plane: ControlPlane, guarded: World) -> None:
     """The grounded annotation refers to the last report before this flight and must not become valid again."""
     path = f"{FRACTUS}/drones/drone-1"
-    seen = "2026-01-01T00:00:00Z"
-    guarded.api.merge(path, {"metadata": {"annotations": {"fractus.dev/grounded": seen}}})
+    last_seen = "2026-01-01T00:00:00Z"
+    guarded.api.merge(path, {"metadata": {"annotations": {"fractus.dev/grounded": last_seen}}})
     guarded.api.merge(f"{path}/status", {"status": {"lastSeen": "2026-01-02T00:00:00Z"}})
     with control_plane.with_token(operator_token(guarded)) as client:
-        for time in (seen, None):
+        for time in (last_seen, None):
             assert "report time of a drone" in refusal(
                 lambda time=time: client.merge(f"{path}/status", {"status": {"lastSeen": time}})
             )
@@ -380,13 +380,13 @@ def test_on_mission_condition_follows_mission(guarded: World, permitted: Operato
 
 
 def test_grounded_annotation_allows_replacement_and_is_recorded(guarded: World, permitted: OperatorProcess) -> None:
-    seen = "2026-01-01T00:00:00Z"
+    last_seen = "2026-01-01T00:00:00Z"
     path = f"{FRACTUS}/drones/drone-1"
     release(guarded, 1, "old")
     release(guarded, 2, "new")
-    guarded.api.merge(f"{path}/status", {"status": {"lastSeen": seen}})
+    guarded.api.merge(f"{path}/status", {"status": {"lastSeen": last_seen}})
     wait_for(lambda: condition(guarded, "drone-1", "ServicesCurrent").get("reason") == "InTheAir", permitted.log)
-    guarded.api.merge(path, {"metadata": {"annotations": {"fractus.dev/grounded": seen}}})
+    guarded.api.merge(path, {"metadata": {"annotations": {"fractus.dev/grounded": last_seen}}})
     wait_for(lambda: condition(guarded, "drone-1", "ServicesCurrent").get("reason") != "InTheAir", permitted.log)
 
     def recorded() -> bool:

@@ -15,9 +15,9 @@ Body = dict[str, Any]
 
 
 def targets(world: World, namespace: str, name: str = "traffic") -> dict[str, Any]:
-    """The address of the pod behind each link, None while there is none, by node."""
-    found = world.links(namespace, name).items()
-    return {node: (body["spec"]["services"][0].get("target") or {}).get("address") for node, body in found}
+    """Return the address of the pod behind each link by node, or None if it has no pod."""
+    links = world.links(namespace, name).items()
+    return {node: (body["spec"]["services"][0].get("target") or {}).get("address") for node, body in links}
 
 
 def checkers(world: World, namespace: str) -> dict[str, Body]:
@@ -32,12 +32,12 @@ def addresses(world: World, namespace: str) -> dict[str, Any]:
 
 def test_direct_links_target_pods_usable_by_drone(world: World, operator: OperatorProcess, namespace: str) -> None:
     running(world, namespace)
-    found = world.links(namespace)
-    assert found, "no links"
+    links = world.links(namespace)
+    assert links, "no links"
     assert targets(world, namespace) == addresses(world, namespace)
     service = world.api.get(f"/api/v1/namespaces/{namespace}/services/traffic-image-checker")
     assert service is not None
-    for node, body in found.items():
+    for node, body in links.items():
         spec = body["spec"]
         assert (spec["drone"], spec["range"], spec["pairing"]["networkId"]) == ("drone-1", 80, node)
         assert spec["services"][0]["virtual"] == {
@@ -63,7 +63,7 @@ def restarted(world: World, namespace: str, pod: Body, ip: str) -> None:
 
 
 def base_addresses(world: World, namespace: str) -> list[str]:
-    """Where the cloud path of the hybrid component leads."""
+    """Return the addresses to which the cloud path of the hybrid component leads."""
     path = f"/apis/discovery.k8s.io/v1/namespaces/{namespace}/endpointslices/traffic-image-checker"
     return [a for endpoint in (world.api.get(path) or {}).get("endpoints") or () for a in endpoint["addresses"]]
 
@@ -117,8 +117,8 @@ def test_direct_link_transitions_have_events(world: World, operator: OperatorPro
     path = f"{FRACTUS}/directlinks/{next(iter(world.links(namespace).values()))['metadata']['name']}"
     direct = {"phase": "Up", "traffic": "direct", "switches": 1, "message": "it is faster"}
     world.api.merge(f"{path}/status", {"status": direct})
-    told = wait_for(lambda: "TrafficDirect" in events(world, namespace) and events(world, namespace), "an Event")
-    assert told.count("LinkUp") == told.count("TrafficDirect") == 1
+    reasons = wait_for(lambda: "TrafficDirect" in events(world, namespace) and events(world, namespace), "an Event")
+    assert reasons.count("LinkUp") == reasons.count("TrafficDirect") == 1
     world.api.merge(f"{path}/status", {"status": {"switches": 2, "traffic": "cloud"}})
     wait_for(lambda: "TrafficCloud" in events(world, namespace), "an Event")
     assert events(world, namespace).count("LinkUp") == 1

@@ -66,15 +66,15 @@ class Node:
     def expect(self, begins: str) -> str:
         """The next event that begins like this."""
         deadline = time.monotonic() + TIMEOUT_S
-        seen = []
-        while (left := deadline - time.monotonic()) > 0:
+        lines = []
+        while (remaining_s := deadline - time.monotonic()) > 0:
             try:
-                seen.append(self._events.get(timeout=left))
+                lines.append(self._events.get(timeout=remaining_s))
             except queue.Empty:
                 break
-            if seen[-1].startswith(begins):
-                return seen[-1]
-        raise AssertionError(f"{self.name}: no {begins!r} in {seen}")
+            if lines[-1].startswith(begins):
+                return lines[-1]
+        raise AssertionError(f"{self.name}: no {begins!r} in {lines}")
 
     def tell(self, command: str) -> None:
         assert self._process.stdin is not None
@@ -139,9 +139,9 @@ class Air:
 
 @pytest.fixture
 def air(tmp_path: Path) -> Iterator[Air]:
-    found = Air(tmp_path)
-    yield found
-    found.close()
+    air = Air(tmp_path)
+    yield air
+    air.close()
 
 
 def test_two_nodes_discover_each_other_pair_and_disconnect(air: Air) -> None:
@@ -270,7 +270,7 @@ def test_beacons_contain_a_valid_node_name_only() -> None:
 
 
 def test_link_addresses_are_derived_from_names_and_avoid_reserved_ranges() -> None:
-    found = {link_address(f"node-{n}") for n in range(2000)}
-    assert len(found) > 1900
-    assert all(str(address).startswith("169.254.") for address in found)
-    assert not [a for a in found if a.packed[2] in {0, 255}]
+    addresses = {link_address(f"node-{n}") for n in range(2000)}
+    assert len(addresses) > 1900
+    assert all(str(address).startswith("169.254.") for address in addresses)
+    assert not [a for a in addresses if a.packed[2] in {0, 255}]

@@ -22,7 +22,7 @@ def namespace(world: World) -> Iterator[str]:
 
 
 def rendered(chart: str, control_plane: ControlPlane, *more: str) -> subprocess.CompletedProcess[str]:
-    """As `helm install` renders it first, which stops there when this fails."""
+    """Render a chart like `helm install`, which stops if rendering fails."""
     argv = [helm(), "template", chart, str(CHARTS / chart), "-n", SYSTEM, "--kubeconfig", str(control_plane.kubeconfig)]
     argv += [KUBERNETES, *CHART[chart], *more]
     return subprocess.run(argv, capture_output=True, text=True, timeout=60, check=False)
@@ -35,11 +35,13 @@ def test_chart_is_refused_in_namespace_with_restrictive_pod_security(
     for level in ("baseline", "restricted"):
         world.api.merge(namespace, {"metadata": {"labels": {ENFORCE: level}}})
         for verb in ((), ("--is-upgrade",)):
-            done = rendered(chart, control_plane, "--dry-run=server", *verb)
-            assert done.returncode != 0
-            assert f"the namespace {SYSTEM} enforces Pod Security {level}" in done.stderr
-            assert f"kubectl label namespace {SYSTEM} {ENFORCE}=privileged --overwrite" in done.stderr
-        assert rendered(chart, control_plane).returncode == 0, "without a cluster nothing is known of it"
+            result = rendered(chart, control_plane, "--dry-run=server", *verb)
+            assert result.returncode != 0
+            assert f"the namespace {SYSTEM} enforces Pod Security {level}" in result.stderr
+            assert f"kubectl label namespace {SYSTEM} {ENFORCE}=privileged --overwrite" in result.stderr
+        assert rendered(chart, control_plane).returncode == 0, (
+            "the chart is refused although helm cannot look up the namespace"
+        )
 
 
 @pytest.mark.parametrize("chart", CHART)
@@ -48,5 +50,5 @@ def test_chart_is_accepted_in_namespace_with_privileged_pod_security(
 ) -> None:
     for level in ("privileged", None):
         world.api.merge(namespace, {"metadata": {"labels": {ENFORCE: level}}})
-        done = rendered(chart, control_plane, "--dry-run=server")
-        assert done.returncode == 0, done.stderr
+        result = rendered(chart, control_plane, "--dry-run=server")
+        assert result.returncode == 0, result.stderr

@@ -26,9 +26,9 @@ PORT = 7777
 
 
 def _udp() -> socket.socket:
-    found = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    found.settimeout(1.0)
-    return found
+    udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    udp.settimeout(1.0)
+    return udp
 
 
 class Air:
@@ -70,7 +70,7 @@ class Air:
 
     def ping(self, network: str, count: int = 3) -> list[float]:
         """Round-trip times in ms of the datagrams that come back."""
-        found = []
+        round_trips_ms = []
         for number in range(count):
             begun = time.monotonic()
             self._asking.sendto(b"%d" % number, (f"{network}.2", PORT))
@@ -79,8 +79,8 @@ class Air:
                     pass
             except TimeoutError:
                 continue
-            found.append((time.monotonic() - begun) * 1e3)
-        return found
+            round_trips_ms.append((time.monotonic() - begun) * 1e3)
+        return round_trips_ms
 
     def _echo(self) -> None:
         while not self._over.is_set():
@@ -103,9 +103,9 @@ class Air:
 
 @pytest.fixture
 def air(tmp_path: Path) -> Iterator[Air]:
-    found = Air(tmp_path)
-    yield found
-    found.close()
+    air = Air(tmp_path)
+    yield air
+    air.close()
 
 
 def test_simulated_radio_connects_nodes_within_range(air: Air) -> None:
@@ -127,14 +127,14 @@ def test_simulated_radio_faults_start_and_end(air: Air, fault: dict[str, object]
 
 
 def test_simulated_uplink_has_delay(air: Air) -> None:
-    found = air.ping("10.78.0", 5)
-    assert min(found) >= 120.0
+    round_trips_ms = air.ping("10.78.0", 5)
+    assert min(round_trips_ms) >= 120.0
     air.command(uplink="a", off=True)
     assert not air.ping("10.78.0", 1)
 
 
 def test_simulated_radio_refuses_bad_command_without_effect(air: Air) -> None:
-    for command, what in (
+    for command, message in (
         ({"station": "c"}, "unknown station c"),
         ({"station": "a", "speed": 3}, "unknown attribute speed"),
         ({"station": "a", "off": 1}, "wrong type"),
@@ -146,6 +146,6 @@ def test_simulated_radio_refuses_bad_command_without_effect(air: Air) -> None:
         ({"uplink": "a", "rate_bps": float("inf")}, "finite"),
         ({}, "must name a station"),
     ):
-        with pytest.raises(BadCommand, match=what):
+        with pytest.raises(BadCommand, match=message):
             air.radio.command(command)
     assert air.ping("10.77.0", 1)

@@ -199,8 +199,8 @@ def test_navigator_flies_path_with_corrections_and_refusals(stage: Stage) -> Non
     stage.start_navigator()
     stage.wait("landing", lambda: stage.is_logged("landed"))
 
-    made = [call for call in calls(stage) if call[0] in {"SetSpeed", "Goto", "Takeoff"}]
-    assert made == [
+    judged = [call for call in calls(stage) if call[0] in {"SetSpeed", "Goto", "Takeoff"}]
+    assert judged == [
         ("Takeoff", "allow", ""),
         ("SetSpeed", "correct", "SpeedAboveLimit"),
         ("Goto", "allow", ""),

@@ -1,4 +1,4 @@
-"""Unix time of a machine whose clock may be stepped, and steady time that no step affects."""
+"""Unix time that tolerates steps of the system clock, and steady time that steps do not affect."""
 
 from __future__ import annotations
 

@@ -131,7 +131,7 @@ class GrantFiles:
 
     def _read_changes(self) -> bool:
         """Read the files that changed. Return True if there are any."""
-        # The thread of a cancelled scan may still be reading.
+        # A cancelled scan may still be reading in its thread.
         with self._reading:
             return self._read_changes_locked()
 

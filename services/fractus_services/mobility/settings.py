@@ -86,7 +86,7 @@ class MobilitySettings:
     """Seconds without need for the fence after which it is removed, so that a repeated arming attempt still finds it."""
 
     verify_min_retry_s: float = 0.5
-    """Shortest time between two checks whether the failsafes have to be verified."""
+    """Shortest time between two checks of the failsafes."""
 
     verify_max_retry_s: float = 30.0
     """Longest time between two verifications on the ground, after repeated failures."""
@@ -126,7 +126,7 @@ class MobilitySettings:
 """
 
     max_judgements: int = 6
-    """Number of judgements after which a call is given up, because a drone that does not come to rest cannot begin its leg."""
+    """Maximum number of judgements of one call. A drone that does not come to rest cannot begin its leg."""
 
     reached_m: float = 1.0
     """Default distance to the target within which a leg is complete."""
@@ -184,7 +184,7 @@ class MobilitySettings:
 """
 
     min_hold_s: float = 1e-3
-    """Remaining hold time below which a velocity setpoint has expired. The event loop does not sleep for less."""
+    """Remaining hold time below which a velocity setpoint has expired. The event loop cannot sleep for a shorter time."""
 
     # System flights
 

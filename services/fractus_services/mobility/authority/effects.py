@@ -110,7 +110,7 @@ class Motion:
         self._refusal = self._refusal or refusal
 
     def check(self) -> None:
-        """Return if the motion may continue.
+        """Check that the motion may continue.
 
         Raises:
             Refused: The motion was stopped.

@@ -1,4 +1,4 @@
-"""Reaction to the autopilot's link, heartbeats and parameters: failsafes are set, verified and kept in flight."""
+"""Reaction to connections, heartbeats and parameters of the autopilot: set the failsafes, and verify them in flight."""
 
 from __future__ import annotations
 

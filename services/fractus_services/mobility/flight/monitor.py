@@ -45,7 +45,7 @@ class MotionMonitor:
         gate: Policy engine.
         audit: Audit log for alarms and for the flight recorder.
         supervisor: Supervision that runs in the same loop.
-        return_flight: Return flights, whose last resort must not be interrupted.
+        return_flight: Return flights. A return for which no legal route was found is not interrupted.
     """
 
     def __init__(

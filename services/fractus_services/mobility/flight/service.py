@@ -227,9 +227,9 @@ class MobilityService:
     async def _settle(
         self, call: Call, grant: ActiveGrant, verdict: Verdict, motion: Motion, permit: Permit
     ) -> Verdict:
-        """Bring the drone into GUIDED, and to rest if the verdict requires it. Return the verdict to carry out.
+        """Change to GUIDED, and bring the drone to rest if the verdict requires it. Return the verdict to carry out.
 
-        The drone moves during the mode change and while it brakes, so the call is judged again after them.
+        The drone moves during the mode change and while it brakes, so the call is judged again afterwards.
 
         Raises:
             Refused: The call is not legal from the new position, or the drone does not come to rest.

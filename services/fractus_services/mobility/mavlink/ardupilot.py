@@ -269,7 +269,7 @@ class ArduCopter:
 
 
 def _leant_mps2(reader: ParameterReader) -> float:
-    """Return the horizontal acceleration that the vehicle reaches within its lean angle in any permitted wind."""
+    """Return the horizontal acceleration that the vehicle reaches within its lean angle, with a reserve for wind."""
     lean_deg = reader.read(_OWN_LEAN, 0.0, needed=False)
     if lean_deg <= 0.0:
         lean_deg = reader.read(_LEAN, _MAX_LEAN_DEG, needed=False)

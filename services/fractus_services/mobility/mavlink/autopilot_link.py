@@ -228,7 +228,7 @@ class AutopilotLink:
         """Discard the state that belongs to the broken connection."""
 
     def send(self, outgoing: Message) -> None:
-        """Send a message. Without a connection it is dropped."""
+        """Send a message. It is dropped if there is no connection."""
         if self._transport is not None:
             frame = self._endpoint.encode(outgoing.name, outgoing.values)
             self._transport.write(frame)

@@ -150,7 +150,7 @@ class MissionFence:
     async def raise_around(self, spec: GrantSpec, *, retraces: bool) -> None:
         """Load the outer bounds of a grant, enable the fence, and verify everything by reading it back.
 
-        An autopilot without fence support stays as it is, see `missing`.
+        If the autopilot does not support fences, nothing is changed, and `missing` contains the reason.
 
         Args:
             spec: Specification of the Grant.

@@ -140,7 +140,7 @@ class Acknowledgements:
         # The acknowledgement of an abandoned command measures the link as well.
         self._timing.take_acknowledgement(sent_at, now)
         if result == mavlink.MAV_RESULT_IN_PROGRESS:
-            transmissions.appendleft((now, answer))  # the final acknowledgement follows
+            transmissions.appendleft((now, answer))  # The final acknowledgement follows.
         elif answer.done():
             log.debug("commands: acknowledgement of an earlier transmission (command=%d, result=%d)", command, result)
         else:
@@ -428,7 +428,7 @@ class MavlinkAutopilot(AutopilotLink):
             try:
                 await self.command(mavlink.MAV_CMD_NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, altitude_m, permit=permit, attempts=1)
             except AutopilotError as error:
-                # A refusal may mean that only the acknowledgement was lost: a vehicle that is taking off refuses a second takeoff command.
+                # The acknowledgement of the previous attempt may be lost: a vehicle that is taking off refuses a second takeoff.
                 if attempt and not error.link and await self._starts_to_fly():
                     return
                 if not error.link or attempt + 1 == COMMAND_ATTEMPTS:

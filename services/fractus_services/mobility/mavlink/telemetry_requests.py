@@ -26,7 +26,7 @@ RATES_HZ = {
     "GPS_RAW_INT": (1.0, 2.0),
     "HOME_POSITION": (0.2, 1.0),
     "WIND": (0.2, 1.0),
-    # Last, because many vehicles have no gimbal, and the messages that flight needs must not wait for a refusal.
+    # This message is requested last, because many vehicles have no gimbal, and the other messages must not wait for a refusal.
     "GIMBAL_DEVICE_ATTITUDE_STATUS": (2.0, 10.0),
 }
 """Requested messages with their rates on the ground and in the air."""

@@ -159,7 +159,7 @@ class VehicleSelector:
         """Process a message of any sender.
 
         Returns:
-            Reason why the drone's own vehicle is not certain; empty if it is alone on the link.
+            Reason why it is uncertain which vehicle is the drone's own; empty if one vehicle is alone on the link.
         """
         if is_vehicle_heartbeat(message):
             self._note((message.sysid, message.compid), now)

@@ -94,8 +94,8 @@ class PolicyGate:
             if max(abs(north), abs(east), abs(down)) < LEG_MPS / 2:
                 pending.append((north, east, down))
             else:
-                share = max_mps / LEG_MPS
-                pending.append((north * share, east * share, min(max(down, -max_mps), max_mps)))
+                vertical_mps = min(max(down, -max_mps), max_mps)
+                pending.append((north * max_mps / LEG_MPS, east * max_mps / LEG_MPS, vertical_mps))
         return replace(
             unlocated,
             lat=vehicle.lat,

@@ -114,7 +114,7 @@ class Arming:
         self._control.dispatch(MotorStart(begins=True))
         unanswered = False
         try:
-            await self._control.modes.enter_guided(permit)
+            await self._control.modes.change_mode(autopilot.stack.guided, permit)
             try:
                 unanswered = True
                 await autopilot.arm(permit)

@@ -66,14 +66,6 @@ class ModeController:
         finally:
             self._control.dispatch(ModeChangeEnded(mode, before, done, refused))
 
-    async def enter_guided(self, permit: Permit = always) -> None:
-        """Change to the mode in which the autopilot follows the companion.
-
-        Raises:
-            AutopilotError: The autopilot did not change the mode.
-        """
-        await self.change_mode(self._autopilot.stack.guided, permit)
-
     async def hold(self, permit: Permit = always) -> None:
         """Brake and hover.
 
@@ -82,7 +74,7 @@ class ModeController:
         """
         permit()
         self._autopilot.stop()
-        await self.enter_guided(permit)
+        await self.change_mode(self._autopilot.stack.guided, permit)
         self._autopilot.stop()
 
     async def settle(self) -> None:

@@ -148,7 +148,7 @@ class ReturnFlight:
 
         flight = SystemFlight(constraints, "Homeward", lambda motion: _both(permit, motion))
         try:
-            await control.modes.enter_guided(permit)
+            await control.modes.change_mode(control.autopilot.stack.guided, permit)
             async for _ in self._routes.follow(flight, lambda: self._next_leg(flight)):
                 pass
         except Refused as refusal:

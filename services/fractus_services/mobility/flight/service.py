@@ -152,7 +152,7 @@ class MobilityService:
             permit = self._control.driver_permit(grant, motion)
             final = verdict
             vehicle = self._autopilot.vehicle
-            await self._control.modes.enter_guided(permit)
+            await self._control.modes.change_mode(self._autopilot.stack.guided, permit)
             climbs: Callable[[Autopilot, Motion, float, Permit], AsyncGenerator[Step, None]] = climb
             if vehicle.in_air and not vehicle.reports_on_ground:
                 await come_to_rest(self._autopilot, motion, permit)
@@ -236,7 +236,7 @@ class MobilityService:
         """
         for _ in range(SETTINGS.max_judgements):
             begun = self._autopilot.now
-            await self._control.modes.enter_guided(permit)
+            await self._control.modes.change_mode(self._autopilot.stack.guided, permit)
             if verdict.brake_first:
                 await come_to_rest(self._autopilot, motion, permit)
             elif self._autopilot.now - begun <= SETTINGS.rejudge_after_s / self._autopilot.pace:
@@ -309,7 +309,7 @@ class MobilityService:
         """Try once to fly home and land."""
         permit = flight.permit(motion)
         modes = self._control.modes
-        await modes.enter_guided(permit)
+        await modes.change_mode(self._autopilot.stack.guided, permit)
         async with aclosing(self._return_flight.attempt(flight, motion)) as steps:
             async for step in steps:
                 yield Progress(verdict, step)

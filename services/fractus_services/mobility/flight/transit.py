@@ -112,13 +112,13 @@ class TransitFlight:
                             yield f"the system arms the drone: {reason}"
                 allowed = self._allow(Call("Takeoff", TakeoffArgs(self._altitude_m(target, flight))), flight)
                 yield "the system takes off"
-                await control.modes.enter_guided(permit)
+                await control.modes.change_mode(autopilot.stack.guided, permit)
                 altitude_m = (
                     allowed.altitude_m if isinstance(allowed, TakeoffArgs) else SETTINGS.default_takeoff_altitude_m
                 )
                 async for _ in climb(autopilot, motion, altitude_m, permit):
                     pass
-            await control.modes.enter_guided(permit)
+            await control.modes.change_mode(autopilot.stack.guided, permit)
         finally:
             control.finish_motion(motion)
 

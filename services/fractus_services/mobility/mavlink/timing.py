@@ -247,21 +247,16 @@ class Timing:
         if now - self._measured_at > STALE_S or self.delay_s > MAX_DELAY_S:
             return math.inf
         age_s = self._present(now) - self._sampled
+        # When the link becomes slow, the first slow answer arrives late. Until then, the delay is longer by the time by which the
+        # oldest unanswered request exceeds the slowest recent answer.
+        overdue_s = 0.0
+        # After `STALE_S` without an answer, acknowledgements measure this link. Before that, the answers may only have become slow.
+        if not self.unanswering or now - self._latest_answered_sent <= STALE_S:
+            later_requests = (sent for sent, _ in self._open_requests.values() if sent > self._latest_answered_sent)
+            overdue_s = max(now - min(later_requests, default=now) - self.answer_s, 0.0)
         # An unanswered request alone does not make the link too slow to fly, because it may be lost and the next one answered.
-        delay_s = min(self.delay_s + self.pace * self._overdue_s(now), MAX_DELAY_S)
+        delay_s = min(self.delay_s + self.pace * overdue_s, MAX_DELAY_S)
         return age_s + delay_s + REACTION_S if age_s <= MAX_POSITION_AGE_S else math.inf
-
-    def _overdue_s(self, now: float) -> float:
-        """Return by how much the oldest unanswered request exceeds the slowest recent answer, in seconds.
-
-        When the link becomes slow, the first slow answer arrives late. Until then, the delay of the link is at least this much longer.
-        """
-        if self.unanswering and now - self._latest_answered_sent > STALE_S:
-            return 0.0  # Acknowledgements measure this link. Before `STALE_S`, the answers may only have become slow.
-        waiting = min(
-            (sent for sent, _ in self._open_requests.values() if sent > self._latest_answered_sent), default=now
-        )
-        return max(now - waiting - self.answer_s, 0.0)
 
     def problem(self, now: float) -> str:
         """Return why this link forbids arming; empty if it does not."""

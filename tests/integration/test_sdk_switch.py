@@ -36,7 +36,7 @@ CLIENT = """
 import asyncio, json, sys
 import fractus
 address, count, pause_s, size = sys.argv[1], int(sys.argv[2]), float(sys.argv[3]), int(sys.argv[4])
-async def request():
+async def send_requests():
     loop = asyncio.get_running_loop()
     async with fractus.Requester(address, attempt_timeout_s=2.0) as checker:
         print("ready", flush=True)
@@ -45,7 +45,7 @@ async def request():
             server = await checker.request("check", bytes(size), request_id=str(number))
             print(json.dumps({"number": number, "server": server.decode(), "at": loop.time()}), flush=True)
             await asyncio.sleep(max(pause_s - (loop.time() - begun), 0))
-asyncio.run(ask())
+asyncio.run(send_requests())
 """
 
 

@@ -31,10 +31,10 @@ class _Stop:
     """Signal handler that records a stop request."""
 
     def __init__(self) -> None:
-        self.wanted = False
+        self.requested = False
 
     def __call__(self, *_: object) -> None:
-        self.wanted = True
+        self.requested = True
 
 
 def run(simulation: Simulation, hub: Hub, speedup: float, stop: _Stop, until_s: float | None = None) -> None:
@@ -48,7 +48,7 @@ def run(simulation: Simulation, hub: Hub, speedup: float, stop: _Stop, until_s: 
     time_0 = simulation.time_s
     woken = False
     nap = 1
-    while not stop.wanted and (until_s is None or simulation.time_s < until_s):
+    while not stop.requested and (until_s is None or simulation.time_s < until_s):
         if speedup > 0.0:
             behind = time_0 + (time.monotonic() - wall_0) * speedup - simulation.time_s
             steps = min(int(behind / CONTROL_STEP_S + 1e-6), MAX_BATCH)
@@ -253,7 +253,7 @@ def vehicle(
         for number, where in opened:
             click.echo(f"vehicle {number} ready for connections on {where}", err=True)
         if lockstep_server is not None:
-            run_lockstep(simulation, hub, lockstep_server, lambda: stop.wanted)
+            run_lockstep(simulation, hub, lockstep_server, lambda: stop.requested)
         else:
             run(simulation, hub, speedup, stop, duration)
 

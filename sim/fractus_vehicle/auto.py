@@ -22,7 +22,7 @@ CURVES = frozenset({mavlink.MAV_CMD_NAV_WAYPOINT, mavlink.MAV_CMD_NAV_SPLINE_WAY
 
 
 class AutoFlight(Flight):
-    """AUTO mode: run NAV commands in order, and DO commands as soon as they are reached."""
+    """AUTO mode: run NAV commands in order, and the DO commands between them as soon as they are reached."""
 
     def __init__(self, set_mode: Callable[[int], bool]) -> None:
         self._set_mode = set_mode
@@ -48,7 +48,7 @@ class AutoFlight(Flight):
 
     def begin(self, v: VehicleState) -> None:
         """Hold position. The mission starts in the first step with running motors."""
-        v.control.hold_here()
+        v.control.hold_position()
         v.heading.follow_course()
 
     def _start(self, v: VehicleState) -> None:
@@ -84,7 +84,7 @@ class AutoFlight(Flight):
     def pause(self, v: VehicleState, *, paused: bool) -> None:
         """Handle DO_PAUSE_CONTINUE: hold the current position, or restart the current item."""
         if paused and not self.paused:
-            v.control.hold_here()
+            v.control.hold_position()
         elif not paused and self.paused and self._item is not None:
             self._begin_item(v, self._index, self._item)
         self.paused = paused
@@ -121,7 +121,7 @@ class AutoFlight(Flight):
         if v.landed:
             v.disarm()
         else:
-            v.control.hold_here()
+            v.control.hold_position()
 
     def _begin_item(self, v: VehicleState, index: int, item: Item) -> None:
         self._item = item
@@ -221,7 +221,7 @@ class AutoFlight(Flight):
             self._finish_if_down(v)
 
     def _finish_if_down(self, v: VehicleState) -> None:
-        """Complete the item when a landing or return has stopped the motors. The next item waits for the next start."""
+        """Complete the item when a landing or return has stopped the motors. The next item begins after the next start."""
         if v.armed:
             return
         self._item = None

@@ -28,7 +28,7 @@ Point = tuple[float, float, float]
 
 @dataclass(frozen=True, slots=True)
 class Loop:
-    """A loop that one point can replace: `joint` replaces path[start] to path[end]."""
+    """A loop in the path. The point `joint` can replace path[start] to path[end]."""
 
     start: int
     end: int

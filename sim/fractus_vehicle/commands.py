@@ -27,7 +27,7 @@ from fractus_vehicle.copter import (
 )
 from fractus_vehicle.earth import ALTITUDE_MAX_M, valid_coordinates
 from fractus_vehicle.guided import GuidedFlight
-from fractus_vehicle.home import set_home_at, set_home_here
+from fractus_vehicle.home import set_home_at, set_home_to_position
 from fractus_vehicle.mission_commands import item_target, switch_fence
 from fractus_vehicle.mission_items import Item
 from fractus_vehicle.mission_orders import (
@@ -112,7 +112,12 @@ def _set_mode(vehicle: Vehicle, o: Command, _c: Channel) -> int:
 
 def _change_speed(vehicle: Vehicle, o: Command, _c: Channel) -> int:
     v = vehicle.state
-    kind = 3 if o.params[0] > 2.9 else 2 if o.params[0] > 1.9 else 0  # thresholds of ArduPilot's comparison
+    # ArduPilot compares with these thresholds.
+    kind = 0
+    if o.params[0] > 2.9:
+        kind = 3
+    elif o.params[0] > 1.9:
+        kind = 2
     takes = v.mode in SPEED_MODES and v.control.limits.change_speed(kind, o.params[1])
     return mavlink.MAV_RESULT_ACCEPTED if takes else mavlink.MAV_RESULT_FAILED
 
@@ -181,7 +186,7 @@ def _roi(vehicle: Vehicle, o: Command, _c: Channel) -> int:
 def _set_home(vehicle: Vehicle, o: Command, _c: Channel) -> int:
     v = vehicle.state
     if o.params[0] == 1.0 or not o.has_place:
-        return mavlink.MAV_RESULT_ACCEPTED if set_home_here(v) else mavlink.MAV_RESULT_FAILED
+        return mavlink.MAV_RESULT_ACCEPTED if set_home_to_position(v) else mavlink.MAV_RESULT_FAILED
     if o.params[0] != 0.0:
         return mavlink.MAV_RESULT_FAILED
     if not _has_valid_position(v, o):

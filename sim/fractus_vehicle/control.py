@@ -155,7 +155,7 @@ class Control:
         self.attitude = (0.0, 0.0)
         self._integral = [0.0, 0.0, 0.0]
 
-    def hold_here(self) -> None:
+    def hold_position(self) -> None:
         """Stop as soon as the limits allow, then hold position and altitude."""
         self.stop()
         vd = self.vel[2]
@@ -308,9 +308,9 @@ class Control:
             self.yaw_setpoint + clamp(wrap_pi(self.target_yaw - self.yaw_setpoint), -step, step)
         )
 
-    def _thrust_and_lean(self, wanted: tuple[float, float, float], est: Estimate, full: float) -> float:
+    def _thrust_and_lean(self, acceleration: tuple[float, float, float], est: Estimate, full: float) -> float:
         """Convert a demanded acceleration to a lean angle (set in `self.lean`) and a collective thrust in newtons."""
-        an, ae, ad = wanted
+        an, ae, ad = acceleration
         yaw = self.yaw_setpoint
         vertical = clamp(GRAVITY - ad, 0.2 * GRAVITY, 3.0 * GRAVITY)
         if self.horizontal is Axis.ATTITUDE:

@@ -129,10 +129,13 @@ class Failsafes:
             self._take_over(v, "GCS", GCS_ACTIONS.get(setting, Action.RTL))
 
     def _check_radio(self, v: VehicleState) -> None:
-        """Check the simulated receiver: SIM_RC_FAIL silences it, overrides of a ground station replace it."""
+        """Check the simulated receiver. SIM_RC_FAIL makes it silent unless a ground station overrides its channels."""
         setting = int(v.params["FS_THR_ENABLE"])
         silent = int(v.params["SIM_RC_FAIL"]) != 0 and not v.receiver.overridden
-        self._radio_lost_s = (v.time_s if self._radio_lost_s is None else self._radio_lost_s) if silent else None
+        if not silent:
+            self._radio_lost_s = None
+        elif self._radio_lost_s is None:
+            self._radio_lost_s = v.time_s
         lost = self._radio_lost_s is not None and v.time_s - self._radio_lost_s >= v.params["RC_FS_TIMEOUT"]
         lost = lost and setting != 0
         if lost == v.failsafes.radio:
@@ -151,7 +154,7 @@ class Failsafes:
             self._take_over(v, "Radio", RADIO_ACTIONS.get(setting, Action.LAND))
 
     def _take_over(self, v: VehicleState, cause: str, action: Action) -> None:
-        """Announce a failsafe and execute_action, unless the vehicle is disarmed, on the ground or landing."""
+        """Announce a failsafe, and execute its action unless the vehicle is disarmed, on the ground or landing."""
         options = Option(int(v.params["FS_OPTIONS"]) & 31)
         if not v.armed:
             self._announce(v, cause)

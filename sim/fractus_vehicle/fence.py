@@ -43,7 +43,7 @@ def _ahead_m(position: Vertex, course: Vertex, a: Vertex, b: Vertex) -> float | 
 
 
 class FenceShapeError(ValueError):
-    """Fence items that do not form valid shapes."""
+    """The fence items do not form valid shapes."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -40,7 +40,7 @@ class GuidedFlight(Flight):
     def begin(self, v: VehicleState) -> None:
         """Stop and wait for a target."""
         self.task = Task.IDLE
-        v.control.hold_here()
+        v.control.hold_position()
         v.heading.follow_course()
 
     def use(self, v: VehicleState, controller: Task) -> None:
@@ -130,7 +130,7 @@ class GuidedFlight(Flight):
         """Stop and hold."""
         self.task = Task.POSITION
         self._commanded_velocity = None
-        v.control.hold_here()
+        v.control.hold_position()
 
     def pause(self, v: VehicleState, *, paused: bool) -> None:
         """Handle DO_PAUSE_CONTINUE: hold the current position, or continue to the last target."""
@@ -170,7 +170,7 @@ class GuidedWithoutGps(GuidedFlight):
 
     def begin(self, v: VehicleState) -> None:
         """Level out."""
-        v.control.hold_here()
+        v.control.hold_position()
         self.lean(v, 0.0, 0.0, None, 0.0)
 
     def go_to(self, _v: VehicleState, _north: float, _east: float, _down: float) -> None:

@@ -18,7 +18,7 @@ def set_home(v: VehicleState, place: Place) -> None:
     send_on_all(v, "HOME_POSITION")
 
 
-def set_home_here(v: VehicleState) -> bool:
+def set_home_to_position(v: VehicleState) -> bool:
     """Set home to the current position and keep it on arming. Return False if the position is unknown."""
     if not v.position_ok:
         return False

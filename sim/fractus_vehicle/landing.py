@@ -19,7 +19,7 @@ class Hold(Flight):
 
     def begin(self, v: VehicleState) -> None:
         """Stop and hold."""
-        v.control.hold_here()
+        v.control.hold_position()
 
 
 class Brake(Flight):
@@ -27,7 +27,7 @@ class Brake(Flight):
 
     def begin(self, v: VehicleState) -> None:
         """Stop hard and hold."""
-        v.control.hold_here()
+        v.control.hold_position()
         v.control.stop(BRAKE_MPS2)
 
 

@@ -24,7 +24,7 @@ class LockstepServer:
         self._hub = hub
         self._driver: socket.socket | None = None
         self._input = b""
-        self._wanted = 0
+        self._requested_steps = 0
         self._listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
         self._listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
@@ -39,9 +39,9 @@ class LockstepServer:
 
     def take(self) -> int:
         """Return the number of steps requested since the last call."""
-        wanted = self._wanted
-        self._wanted = 0
-        return wanted
+        steps = self._requested_steps
+        self._requested_steps = 0
+        return steps
 
     def answer(self, ticks: int) -> None:
         """Report the number of completed steps to the driver."""
@@ -78,7 +78,7 @@ class LockstepServer:
             if not line.strip().isdigit() or len(line) > 8:
                 self._drop()
                 return
-            self._wanted = min(self._wanted + int(line), MAX_STEPS)
+            self._requested_steps = min(self._requested_steps + int(line), MAX_STEPS)
         if len(self._input) > 16:
             self._drop()
 

@@ -97,7 +97,7 @@ class AltHold(Flight):
 
     def begin(self, v: VehicleState) -> None:
         """Hold the altitude."""
-        v.control.hold_here()
+        v.control.hold_position()
         v.control.horizontal = Axis.ATTITUDE
 
     def step(self, v: VehicleState) -> None:
@@ -115,7 +115,7 @@ class Loiter(Flight):
 
     def begin(self, v: VehicleState) -> None:
         """Stop and hold."""
-        v.control.hold_here()
+        v.control.hold_position()
 
     def step(self, v: VehicleState) -> None:
         """Follow the sticks."""
@@ -146,7 +146,7 @@ class Circle(Flight):
 
     def begin(self, v: VehicleState) -> None:
         """Set the centre CIRCLE_RADIUS ahead of the stopping position."""
-        v.control.hold_here()
+        v.control.hold_position()
         radius = v.params["CIRCLE_RADIUS"] / 100.0
         yaw = v.est.yaw
         north, east = v.control.target

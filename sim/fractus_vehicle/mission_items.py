@@ -153,7 +153,7 @@ _UINT16_MAX = 65535
 
 
 def _parameters(message: Message, command: int) -> tuple[float, float, float, float]:
-    """Return the four parameters as they are stored."""
+    """Return the four parameters in the form in which ArduPilot stores them."""
     one, *more = (_finite(message.real(f"param{at}")) for at in range(1, 5))
     stored = STORED_PARAMETERS.get(command)
     if stored is None:

@@ -10,7 +10,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fractus_vehicle.mission_items import Item
 
-# Commands whose fifth and sixth parameters are degrees. Those of other commands are plain integers.
+# Commands whose fifth and sixth parameters are degrees. In other commands these parameters are plain integers.
 PLACED = frozenset(
     {
         mavlink.MAV_CMD_DO_SET_HOME,

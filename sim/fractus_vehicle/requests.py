@@ -81,9 +81,11 @@ def _set_interval(v: VehicleState, o: Command, c: Channel) -> int:
 def _get_interval(_v: VehicleState, o: Command, c: Channel) -> int:
     name = _message_name(o.params[0])
     stream = c.streams.get(name) if name is not None else None
-    interval = 0 if name is None else -1 if stream is None else round(stream.interval_s * 1e6)
+    interval_us = 0  # MAVLink: not available
+    if name is not None:
+        interval_us = -1 if stream is None else round(stream.interval_s * 1e6)  # -1: disabled
     number = int(o.params[0]) & 0xFFFF if math.isfinite(o.params[0]) else 0
-    c.send("MESSAGE_INTERVAL", {"message_id": number, "interval_us": interval})
+    c.send("MESSAGE_INTERVAL", {"message_id": number, "interval_us": interval_us})
     return mavlink.MAV_RESULT_ACCEPTED if name is not None else mavlink.MAV_RESULT_FAILED
 
 

@@ -45,16 +45,16 @@ class ReturnToLaunch(Flight):
         distance = point.distance_m((v.est.north, v.est.east))
         height = base_down - v.est.down
         least = max(height + p["RTL_CLIMB_MIN"] / 100.0, 2.0)
-        wanted = max(least, p["RTL_ALT"] / 100.0, point.altitude_m)
+        altitude_m = max(least, p["RTL_ALT"] / 100.0, point.altitude_m)
         if p["RTL_CONE_SLOPE"] >= 0.5:
-            wanted = min(wanted, max(distance * p["RTL_CONE_SLOPE"], least))
+            altitude_m = min(altitude_m, max(distance * p["RTL_CONE_SLOPE"], least))
         ceiling = v.fence.alt_max_m - p["FENCE_MARGIN"]
         if v.fence.enabled and v.fence.types & 1:
-            wanted = min(wanted, ceiling)
-        wanted = max(wanted, height)
+            altitude_m = min(altitude_m, ceiling)
+        altitude_m = max(altitude_m, height)
         if p["RTL_SPEED"] > 0.0:
             v.control.limits.speed_mps = p["RTL_SPEED"] / 100.0
-        self._down = base_down - wanted
+        self._down = base_down - altitude_m
         v.control.yaw_rate = None
         v.control.target_yaw = v.control.yaw_setpoint
         v.touch_time_s = 0.0

@@ -64,8 +64,8 @@ class Battery:
 
     def step(self, dt: float, load: float) -> None:
         """Draw current for `dt` seconds; `load` is thrust as a multiple of the hover thrust."""
-        wanted = HOVER_CURRENT_A * max(load, 0.0) ** 1.5
-        self.current_a += (wanted - self.current_a) * min(1.0, dt / 0.1)
+        demand_a = HOVER_CURRENT_A * max(load, 0.0) ** 1.5
+        self.current_a += (demand_a - self.current_a) * min(1.0, dt / 0.1)
         self.used_mah += self.current_a * dt / 3.6
         self.used_j += self.current_a * self.voltage_v * dt
         if self.pack_mah > 0.0:

@@ -42,10 +42,10 @@ def shape_velocity(
     target: float, velocity: float, acceleration: float, *, accel_max: float, jerk_max: float, dt: float
 ) -> float:
     """Return the next acceleration that brings `velocity` to `target` under both limits."""
-    wanted = sqrt_controller(target - velocity, jerk_max / accel_max, jerk_max, dt)
-    wanted = clamp(wanted, -accel_max, accel_max)
+    demand = sqrt_controller(target - velocity, jerk_max / accel_max, jerk_max, dt)
+    demand = clamp(demand, -accel_max, accel_max)
     step = jerk_max * dt
-    return acceleration + clamp(wanted - acceleration, -step, step)
+    return acceleration + clamp(demand - acceleration, -step, step)
 
 
 def shape_position(
@@ -82,13 +82,14 @@ def shape_velocity_xy(
     error_n = target[0] - velocity[0]
     error_e = target[1] - velocity[1]
     size = math.hypot(error_n, error_e)
-    thrust_demand_n = wanted_e = 0.0
+    demand_n = 0.0
+    demand_e = 0.0
     if size > 1e-9:
         scale = min(sqrt_controller(size, jerk_max / accel_max, jerk_max, dt), accel_max) / size
-        thrust_demand_n = error_n * scale
-        wanted_e = error_e * scale
-    delta_n = thrust_demand_n - acceleration[0]
-    delta_e = wanted_e - acceleration[1]
+        demand_n = error_n * scale
+        demand_e = error_e * scale
+    delta_n = demand_n - acceleration[0]
+    delta_e = demand_e - acceleration[1]
     size = math.hypot(delta_n, delta_e)
     step = jerk_max * dt
     scale = step / size if size > step else 1.0

@@ -1,4 +1,4 @@
-"""SMART_RTL mode: return along the flown path and land where it began."""
+"""SMART_RTL mode: return along the flown path and land at its start."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class SmartReturn(Flight):
 
     def begin(self, v: VehicleState) -> None:
         """Stop and begin to simplify the path."""
-        v.control.hold_here()
+        v.control.hold_position()
         v.heading.follow_course()
         v.touch_time_s = 0.0
         self._cleanup = v.breadcrumbs.simplify_fully()

@@ -72,11 +72,11 @@ class SplineLeg:
         slope, bend = self._slopes(share)
         size = max(math.hypot(*slope), 1e-6)
         level = max(math.hypot(slope[0], slope[1]), 1e-6)
-        wanted = limits.speed_mps * size / level
+        speed_mps = limits.speed_mps * size / level
         if slope[2]:
-            wanted = min(wanted, (limits.climb_mps if slope[2] < 0.0 else limits.sink_mps) * size / abs(slope[2]))
+            speed_mps = min(speed_mps, (limits.climb_mps if slope[2] < 0.0 else limits.sink_mps) * size / abs(slope[2]))
         curvature = abs(slope[0] * bend[1] - slope[1] * bend[0]) / level**3
-        return min(wanted, math.sqrt(limits.accel_mps2 / curvature)) if curvature > 1e-6 else wanted
+        return min(speed_mps, math.sqrt(limits.accel_mps2 / curvature)) if curvature > 1e-6 else speed_mps
 
     def step(self, v: VehicleState) -> None:
         """Advance the trajectory along the curve by one control step."""
@@ -90,19 +90,19 @@ class SplineLeg:
             return
         at = self._share * _SAMPLES
         low = min(int(at), _SAMPLES - 1)
-        wanted = self._allowed_mps[low] + (at - low) * (self._allowed_mps[low + 1] - self._allowed_mps[low])
-        wanted = max(wanted, _SLOWEST_MPS)
+        speed_mps = self._allowed_mps[low] + (at - low) * (self._allowed_mps[low + 1] - self._allowed_mps[low])
+        speed_mps = max(speed_mps, _SLOWEST_MPS)
         self._accel_mps2 = shape_velocity(
-            wanted,
+            speed_mps,
             self._speed_mps,
             self._accel_mps2,
             accel_max=control.limits.accel_mps2,
             jerk_max=control.limits.jerk_mps3,
             dt=dt,
         )
-        if self._speed_mps + self._accel_mps2 * dt > wanted:
+        if self._speed_mps + self._accel_mps2 * dt > speed_mps:
             # The profile already allows for braking. Shaping it again would make the vehicle arrive too fast.
-            self._accel_mps2 = max((wanted - self._speed_mps) / dt, -control.limits.accel_mps2)
+            self._accel_mps2 = max((speed_mps - self._speed_mps) / dt, -control.limits.accel_mps2)
         self._speed_mps = max(self._speed_mps + self._accel_mps2 * dt, 0.0)
         slope, bend = self._slopes(self._share)
         pace = self._speed_mps / max(math.hypot(*slope), 1e-6)
@@ -126,7 +126,7 @@ class SplineLeg:
             (bend[1] - along * slope[1]) * pace2 + push * slope[1],
             (bend[2] - along * slope[2]) * pace2 + push * slope[2],
         )
-        # Limit the acceleration where a short tangent bends the curve more sharply than the vehicle can fly.
+        # A short tangent may bend the curve more sharply than the vehicle can fly.
         return _scaled(demand, min(1.0, most_mps2 / max(math.hypot(*demand), 1e-6)))
 
     def reached(self, v: VehicleState, radius_m: float) -> bool:

@@ -126,15 +126,15 @@ class Transfers:
             case _:
                 pass  # MISSION_ACK: an upload cancelled by its sender times out
 
-    def _begin(self, channel: Channel, message: Message, store: ItemStore, wanted: range) -> None:
-        """Start the upload of the item range `wanted`: a whole new list, or a part of the stored list."""
+    def _begin(self, channel: Channel, message: Message, store: ItemStore, item_range: range) -> None:
+        """Start the upload of the given item range: a whole new list, or a part of the stored list."""
         active = self.uploads.get(store.kind)
         if active is not None and not active.is_from(message):
             self._ack(channel, message, store.kind, mavlink.MAV_MISSION_DENIED)
-        elif wanted.stop > MAX_ITEMS[store.kind]:
+        elif item_range.stop > MAX_ITEMS[store.kind]:
             self._send_text(mavlink.MAV_SEVERITY_WARNING, f"Only {MAX_ITEMS[store.kind]} items are supported")
             self._ack(channel, message, store.kind, mavlink.MAV_MISSION_NO_SPACE)
-        elif not wanted:
+        elif not item_range:
             self._complete(channel, message, store, [])
         else:
             partial = message.name == "MISSION_WRITE_PARTIAL_LIST"
@@ -143,8 +143,8 @@ class Transfers:
                 sysid=message.sysid,
                 compid=message.compid,
                 kind=store.kind,
-                next=wanted.start,
-                last=wanted.stop - 1,
+                next=item_range.start,
+                last=item_range.stop - 1,
                 items=list(store.items) if partial else [],
                 partial=partial,
                 received_s=self.now_s,

@@ -162,7 +162,9 @@ def face_box(variation: int) -> tuple[float, float, float, float]:
     left = (_FACE[0] - _CROP[0]) / wide
     right = (_FACE[2] - _CROP[0]) / wide
     if variation % 2:
-        left, right = 1.0 - right, 1.0 - left
+        mirrored_left = 1.0 - right
+        right = 1.0 - left
+        left = mirrored_left
     return left, (_FACE[1] - _CROP[1]) / high, right, (_FACE[3] - _CROP[1]) / high
 
 

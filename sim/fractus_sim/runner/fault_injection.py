@@ -88,6 +88,7 @@ class FaultInjector:
         return [(running.vehicle, running.fault.title) for running in self._faults if running.index is None]
 
     def _targets(self, fault: Fault) -> Sequence[str]:
+        """Return the vehicles of a fault, or an empty name for a fault of a node without a vehicle."""
         if isinstance(fault, NodePowerOff) and fault.node is not None:
             return [""]
         return fault.vehicles or tuple(self._observers)
@@ -106,6 +107,7 @@ class FaultInjector:
         return None if takeoff_s is None else takeoff_s + running.fault.at
 
     def _inject(self, running: _InjectedFault) -> Generator[None, None, None]:
+        """Wait for the begin of a fault, inject it, and end it after its duration. Restore the changed parameters."""
         fault = running.fault
         while (begin_s := self._begin_s(running)) is None or self._now_s < begin_s:
             yield

@@ -102,6 +102,11 @@ def _command(station: Station, command: int, *params: float) -> Task:
 
 
 def _set_mode(station: Station, mode: int) -> Task:
+    """Change the flight mode, and wait until the vehicle reports it.
+
+    Raises:
+        TaskFailed: The vehicle rejected the mode or did not enter it in time.
+    """
     yield from _command(station, mavlink.MAV_CMD_DO_SET_MODE, 1, mode)
     deadline = station.now_s + MODE_TIMEOUT_S
     while station.state.mode != enum_name("COPTER_MODE", mode):
@@ -170,6 +175,11 @@ def _land(station: Station, mode: int) -> Task:
 
 
 def _require_mode(station: Station, mode: int) -> None:
+    """Check that the vehicle is still armed in a mode.
+
+    Raises:
+        TaskFailed: The vehicle is in another mode, or disarmed.
+    """
     if station.state.mode != enum_name("COPTER_MODE", mode):
         raise TaskFailed(f"the autopilot changed to {station.state.mode}")
     if not station.state.armed:

@@ -25,8 +25,8 @@ from fractus_services.mobility.rpc.server import run
 from fractus_services.options import MobilityOptions
 from mobility_rig import DRIVER, FRAME, NODE, Rig, altitude_limit, fence, grant
 
-MAX_FILES = 39
-MAX_FUNCTIONS = 122  # varies by a few with the timing of telemetry
+MAX_FILES = 38
+MAX_FUNCTIONS = 120  # varies by a few with the timing of telemetry
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 VALUE_METHODS = frozenset({"__init__", "__new__", "__post_init__", "__eq__", "__hash__", "__bool__", "__len__"})

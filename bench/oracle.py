@@ -5,7 +5,7 @@ motion in steps of 50 ms, with wind, latency and position errors inside the boun
 in forbidden places, and corrected targets that the engine would not allow unchanged or that lie inside a margin. Vehicles
 differ in acceleration and return altitude, and other ground stations change these in flight. Afterwards the system flies
 some drones home like the mobility service, and the autopilots of others return without the system
-(tests/component/homeward_flights.py). The motion monitor watches one flight in twelve and must not stop it.
+(tests/component/return_flights.py). The motion monitor watches one flight in twelve and must not stop it.
 
 A case is one request of one drone under one set of policies. Each drone makes three requests, two of them in flight. In
 addition, vehicles with missing, absent and unusual parameters are armed (tests/component/parameter_faults.py).
@@ -20,9 +20,9 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "component"))
 
 from harness import Progress, Report, parser
-from homeward_flights import WaysHome
 from parameter_faults import parameter_faults
 from policy_flights import Tally, flights
+from return_flights import ReturnFlights
 
 DRONES = 500
 REQUESTS = 3
@@ -42,9 +42,9 @@ def main() -> int:
     total = Tally()
     vehicles = 0
     seed = options.seed
-    while total.asked < cases:
-        ways_home = WaysHome(seed, HOME_EVERY)
-        batch = flights(seed, DRONES, requests=REQUESTS, watch_every=WATCH_EVERY, watched=WATCHED, returns=ways_home)
+    while total.requests < cases:
+        returns = ReturnFlights(seed, HOME_EVERY)
+        batch = flights(seed, DRONES, requests=REQUESTS, watch_every=WATCH_EVERY, watched=WATCHED, returns=returns)
         batch.wrong += parameter_faults(seed, VEHICLES)
         vehicles += VEHICLES
         total.add(batch)
@@ -53,17 +53,17 @@ def main() -> int:
         for line in batch.stopped:
             print(f"\nSTOPPED seed {seed}, {line}", flush=True)
         progress.show(
-            total.asked,
+            total.requests,
             f"{total.permitted:,} permitted ({total.corrected:,} corrected, {total.braked:,} after a stop), {total.taken:,} takeovers,"
-            f" {total.homeward:,} flights home ({total.straight:,} by the autopilot), {vehicles:,} arming requests,"
+            f" {total.system_returns:,} flights home ({total.autopilot_returns:,} by the autopilot), {vehicles:,} arming requests,"
             f" {len(total.wrong)} wrong, {len(total.stopped)} stopped (seed {seed})",
         )
         seed += 1
     report = Report("oracle", options)
     report.add(
-        "wrong", len(total.wrong), cases=total.asked, permitted=total.permitted, corrected=total.corrected,
-        braked=total.braked, takeovers=total.taken, changed=total.changed, homeward=total.homeward,
-        alone=total.straight, vehicles=vehicles,
+        "wrong", len(total.wrong), cases=total.requests, permitted=total.permitted, corrected=total.corrected,
+        braked=total.braked, takeovers=total.taken, changed=total.changed, homeward=total.system_returns,
+        alone=total.autopilot_returns, vehicles=vehicles,
     )  # fmt: skip
     report.add("stopped", len(total.stopped), shortened=total.shortened)
     return report.finish()

@@ -1,4 +1,4 @@
-"""A vehicle's parameters as ArduPilot tells them, over a link that loses frames by chance in both directions."""
+"""Fake autopilot that responds to the parameter protocol as ArduPilot does, over a link that loses random frames."""
 
 from __future__ import annotations
 
@@ -11,33 +11,33 @@ from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
 from fractus_services.mobility.mavlink.mavlink_autopilot import MavlinkAutopilot
 
 BY_NAME = 65535
-"""The index in answers to names, and in the news of a change."""
+"""Parameter index in responses to requests by name, and in reports of a change."""
 
 MOVEMENT = {
     "WPNAV_ACCEL": 250.0, "PSC_POSXY_P": 1.0, "WPNAV_ACCEL_Z": 100.0, "PSC_JERK_XY": 5.0, "RTL_ALT": 1500.0, "RTL_SPEED": 0.0,
     "RTL_CLIMB_MIN": 0.0, "WPNAV_SPEED": 1000.0, "FENCE_ENABLE": 0.0, "FENCE_AUTOENABLE": 0.0, "FENCE_TYPE": 7.0, "FENCE_ALT_MAX": 100.0,
     "FENCE_MARGIN": 2.0, "FENCE_ACTION": 1.0, "FENCE_OPTIONS": 0.0, "ANGLE_MAX": 3000.0, "PSC_ANGLE_MAX": 0.0,
 }  # fmt: skip
-"""What tells how a vehicle moves, as releases before 4.7 spell it."""
+"""Parameters of the motion of a vehicle, with the names before release 4.7."""
 
 FAILSAFES = {
     "SYSID_MYGCS": 244.0, "FS_GCS_ENABLE": 1.0, "FS_GCS_TIMEOUT": 5.0, "GUID_TIMEOUT": 1.0, "BATT_FS_CRT_ACT": 1.0,
     "BATT_FS_LOW_ACT": 2.0, "FS_EKF_ACTION": 1.0, "SRTL_POINTS": 0.0, "RTL_ALT_TYPE": 0.0, "RTL_ALT_FINAL": 0.0,
     "RALLY_LIMIT_KM": 2.0**-10, "RTL_CONE_SLOPE": 3.0, "GUID_OPTIONS": 0.0, "FS_EKF_THRESH": 0.8,
 }  # fmt: skip
-"""Failsafes that hold, of a vehicle that does not remember its path."""
+"""Failsafe parameters that permit arming, for a vehicle that records no path."""
 
 
-def told(
+def parameter_responses(
     values: dict[str, float], outgoing: Message, fixed: Collection[str] = (), hidden: Collection[str] = ()
 ) -> list[Message]:
-    """What a vehicle answers to a question about its parameters.
+    """Return the responses of a vehicle to a parameter message.
 
     Args:
-        values: its parameters; changed by PARAM_SET.
-        outgoing: the question.
-        fixed: those that it does not let anyone set.
-        hidden: those that it leaves out of its list.
+        values: Parameters of the vehicle. PARAM_SET changes them.
+        outgoing: Received message.
+        fixed: Parameters that cannot be set.
+        hidden: Parameters that are missing in the list.
     """
     listed = [name for name in values if name not in hidden]
 
@@ -60,15 +60,15 @@ def told(
 
 
 class ParameterVehicle(MavlinkAutopilot):
-    """An autopilot that only has parameters.
+    """Fake autopilot that has only parameters.
 
     Args:
-        values: its parameters.
-        fixed: those that cannot be set.
-        hidden: those that are not in its list.
-        loss: share of the frames that are lost each way.
-        seed: of what is lost.
-        delay_s: from the question to the answer.
+        values: Parameters of the vehicle.
+        fixed: Parameters that cannot be set.
+        hidden: Parameters that are missing in the list.
+        loss: Share of frames lost in each direction.
+        seed: Seed of the lost frames.
+        delay_s: Time from a request to its response.
     """
 
     def __init__(
@@ -88,16 +88,16 @@ class ParameterVehicle(MavlinkAutopilot):
         self.hidden = hidden
         self.loss = loss
         self.delay_s = delay_s
-        self.asked: list[str] = []
+        self.received_names: list[str] = []
         self._random = random.Random(seed)
 
     def send(self, outgoing: Message) -> None:
-        self.asked.append(outgoing.name)
-        if self._lose():
+        self.received_names.append(outgoing.name)
+        if self._is_lost():
             return
-        for answer in told(self.values, outgoing, self.fixed, self.hidden):
-            if not self._lose():
-                asyncio.get_running_loop().call_later(self.delay_s, self.take, answer)
+        for response in parameter_responses(self.values, outgoing, self.fixed, self.hidden):
+            if not self._is_lost():
+                asyncio.get_running_loop().call_later(self.delay_s, self.take, response)
 
-    def _lose(self) -> bool:
+    def _is_lost(self) -> bool:
         return self._random.random() < self.loss

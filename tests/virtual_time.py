@@ -1,42 +1,44 @@
-"""Time that jumps: minutes of virtual time pass in a fraction of a second, always the same."""
+"""Event loop in virtual time: minutes pass in a fraction of a second, and runs are deterministic."""
 
 from __future__ import annotations
 
 import asyncio
 import selectors
 from collections.abc import Callable, Coroutine
-from typing import Any
+from typing import Any, TypeVar
+
+T = TypeVar("T")
 
 
-class _Hurried(selectors.DefaultSelector):
-    """Never waits: what others wait for is there at once."""
+class _SkippingSelector(selectors.DefaultSelector):
+    """Selector that never waits. It advances the virtual time instead."""
 
-    def __init__(self, hurry: Callable[[float], None]) -> None:
+    def __init__(self, advance: Callable[[float], None]) -> None:
         super().__init__()
-        self._hurry = hurry
+        self._advance = advance
 
     def select(self, timeout: float | None = None) -> list[Any]:
-        found = super().select(0.001 if timeout is None else 0)
-        if not found and timeout:
-            self._hurry(timeout)
-        return found
+        events = super().select(0.001 if timeout is None else 0)
+        if not events and timeout:
+            self._advance(timeout)
+        return events
 
 
 class Loop(asyncio.SelectorEventLoop):
-    """An event loop that jumps to the moment of the next event."""
+    """Event loop that jumps to the time of the next event."""
 
     def __init__(self) -> None:
         self._now = 1000.0
-        super().__init__(_Hurried(self._hurry))
+        super().__init__(_SkippingSelector(self._advance))
 
-    def _hurry(self, seconds: float) -> None:
+    def _advance(self, seconds: float) -> None:
         self._now += seconds
 
     def time(self) -> float:
         return self._now
 
     def run_in_executor(self, _executor: Any, work: Callable[..., Any], *args: Any) -> asyncio.Future[Any]:  # type: ignore[override]
-        """What goes to a thread is done at once: no thread sees this loop's time."""
+        """Run the work at once in this thread, because threads do not share the virtual time."""
         done = self.create_future()
         try:
             done.set_result(work(*args))
@@ -46,7 +48,7 @@ class Loop(asyncio.SelectorEventLoop):
 
 
 def fly(flight: Callable[[], Coroutine[Any, Any, None]]) -> None:
-    """Run a flight to its end; ten minutes of its time are the most."""
+    """Run a flight to its end, at most for ten minutes of virtual time."""
 
     async def bounded() -> None:
         async with asyncio.timeout(600):
@@ -54,3 +56,9 @@ def fly(flight: Callable[[], Coroutine[Any, Any, None]]) -> None:
 
     with asyncio.Runner(loop_factory=Loop) as runner:
         runner.run(bounded())
+
+
+def run(work: Coroutine[Any, Any, T]) -> T:
+    """Run work in virtual time and return its result."""
+    with asyncio.Runner(loop_factory=Loop) as runner:
+        return runner.run(work)

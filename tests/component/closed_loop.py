@@ -1,9 +1,9 @@
 """The mobility service and the simulated vehicle in one loop of virtual time, on a link that delays and loses frames.
 
-Everything but the driver is the product: parameters, failsafes and the vehicle's own fence are set over the link, calls are
-judged, motions flown, monitored and ended. A flight is a seed: a scene of zones and limits, a driver's programme, the link's
-figures, the wind, and what goes wrong on the way. An oracle watches the vehicle's true position, which no part of the service
-sees, and shares no code with the policy engine but the names of things.
+Only the driver is fake. The service sets parameters, failsafes and the fence of the vehicle over the link, judges calls, and
+flies and monitors motions. A seed determines a flight: zones and limits, the requests of the driver, the delay of the link, the
+wind and the faults. An oracle checks the true position of the vehicle, which the service cannot observe. The oracle shares no
+code with the policy engine.
 """
 
 from __future__ import annotations
@@ -40,13 +40,13 @@ from mobility_world import FRAME, Grants, area, goto, spec, zone
 from virtual_time import Loop
 
 PROGRAMME_S = 400.0
-"""A driver that has not finished by then, as under a low limit of speed, gives up."""
+"""Time after which a driver ends its flight, for example because a speed limit is low."""
 
 HOME_S = 250.0
 """Maximum duration of a return, including the grace time."""
 
 HALF_M = 130.0
-"""The operation area reaches this far from home, to each side."""
+"""Distance from home to each side of the operation area, in metres."""
 
 WATCH_S = 0.05
 HEIGHT_SLACK_M = 2.0
@@ -54,16 +54,16 @@ SPEED_SLACK_MPS = 1.0
 """Tolerances stated in docs/policies.md (height) and docs/mobility.md (speed, without gusts)."""
 
 REACTION_S = 0.4
-"""Until what has changed is acted on: 0.2 s is promised; a vehicle that has turned its motors needs as long again."""
+"""Time until a change takes effect. The service guarantees 0.2 s, and the vehicle needs the same time again."""
 
 BRAKING_SHARE = 0.64
 MAX_BRAKING_MPS2 = 1.6
-"""ArduCopter's BRAKE from 6.4 m/s takes 10.6 m, from 9.6 m/s 19.6 m with WPNAV_ACCEL 250: the mean of it, with some wind from
-behind; a vehicle that accelerates less brakes less."""
+"""Mean deceleration of ArduCopter's BRAKE in tailwind: with WPNAV_ACCEL 250 it takes 10.6 m from 6.4 m/s and 19.6 m from 9.6 m/s.
+A lower acceleration setting also reduces the deceleration."""
 
 
 JERK_MPS3 = 5.0
-"""PSC_JERK_XY of ArduCopter, by which an acceleration ends."""
+"""PSC_JERK_XY of ArduCopter, with which an acceleration ends."""
 
 
 @dataclass(frozen=True)
@@ -71,20 +71,20 @@ class Weather:
     """Environment of a flight.
 
     Attributes:
-        there_s: from the companion to the vehicle; jitter adds up to half of it.
-        back_s: from the vehicle to the companion.
-        loss: share of frames that are lost, in each direction.
-        wind_mps: mean wind.
-        gusts_mps: of the wind.
-        error_m: how far north of where it believes to be the vehicle is.
-        claimed_error_m: how far its GPS says that it may err; None: as far as it does.
-        speedup: the vehicle's time in seconds a second.
-        cut: when the link is cut, and for how long; None: never.
-        stall: a busy machine lets no one of these run for so long, every few seconds: "service" or "vehicle".
+        uplink_s: Delay from the companion to the vehicle. Jitter adds up to half of it.
+        downlink_s: Delay from the vehicle to the companion, with the same jitter.
+        loss: Share of frames lost in each direction.
+        wind_mps: Mean wind.
+        gusts_mps: Strength of gusts.
+        error_m: Distance of the true position north of the estimated one.
+        claimed_error_m: Position error reported by the GPS. None: the actual error.
+        speedup: Simulated seconds of the vehicle per second of the service.
+        cut: Begin and duration of a link outage, if any.
+        stall: Process ("service" or "vehicle") that stalls every few seconds, and the duration of each stall.
     """
 
-    there_s: float = 0.0
-    back_s: float = 0.0
+    uplink_s: float = 0.0
+    downlink_s: float = 0.0
     loss: float = 0.0
     wind_mps: float = 0.0
     gusts_mps: float = 0.0
@@ -99,11 +99,11 @@ STALL_EVERY_S = (2.0, 6.0)
 """Range of the interval between two stalls of a process."""
 
 TURN_S = 1e-7
-"""What a turn of the loop takes: without it, who waits for the rest of a rounded period would never see its end."""
+"""Duration of one iteration of the loop. Without it, a wait for the rest of a rounded period would never end."""
 
 
 class Wire(asyncio.Transport):
-    """The companion's end of a link: whole frames, late and in order, or lost."""
+    """The companion's end of a link. Complete frames arrive late and in order, or are lost."""
 
     def __init__(self, loop: Sky, protocol: asyncio.Protocol) -> None:
         super().__init__()
@@ -115,7 +115,7 @@ class Wire(asyncio.Transport):
         self._open = True
 
     def write(self, data: Any) -> None:
-        self._carry(bytes(data), self._loop.weather.there_s, self._to_vehicle, there=True)
+        self._carry(bytes(data), self._loop.weather.uplink_s, self._to_vehicle, to_vehicle=True)
 
     def _to_vehicle(self, data: bytes) -> None:
         if self._open:
@@ -128,14 +128,14 @@ class Wire(asyncio.Transport):
     def flush(self) -> None:
         """Send the pending messages of the vehicle."""
         for message in self._parser.feed(self._channel.take()):
-            self._carry(message.frame, self._loop.weather.back_s, self._to_companion, there=False)
+            self._carry(message.frame, self._loop.weather.downlink_s, self._to_companion, to_vehicle=False)
 
-    def _carry(self, data: bytes, delay_s: float, deliver: Callable[[bytes], None], *, there: bool) -> None:
+    def _carry(self, data: bytes, delay_s: float, deliver: Callable[[bytes], None], *, to_vehicle: bool) -> None:
         loop = self._loop
         if not self._open or loop.severed or loop.chance.random() < loop.weather.loss:
             return
-        arrives = max(loop.time() + delay_s * loop.chance.uniform(1.0, 1.5), self._arrivals[there])
-        self._arrivals[there] = arrives
+        arrives = max(loop.time() + delay_s * loop.chance.uniform(1.0, 1.5), self._arrivals[to_vehicle])
+        self._arrivals[to_vehicle] = arrives
         loop.call_at(arrives, deliver, data)
 
     def close(self) -> None:
@@ -187,17 +187,17 @@ class Sky(Loop):
         protocol.connection_made(wire)
         return wire, protocol
 
-    async def turn(self) -> None:
-        """The vehicle's time, until cancelled."""
+    async def run_vehicle(self) -> None:
+        """Advance the simulation until cancelled."""
         stalls_at = self.time() + self.chance.uniform(*STALL_EVERY_S)
         while True:
-            self._go_on()
+            self._advance_simulation()
             await asyncio.sleep(CONTROL_STEP_S)
             if self.weather.stall is not None and self.time() >= stalls_at:
                 await self._stall(*self.weather.stall)
                 stalls_at = self.time() + self.chance.uniform(*STALL_EVERY_S)
 
-    def _go_on(self, steps: int = 1) -> None:
+    def _advance_simulation(self, steps: int = 1) -> None:
         for _ in range(steps * self.weather.speedup):
             self.simulation.step()
         for wire in self.wires:
@@ -205,27 +205,27 @@ class Sky(Loop):
         for witness in self.witnesses:
             witness()
 
-    async def _stall(self, who: str, duration_s: float) -> None:
+    async def _stall(self, process: str, duration_s: float) -> None:
         steps = round(duration_s / CONTROL_STEP_S)
-        if who == "vehicle":
+        if process == "vehicle":
             await asyncio.sleep(duration_s)
-            self._go_on(steps)  # The vehicle catches up with the lost time.
+            self._advance_simulation(steps)  # The vehicle catches up with the lost time.
             return
         for _ in range(steps):
             self._now += CONTROL_STEP_S
-            self._go_on()
+            self._advance_simulation()
 
 
 @dataclass
 class Wall:
-    """A zone as the oracle sees it.
+    """Zone in the representation of the oracle.
 
     Attributes:
-        box: where it is not allowed, metres around home.
-        low_m: above home.
-        high_m: above home.
-        excused: the drone could not help entering it when it appeared; until it has left.
-        since_s: when it appeared.
+        box: Forbidden area in metres around home.
+        low_m: Lower limit above home.
+        high_m: Upper limit above home.
+        excused: True until the drone has left a zone that it could not avoid when the zone was added.
+        since_s: Time at which the zone was added.
     """
 
     box: shapely.Geometry
@@ -240,10 +240,11 @@ class Rules:
     """Rules in force at a moment.
 
     Attributes:
-        walls: where the drone must not be.
-        ceiling_m: above home.
-        top_mps: over ground.
-        high_since_s: when the ceiling became what it is; `fast_since_s`, the speed.
+        walls: Exclusion zones.
+        ceiling_m: Altitude limit above home.
+        top_mps: Limit of the ground speed.
+        high_since_s: Time of the last change of the ceiling.
+        fast_since_s: Time of the last change of the speed limit.
     """
 
     walls: list[Wall] = field(default_factory=list)
@@ -258,12 +259,12 @@ class Account:
     """Result of a flight.
 
     Attributes:
-        seed: of it.
-        wrong: what must not be, in words.
-        events: what happened, for people.
-        flew: whether it left the ground.
-        down: whether it is back there, with its motors off.
-        depth_m: the deepest that it was in a zone.
+        seed: Seed of the flight.
+        wrong: Violations, as text.
+        events: Log of the flight.
+        flew: True if the drone left the ground.
+        down: True if the drone has landed and disarmed.
+        depth_m: Greatest depth inside a zone.
     """
 
     seed: int
@@ -275,25 +276,25 @@ class Account:
 
 
 class Oracle:
-    """Watches the true position."""
+    """Checks the true position against the rules."""
 
     def __init__(self, sky: Sky, account: Account) -> None:
         self._sky = sky
         self._account = account
         self.rules = Rules()
         self.arena = shapely.box(-HALF_M, -HALF_M, HALF_M, HALF_M)
-        self._said: set[str] = set()
+        self._reported: set[str] = set()
         self._speed_mps = 0.0
         self.speeding_mps2 = 0.0
 
     def place(self) -> tuple[float, float, float]:
-        """East, north and height in metres, truly."""
+        """Return the true position: east, north and height above home in metres."""
         truth = self._sky.truth.true_place
         x, y = FRAME.xy(truth.lat_e7 / 1e7, truth.lon_e7 / 1e7)
         return float(x), float(y) + self._sky.weather.error_m, -self._sky.truth.body.down
 
     def speeds(self) -> tuple[float, float]:
-        """Over ground, and up."""
+        """Return the true ground speed and climb rate in m/s."""
         body = self._sky.truth.body
         return math.hypot(body.vn, body.ve), -body.vd
 
@@ -309,8 +310,8 @@ class Oracle:
         speed = speed + surge_mps
         return run_m + speed * speed / (2 * min(BRAKING_SHARE * accel_mps2, MAX_BRAKING_MPS2)) + 1.0
 
-    def appears(self, wall: Wall) -> None:
-        """A zone is in force from now on."""
+    def add_wall(self, wall: Wall) -> None:
+        """Add a zone that is in force from now on."""
         wall.since_s = self._sky.time()
         self._excuse(wall)
         self.rules.walls.append(wall)
@@ -337,7 +338,7 @@ class Oracle:
         """Return the maximum time until a command takes effect."""
         weather = self._sky.weather
         # Two frames lost in a row cost as much as the jitter of a slow link.
-        return REACTION_S + 1.5 * (weather.there_s + weather.back_s) + (0.4 if weather.loss else 0.0)
+        return REACTION_S + 1.5 * (weather.uplink_s + weather.downlink_s) + (0.4 if weather.loss else 0.0)
 
     async def run(self) -> None:
         while True:
@@ -353,23 +354,23 @@ class Oracle:
         if height < 0.7 or not truth.armed:
             return
         self._account.flew = True
-        here = shapely.Point(x, y)
-        untold_s = self._sky.severed_at - self._late_s()  # While the link is cut, nothing newer can be kept.
+        point = shapely.Point(x, y)
+        unknown_since_s = self._sky.severed_at - self._late_s()  # A rule added while the link is cut is not known yet.
         for number, wall in enumerate(self.rules.walls):
-            if wall.since_s > untold_s:
+            if wall.since_s > unknown_since_s:
                 continue
-            inside = wall.low_m < height < wall.high_m and wall.box.contains(here)
+            inside = wall.low_m < height < wall.high_m and wall.box.contains(point)
             if wall.excused:
-                wall.excused = inside or wall.box.distance(here) < 0.5 * self.unavoidable_m() + 2.0
+                wall.excused = inside or wall.box.distance(point) < 0.5 * self.unavoidable_m() + 2.0
             elif inside:
-                depth = float(wall.box.exterior.distance(here))
+                depth = float(wall.box.exterior.distance(point))
                 self._account.depth_m = max(self._account.depth_m, depth)
                 self._wrong(f"zone {number}", f"{depth:.1f} m deep at ({x:.0f}, {y:.0f}, {height:.0f})")
-        if not self.arena.contains(here):
-            self._wrong("area", f"outside by {self.arena.distance(here):.1f} m")
+        if not self.arena.contains(point):
+            self._wrong("area", f"outside by {self.arena.distance(point):.1f} m")
         speed, climb = self.speeds()
         settled, slowed = (
-            self._sky.time() - since_s if since_s <= untold_s else 0.0
+            self._sky.time() - since_s if since_s <= unknown_since_s else 0.0
             for since_s in (self.rules.high_since_s, self.rules.fast_since_s)
         )
         high = height > self.rules.ceiling_m + HEIGHT_SLACK_M
@@ -379,12 +380,12 @@ class Oracle:
         if excess > 0.0 and slowed > 5.0 + self.unavoidable_m() / 4.0:
             self._wrong("speed", f"{speed:.1f} m/s above a limit of {self.rules.top_mps:.1f}")
 
-    def _wrong(self, kind: str, what: str) -> None:
-        if kind in self._said:
+    def _wrong(self, kind: str, text: str) -> None:
+        if kind in self._reported:
             return
-        self._said.add(kind)
+        self._reported.add(kind)
         mode = ARDUCOPTER.mode(self._sky.truth.mode).name
-        self._account.wrong.append(f"{kind}: {what} at {self._sky.time() - 1000:.1f} s in {mode}")
+        self._account.wrong.append(f"{kind}: {text} at {self._sky.time() - 1000:.1f} s in {mode}")
 
 
 class Drone:
@@ -399,7 +400,7 @@ class Drone:
         self.autopilot = MavlinkAutopilot(
             "tcp:vehicle:1",
             ARDUCOPTER,
-            # The parts need the autopilot first: they are looked up when it calls.
+            # The components need the autopilot first, so they are looked up when it calls.
             alive=lambda: self.parts.supervisor.alive(),  # noqa: PLW0108
             on_found=lambda: self.parts.observer.found(),  # noqa: PLW0108
             on_heartbeat=lambda: self.parts.observer.heartbeat(),  # noqa: PLW0108
@@ -425,8 +426,8 @@ class Drone:
     def _append(self, kind: str, content: dict[str, Any], **_: Any) -> None:
         if kind != "state":
             now = asyncio.get_running_loop().time() - 1000
-            told = {key: value for key, value in content.items() if key in _TOLD and value}
-            line = f"{kind} {told}"
+            fields = {key: value for key, value in content.items() if key in _LOGGED_FIELDS and value}
+            line = f"{kind} {fields}"
             if line != self._last:
                 self._account.events.append(f"{now:7.2f} {line}")
             self._last = line
@@ -439,7 +440,7 @@ class Drone:
             await asyncio.gather(*tasks, return_exceptions=True)
 
     async def follow(self, grant: ActiveGrant) -> None:
-        """A driver's stream, to its end."""
+        """Follow the control stream of a driver to its end."""
         with contextlib.suppress(Refused):
             async for event in self.streams.follow(grant):
                 self.record(event)
@@ -449,7 +450,7 @@ class Drone:
         self._account.events.append(f"{self.autopilot.now - 1000:7.2f} stream {event.state.name} {event.reason}")
 
 
-_TOLD = frozenset({"method", "action", "code", "reason", "takeover", "change", "controller", "outcome"})
+_LOGGED_FIELDS = frozenset({"method", "action", "code", "reason", "takeover", "change", "controller", "outcome"})
 
 
 class Flight:
@@ -466,7 +467,7 @@ class Flight:
         self.changed = False
 
     def _box(self) -> tuple[float, float, float, float]:
-        """A box that leaves home, and ways around it, alone."""
+        """Return a random box away from home, with room for routes around it."""
         chance = self.chance
         while True:
             x = chance.uniform(-100, 100)
@@ -478,7 +479,7 @@ class Flight:
                 return box
 
     def _box_ahead(self) -> tuple[float, float, float, float]:
-        """A box in the way of a drone that can still stop before it: on its course, or between it and home."""
+        """Return a box ahead of the drone, or between a hovering drone and home. The drone can still stop before the box."""
         chance = self.chance
         body = self.sky.truth.body
         x, y, _ = self.oracle.place()
@@ -499,7 +500,7 @@ class Flight:
         return self._box()
 
     def add_zone(self, *, ahead: bool = False) -> None:
-        """One more zone, now."""
+        """Add a random zone."""
         chance = self.chance
         box = self._box_ahead() if ahead else self._box()
         if any(wall.box.distance(shapely.box(*box)) < 25.0 for wall in self.oracle.rules.walls):
@@ -516,10 +517,10 @@ class Flight:
         self.account.events.append(
             f"{self.sky.time() - 1000:7.2f} zone {name} {action} {[round(e) for e in box]} {low}..{high}"
         )
-        self.oracle.appears(Wall(shapely.box(*box), low, high))
+        self.oracle.add_wall(Wall(shapely.box(*box), low, high))
 
     def add_zone_overhead(self) -> None:
-        """A zone above the drone, now, that it can still stop below."""
+        """Add a zone above the drone, which can still stop below the zone."""
         chance = self.chance
         x, y, height = self.oracle.place()
         _, climb = self.oracle.speeds()
@@ -532,10 +533,10 @@ class Flight:
         policy["zones"][0]["altitude"] = {"lower": low, "upper": 60.0, "reference": "home"}
         self.policies.append(policy)
         self.account.events.append(f"{self.sky.time() - 1000:7.2f} zone {name} {action} from {low:.1f} m overhead")
-        self.oracle.appears(Wall(shapely.box(*box), low, 60.0))
+        self.oracle.add_wall(Wall(shapely.box(*box), low, 60.0))
 
     def add_limit(self) -> None:
-        """A limit of height or of speed, now."""
+        """Add a limit of altitude or speed."""
         chance = self.chance
         rules = self.oracle.rules
         name = f"l{len(self.policies)}"
@@ -568,7 +569,7 @@ class Flight:
             self.add_zone()
         for _ in range(chance.randrange(3)):
             self.add_limit()
-        turning = [asyncio.ensure_future(self.sky.turn()), asyncio.ensure_future(self.oracle.run())]
+        turning = [asyncio.ensure_future(self.sky.run_vehicle()), asyncio.ensure_future(self.oracle.run())]
         grant = drone.grants.put(self.spec())
         following = asyncio.ensure_future(drone.follow(grant))
         trouble = asyncio.ensure_future(self._trouble())
@@ -576,7 +577,7 @@ class Flight:
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(PROGRAMME_S):
                     await self._drive(following)
-            following.cancel()  # A driver that dies, or has landed: the system brings home what still flies.
+            following.cancel()  # The driver ends or is lost. The system flies home if the drone is in the air.
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(HOME_S):
                     await self._landed()
@@ -600,7 +601,7 @@ class Flight:
             await asyncio.sleep(0.2)
 
     async def _drive(self, following: asyncio.Task[None]) -> None:
-        """The driver's programme: it tries what comes to its mind, and gives up when the drone is not its own."""
+        """Make random requests as a driver, and end when control is lost."""
         drone = self.drone
         chance = self.chance
         try:
@@ -663,8 +664,8 @@ class Flight:
         else:
             await service.set_speed(self.grant, SetSpeedArgs(chance.uniform(1, 14)))
 
-    def _note_request(self, what: str) -> None:
-        self.account.events.append(f"{self.drone.autopilot.now - 1000:7.2f} asks {what}")
+    def _note_request(self, text: str) -> None:
+        self.account.events.append(f"{self.drone.autopilot.now - 1000:7.2f} requests {text}")
 
     async def _finish(self, motion: Any) -> None:
         async with contextlib.aclosing(motion):
@@ -706,8 +707,8 @@ def weather_of(seed: int) -> Weather:
     bad = chance.random() < 0.7
     cut = (chance.uniform(3, 60), chance.uniform(0.5, 8)) if chance.random() < 0.15 else None
     return Weather(
-        there_s=chance.uniform(0, 0.25) if bad else 0.0,
-        back_s=chance.uniform(0, 0.25) if bad else 0.0,
+        uplink_s=chance.uniform(0, 0.25) if bad else 0.0,
+        downlink_s=chance.uniform(0, 0.25) if bad else 0.0,
         loss=chance.choice([0.0, 0.03, 0.1]) if bad else 0.0,
         wind_mps=chance.choice([0.0, 0.0, 3.0, 6.0]),
         gusts_mps=chance.choice([0.0, 1.0]),
@@ -716,7 +717,7 @@ def weather_of(seed: int) -> Weather:
 
 
 def parameters_of(seed: int) -> dict[str, float]:
-    """Another owner's vehicle: how it accelerates and how it comes home."""
+    """Return parameters of acceleration and return flight that an owner may have set."""
     chance = random.Random(seed * 11 + 5)
     if chance.random() < 0.5:
         return {}
@@ -729,7 +730,7 @@ def parameters_of(seed: int) -> dict[str, float]:
 
 
 def flight(seed: int, directory: Path, weather: Weather | None = None) -> Account:
-    """Fly one seed."""
+    """Fly the flight of a seed."""
     weather = weather or weather_of(seed)
     sky = Sky(seed, weather, parameters_of(seed))
 

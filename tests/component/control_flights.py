@@ -20,7 +20,7 @@ from fractus_services.grant_files import ActiveGrant
 from mobility_world import World, goto
 from virtual_time import fly
 
-BEAT_S = 0.5
+HEARTBEAT_S = 0.5
 RECORDED_STEP_S = 0.05
 SAMPLE_S = 5.0
 
@@ -30,20 +30,21 @@ Trace = dict[str, list[str]]
 class Recording(list[Any]):
     """List that calls a function for each appended item."""
 
-    def __init__(self, heard: Callable[[Any], None]) -> None:
+    def __init__(self, on_append: Callable[[Any], None]) -> None:
         super().__init__()
-        self._heard = heard
+        self._on_append = on_append
 
     def append(self, item: Any) -> None:
         super().append(item)
-        self._heard(item)
+        self._on_append(item)
 
 
 class Flight:
-    """A world that is flown in, and the trace that it leaves.
+    """Flight in a world, which records its trace.
 
     Attributes:
-        trace: by source, what happened in the order of time; texts of reasons, which may be reworded, stand apart.
+        trace: Events by source in order of time.
+        texts: Reasons and error texts, which are not compared because their wording may change.
     """
 
     def __init__(self, directory: Path, **options: Any) -> None:
@@ -57,77 +58,79 @@ class Flight:
 
     def _wired(self, world: World) -> World:
         world.plane.parameters |= {"SYSID_MYGCS": 244.0}
-        world.entries = Recording(self._audited)
-        world.plane.commands = Recording(self._commanded)
+        world.entries = Recording(self._record_audit_entry)
+        world.plane.commands = Recording(self._record_command)
         obey = type(world.plane).set_to
 
         def set_to(mode: FlightMode) -> None:
             self._write("commands", f"mode {mode.name}")
             obey(world.plane, mode)
 
-        def heard(outgoing: Any) -> None:
+        def obey_and_report(outgoing: Any) -> None:
             """Obey, and deliver a heartbeat at once, because regular heartbeats are too rare to attribute arming."""
             type(world.plane)._obey(world.plane, outgoing)
             self.observer.heartbeat()
 
         world.plane.set_to = set_to  # type: ignore[method-assign]
-        world.plane._obey = heard  # type: ignore[method-assign]
+        world.plane._obey = obey_and_report  # type: ignore[method-assign]
         self.observer = world.observer
         return world
 
-    # The trace
+    # Trace
 
-    def _write(self, source: str, what: str) -> None:
-        """Add an entry; what repeats itself without a break is written once."""
+    def _write(self, source: str, event: str) -> None:
+        """Add an entry, unless it repeats the previous entry of a source without repetitions."""
         lines = self.trace[source]
-        if not lines or lines[-1].partition(" ")[2] != what or source in {"authority", "streams"}:
-            lines.append(f"{self.world.plane.now - 1000:.1f} {what}")
+        if not lines or lines[-1].partition(" ")[2] != event or source in {"authority", "streams"}:
+            lines.append(f"{self.world.plane.now - 1000:.1f} {event}")
 
-    def _audited(self, entry: tuple[str, dict[str, Any]]) -> None:
+    def _record_audit_entry(self, entry: tuple[str, dict[str, Any]]) -> None:
         kind, content = entry
         if kind in {"control", "takeover"}:
             plane = self.world.plane
-            where = self._place()
-            who = str(content["controller"]).rpartition("/")[2]
-            self._write("authority", f"{kind} {content['action']} by {who} {content['code'] or '-'} at {where}")
+            position = self._position()
+            controller = str(content["controller"]).rpartition("/")[2]
+            self._write(
+                "authority", f"{kind} {content['action']} by {controller} {content['code'] or '-'} at {position}"
+            )
             self.texts.append(f"{plane.now:.1f} {kind} {content['reason']}")
         elif kind == "monitor":
             self._write("authority", f"monitor {content['action']} {content['code']}")
 
-    def _commanded(self, number: int) -> None:
+    def _record_command(self, number: int) -> None:
         self._write("commands", f"command {number}")
 
-    def _stream_event(self, name: str, what: str, text: str = "") -> None:
-        self._write("streams", f"{name} {what}")
-        self.texts.append(f"{self.world.plane.now:.1f} {name} {what} {text}")
+    def _stream_event(self, name: str, event: str, text: str = "") -> None:
+        self._write("streams", f"{name} {event}")
+        self.texts.append(f"{self.world.plane.now:.1f} {name} {event} {text}")
 
-    def _place(self) -> str:
+    def _position(self) -> str:
         """Return the position in whole metres east, north and up of home."""
         plane = self.world.plane
         return str(tuple(round(metres) for metres in (*plane.xy, plane.height)))
 
-    # What happens
+    # Actions
 
     def put(self, grant: Any, key: str = "m1") -> ActiveGrant:
         self._grants.append((grant, key))
         return self.world.grants.put(grant, key)
 
-    def follow(self, held: ActiveGrant, name: str = "driver") -> asyncio.Task[None]:
-        """A stream of GetControl."""
-        return self._spawn(self._follow(held, name, asyncio.Event()))
+    def follow(self, grant: ActiveGrant, name: str = "driver") -> asyncio.Task[None]:
+        """Open a GetControl stream in the background."""
+        return self._spawn(self._follow(grant, name, asyncio.Event()))
 
-    async def drive(self, held: ActiveGrant, name: str = "driver") -> asyncio.Task[None]:
-        """A stream of GetControl that has the drone, or has ended."""
+    async def drive(self, grant: ActiveGrant, name: str = "driver") -> asyncio.Task[None]:
+        """Open a GetControl stream, and wait until it has control or ends."""
         granted = asyncio.Event()
-        stream = self._spawn(self._follow(held, name, granted))
+        stream = self._spawn(self._follow(grant, name, granted))
         waiting = asyncio.ensure_future(granted.wait())
         await asyncio.wait([stream, waiting], return_when=asyncio.FIRST_COMPLETED)
         waiting.cancel()
         return stream
 
-    async def _follow(self, held: ActiveGrant, name: str, granted: asyncio.Event) -> None:
+    async def _follow(self, grant: ActiveGrant, name: str, granted: asyncio.Event) -> None:
         try:
-            async for event in self.world.streams.follow(held):
+            async for event in self.world.streams.follow(grant):
                 state = event.state.name
                 self._stream_event(name, f"{state} {event.control_point} {event.waypoints_reached}", event.reason)
                 if state == "GRANTED":
@@ -141,11 +144,11 @@ class Flight:
             self._stream_event(name, "ended")
 
     def call(self, name: str, work: Any) -> asyncio.Task[None]:
-        """A call in the background."""
+        """Start a call in the background."""
         return self._spawn(self.do(name, work))
 
     async def do(self, name: str, work: Any) -> None:
-        """A call, to its end."""
+        """Make a call and record its result."""
         try:
             async for _ in _steps(work):
                 pass
@@ -158,37 +161,37 @@ class Flight:
         else:
             self._write("calls", f"{name} done")
 
-    async def up(self, held: ActiveGrant, altitude_m: float = 10.0) -> asyncio.Task[None]:
-        """A driver in the air."""
-        stream = await self.drive(held)
-        await self.do("Arm", lambda: self.world.service.arm(held))
-        await self.do("Takeoff", lambda: self.world.service.take_off(held, TakeoffArgs(altitude_m)))
+    async def up(self, grant: ActiveGrant, altitude_m: float = 10.0) -> asyncio.Task[None]:
+        """Take control, arm and take off."""
+        stream = await self.drive(grant)
+        await self.do("Arm", lambda: self.world.service.arm(grant))
+        await self.do("Takeoff", lambda: self.world.service.take_off(grant, TakeoffArgs(altitude_m)))
         return stream
 
-    async def goto(self, held: ActiveGrant, x: float, y: float, alt: float = 10.0) -> None:
-        await self.do("Goto", lambda: self.world.service.goto(held, goto(x, y, alt), 0))
+    async def goto(self, grant: ActiveGrant, x: float, y: float, alt: float = 10.0) -> None:
+        await self.do("Goto", lambda: self.world.service.goto(grant, goto(x, y, alt), 0))
 
-    def going(self, held: ActiveGrant, x: float, y: float) -> asyncio.Task[None]:
-        return self.call("Goto", lambda: self.world.service.goto(held, goto(x, y), 0))
+    def start_goto(self, grant: ActiveGrant, x: float, y: float) -> asyncio.Task[None]:
+        return self.call("Goto", lambda: self.world.service.goto(grant, goto(x, y), 0))
 
-    async def give_back(self, held: ActiveGrant) -> None:
-        await self.do("ReturnControl", lambda: self.world.control.return_control(held))
+    async def give_back(self, grant: ActiveGrant) -> None:
+        await self.do("ReturnControl", lambda: self.world.control.return_control(grant))
 
     def failsafe(self, mode: FlightMode) -> None:
-        """The autopilot's own failsafe acts."""
+        """Let a failsafe of the autopilot change the mode."""
         vehicle = self.world.plane.vehicle
         plane = self.world.plane
         vehicle.failsafe_text = "Battery Failsafe"
         vehicle.failsafe_text_at = plane.now
         plane.set_to(mode)
 
-    def lose_link(self) -> None:
-        self.world.plane.deaf = True
+    def break_link(self) -> None:
+        self.world.plane.disconnected = True
 
-    def find_link(self) -> None:
+    def restore_link(self) -> None:
         """Restore the link and let the service find the vehicle."""
         plane = self.world.plane
-        plane.deaf = False
+        plane.disconnected = False
         plane.vehicle.heartbeat_at = plane.now
         self.observer.found()
 
@@ -197,14 +200,14 @@ class Flight:
         old = self.world
         await self._stop_tasks()
         await old.__aexit__()
-        self.world = self._wired(World(self._directory, **self._options, after=old, known=False))
+        self.world = self._wired(World(self._directory, **self._options, after=old, initialised=False))
         grants = self._grants
         self._grants = []
         for grant, key in grants:
             self.put(grant, key)
         self.observer.found()
         await self.world.__aenter__()
-        self._beat()
+        self._send_heartbeats()
 
     async def sleep(self, seconds: float) -> None:
         await asyncio.sleep(seconds)
@@ -216,23 +219,23 @@ class Flight:
         await self.until(lambda: not self.world.plane.vehicle.armed)
         await self.sleep(2)
 
-    # Plumbing
+    # Tasks
 
     def _spawn(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
         task = asyncio.ensure_future(work)
         self._tasks.append(task)
         return task
 
-    def _beat(self) -> None:
-        async def beat() -> None:
+    def _send_heartbeats(self) -> None:
+        async def send_heartbeats() -> None:
             for number in itertools.count():
-                await asyncio.sleep(BEAT_S)
-                if not self.world.plane.deaf:
+                await asyncio.sleep(HEARTBEAT_S)
+                if not self.world.plane.disconnected:
                     self.observer.heartbeat()
-                if number % (SAMPLE_S / BEAT_S) == 0:
-                    self._write("path", self._place())
+                if number % (SAMPLE_S / HEARTBEAT_S) == 0:
+                    self._write("path", self._position())
 
-        self._spawn(beat())
+        self._spawn(send_heartbeats())
 
     async def _stop_tasks(self) -> None:
         for task in self._tasks:
@@ -243,7 +246,7 @@ class Flight:
     @asynccontextmanager
     async def flown(self) -> AsyncIterator[Flight]:
         async with self.world:
-            self._beat()
+            self._send_heartbeats()
             try:
                 yield self
             finally:
@@ -259,7 +262,7 @@ class Flight:
 
 
 def missions_of(world: World) -> list[Any]:
-    """The missions that the service remembers."""
+    """Return the missions in the control state."""
     return list(world.control.state.missions.values())
 
 
@@ -277,14 +280,14 @@ async def _steps(work: Any) -> AsyncIterator[Any]:
         yield await started
 
 
-def trace_of(directory: Path, course: Callable[[Flight], Coroutine[Any, Any, None]], **options: Any) -> Flight:
-    """Fly once."""
+def fly_script(directory: Path, script: Callable[[Flight], Coroutine[Any, Any, None]], **options: Any) -> Flight:
+    """Fly a script in virtual time and return the flight with its trace."""
     flights: list[Flight] = []
 
     async def flight() -> None:
         flights.append(Flight(directory, **options))
         async with flights[0].flown():
-            await course(flights[0])
+            await script(flights[0])
 
     fly(flight)
     return flights[0]

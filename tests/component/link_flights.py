@@ -1,6 +1,6 @@
-"""Drivers that fly at a wall as fast as they are let, over links of every delay: how far from it the drone stays.
+"""Drivers that fly toward a wall as fast as permitted, over links with a delay. The result is the least distance to the wall.
 
-The service and the vehicle are those of `closed_loop`; the distance is the true one.
+Service and vehicle are those of `closed_loop`. The distance is that of the true position.
 """
 
 from __future__ import annotations
@@ -29,17 +29,17 @@ WALL = shapely.box(-120.0, 60.0, 120.0, 90.0)
 
 @dataclass
 class Attempt:
-    """One driver, one wall.
+    """Result of one driver's flight toward a wall.
 
     Attributes:
-        kept_m: the least true distance from the wall; negative inside.
-        permitted: how many setpoints were.
-        denied: how many were not.
-        unavailable: how many of these because the position was not known at the moment.
-        problem: why the drone did not fly at all.
+        least_distance_m: Least true distance from the wall, negative inside of it.
+        permitted: Number of permitted setpoints.
+        denied: Number of denied setpoints.
+        unavailable: Number of denied setpoints while the position was unknown.
+        problem: Reason why the drone did not take off.
     """
 
-    kept_m: float = math.inf
+    least_distance_m: float = math.inf
     permitted: int = 0
     denied: int = 0
     unavailable: int = 0
@@ -52,7 +52,7 @@ Pilot = Callable[["Flown"], Awaitable[None]]
 
 @dataclass
 class Flown:
-    """What a driver has in its hands."""
+    """Drone, Grant and oracle of a flight."""
 
     drone: Drone
     chance: random.Random
@@ -62,17 +62,17 @@ class Flown:
     grant: ActiveGrant = field(init=False)
 
     def spec(self) -> GrantSpec:
-        """The grant as the walls are by now."""
+        """Return the Grant with the present walls."""
         zones = [zone(f"wall-{number}", "ignore", *wall.bounds) for number, wall in enumerate(self.walls)]
         return spec(*zones, operationArea=[area(-HALF_M, -HALF_M, HALF_M, HALF_M)])
 
     def put(self) -> ActiveGrant:
-        """Let the walls hold."""
+        """Issue a Grant with the present walls."""
         self.grant = self.drone.grants.put(self.spec())
         return self.grant
 
     async def fly(self, north: float, east: float, hold_s: float) -> bool:
-        """Ask for a velocity."""
+        """Request a velocity. Return True if it is permitted."""
         try:
             await self.drone.service.set_velocity(self.grant, VelocityArgs(north, east, 0.0, None, hold_s))
         except (Refused, AutopilotError) as error:
@@ -83,12 +83,12 @@ class Flown:
         return True
 
     async def to(self, x: float, y: float, speed: float = 10.0) -> None:
-        """Fly to a place."""
-        await _again(lambda: self.drone.service.goto(self.grant, goto(x, y, 15, speed_mps=speed), 0.0))
+        """Fly to a position in metres east and north of home."""
+        await _fly_with_retries(lambda: self.drone.service.goto(self.grant, goto(x, y, 15, speed_mps=speed), 0.0))
 
 
 async def straight(flown: Flown) -> None:
-    """As fast as it goes, again and again after each refusal."""
+    """Request a high velocity toward the wall repeatedly, also after refusals."""
     chance = flown.chance
     speed = chance.uniform(6, 12)
     hold_s = chance.choice([0.5, 1.0, 2.0])
@@ -99,7 +99,7 @@ async def straight(flown: Flown) -> None:
 
 
 async def bursts(flown: Flown) -> None:
-    """Setpoints of all directions in quick succession, more of them toward the wall."""
+    """Request velocities in quick succession, in all directions but mostly toward the wall."""
     chance = flown.chance
     for _ in range(100):
         angle = chance.gauss(0.0, 1.2)
@@ -109,7 +109,7 @@ async def bursts(flown: Flown) -> None:
 
 
 async def both(flown: Flown) -> None:
-    """First the one, then the other."""
+    """Fly `straight`, then `bursts`."""
     await straight(flown)
     await flown.to(0, 15)
     await bursts(flown)
@@ -118,8 +118,8 @@ async def both(flown: Flown) -> None:
 SPEEDS_MPS = (12, 10, 8, 7, 6, 5, 4, 3.5, 3, 2.5, 2, 1.5, 1, 0.7, 0.4)
 
 
-async def as_fast_as_let(flown: Flown) -> None:
-    """Straight at the wall, each time with the highest speed that is permitted."""
+async def at_highest_permitted_speed(flown: Flown) -> None:
+    """Fly straight toward the wall, each time with the highest permitted speed."""
     await flown.to(0, 0)
     for _ in range(30):
         for speed in SPEEDS_MPS:
@@ -128,8 +128,8 @@ async def as_fast_as_let(flown: Flown) -> None:
         await asyncio.sleep(0.4)
 
 
-def appears(away_m: float, speed_mps: float = 10.0) -> Pilot:
-    """A leg under way on which a wall appears so far ahead."""
+def wall_added_ahead(away_m: float, speed_mps: float = 10.0) -> Pilot:
+    """Return a pilot on whose leg a wall is added at a distance ahead of the drone."""
 
     async def pilot(flown: Flown) -> None:
         flown.walls.clear()
@@ -140,18 +140,18 @@ def appears(away_m: float, speed_mps: float = 10.0) -> Pilot:
             await asyncio.sleep(0.05)
         y = flown.oracle.place()[1]
         flown.walls.append(shapely.box(-120, y + away_m, 120, y + away_m + 15))
-        flown.attempt.kept_m = math.inf
+        flown.attempt.least_distance_m = math.inf
         flown.put()
         with contextlib.suppress(Refused, AutopilotError):
             await flying
-        while flown.oracle.speeds()[0] > 0.2:  # noqa: ASYNC110 - the simulation tells no one
+        while flown.oracle.speeds()[0] > 0.2:  # noqa: ASYNC110 - the simulation has no notification
             await asyncio.sleep(0.1)
 
     return pilot
 
 
-async def _again(motion: Callable[[], AsyncGenerator[Any]]) -> None:
-    """Fly a motion to its end, as often as it takes: the SDK tries again what is not available."""
+async def _fly_with_retries(motion: Callable[[], AsyncGenerator[Any]]) -> None:
+    """Fly a motion to its end. Retry while it is unavailable, as the SDK does."""
     for _ in range(20):
         try:
             async with contextlib.aclosing(motion()) as running:
@@ -171,15 +171,15 @@ async def _fly(sky: Sky, pilot: Pilot, seed: int, directory: Path) -> Attempt:
     flown = Flown(drone, random.Random(seed), attempt, oracle, [WALL])
     grant = flown.put()
 
-    def look() -> None:
+    def measure() -> None:
         x, y, height = oracle.place()
-        here = shapely.Point(x, y)
+        point = shapely.Point(x, y)
         for wall in flown.walls if height > 1.0 else ():
-            away = -wall.exterior.distance(here) if wall.contains(here) else wall.distance(here)
-            attempt.kept_m = min(attempt.kept_m, float(away))
+            away = -wall.exterior.distance(point) if wall.contains(point) else wall.distance(point)
+            attempt.least_distance_m = min(attempt.least_distance_m, float(away))
 
-    sky.witnesses.append(look)
-    turning = [asyncio.ensure_future(sky.turn())]
+    sky.witnesses.append(measure)
+    turning = [asyncio.ensure_future(sky.run_vehicle())]
     following = asyncio.ensure_future(drone.follow(grant))
     try:
         async with asyncio.timeout(120):
@@ -210,7 +210,7 @@ async def _fly(sky: Sky, pilot: Pilot, seed: int, directory: Path) -> Attempt:
 
 
 def attempt(pilot: Pilot, seed: int, weather: Weather, parameters: dict[str, float] | None = None) -> Attempt:
-    """Fly once."""
+    """Fly one attempt and return its result."""
     sky = Sky(seed, weather, parameters or {})
     with tempfile.TemporaryDirectory() as directory, asyncio.Runner(loop_factory=lambda: sky) as runner:
         return runner.run(_fly(sky, pilot, seed, Path(directory)))

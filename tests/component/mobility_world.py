@@ -28,7 +28,7 @@ from fractus_services.mobility.mavlink.mavlink_autopilot import MavlinkAutopilot
 from fractus_services.mobility.mavlink.rtl_parameters import RtlParameters
 from fractus_services.mobility.mavlink.timing import PROBE_S
 from fractus_services.mobility.rpc.mobility_components import MobilityComponents
-from parameter_vehicle import FAILSAFES, MOVEMENT, told
+from parameter_vehicle import FAILSAFES, MOVEMENT, parameter_responses
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 FRAME = LocalFrame(39.36, 22.95)
@@ -64,14 +64,14 @@ class Plane(MavlinkAutopilot):
         self.speed_mps = DEFAULT_MPS
         self.positions = False
         self.goal: tuple[float, float] | None = None
-        self.wanted: tuple[float, float, float] | None = None
-        self.wanted_until = 0.0
+        self.velocity_setpoint: tuple[float, float, float] | None = None
+        self.setpoint_end = 0.0
         self.goal_height = 0.0
         self.heading = 0.0
         self.commands: list[int] = []
         self.trace: list[tuple[float, float, float]] = []
         self.refuses: set[int] = set()
-        self.deaf = False
+        self.disconnected = False
         self.uplink_s = self.downlink_s = 0.0
         self.fixed: tuple[str, ...] = ()
         self.measured = False
@@ -97,21 +97,21 @@ class Plane(MavlinkAutopilot):
             await asyncio.sleep(self.step_s)
 
     def send(self, outgoing: Message) -> None:
-        if not self.deaf:
-            self._after(self.uplink_s, self._hear, outgoing)
+        if not self.disconnected:
+            self._after(self.uplink_s, self._receive, outgoing)
 
-    def _after(self, delay_s: float, what: Callable[..., None], *args: Any) -> None:
+    def _after(self, delay_s: float, function: Callable[..., None], *args: Any) -> None:
         if delay_s > 0:
-            asyncio.get_running_loop().call_later(delay_s, what, *args)
+            asyncio.get_running_loop().call_later(delay_s, function, *args)
         else:
-            what(*args)
+            function(*args)
 
     def _reply(self, outgoing: Message) -> None:
         self._after(self.downlink_s, self.take, outgoing)
 
-    def _hear(self, outgoing: Message) -> None:
-        for answer in told(self.parameters, outgoing, self.fixed):
-            self._reply(answer)
+    def _receive(self, outgoing: Message) -> None:
+        for response in parameter_responses(self.parameters, outgoing, self.fixed):
+            self._reply(response)
         kind = outgoing.name
         command = outgoing.values.get("command", 0)
         if kind in {"COMMAND_LONG", "COMMAND_INT"}:
@@ -131,8 +131,8 @@ class Plane(MavlinkAutopilot):
         elif kind == "SET_POSITION_TARGET_LOCAL_NED" and self.vehicle.mode == GUIDED and self.height > 0.2:
             self.commands.append(84)
             self.positions = False
-            self.wanted = (outgoing.real("vy"), outgoing.real("vx"), -outgoing.real("vz"))
-            self.wanted_until = self.now + 3.0
+            self.velocity_setpoint = (outgoing.real("vy"), outgoing.real("vx"), -outgoing.real("vz"))
+            self.setpoint_end = self.now + 3.0
             self.goal = None
 
     def _obey(self, outgoing: Message) -> None:
@@ -144,16 +144,16 @@ class Plane(MavlinkAutopilot):
         elif number == mavlink.MAV_CMD_NAV_TAKEOFF:
             self.goal = (self.xy[0], self.xy[1])
             self.goal_height = outgoing.real("param7") + self.raised_m
-            self.wanted = None
+            self.velocity_setpoint = None
         elif number == mavlink.MAV_CMD_DO_CHANGE_SPEED:
             self.speed_mps = outgoing.real("param2")
         elif number == mavlink.MAV_CMD_DO_REPOSITION:
             if not self.positions:
                 self.positions = True
-                self.speed_mps = DEFAULT_MPS  # its position controller begins again
+                self.speed_mps = DEFAULT_MPS  # the position controller starts again with its default speed
             self.goal = FRAME.xy(outgoing.integer("x") / 1e7, outgoing.integer("y") / 1e7)
             self.goal_height = outgoing.real("z") + self.raised_m
-            self.wanted = None
+            self.velocity_setpoint = None
         elif number == mavlink.MAV_CMD_CONDITION_YAW:
             self.heading = outgoing.real("param1")
         elif number == mavlink.MAV_CMD_DO_SET_HOME:
@@ -181,14 +181,16 @@ class Plane(MavlinkAutopilot):
         """Change the mode, as a pilot or a failsafe does."""
         self.positions = False
         self.vehicle.mode = mode
-        self.goal, self.wanted = ((self.xy[0], self.xy[1]), None) if mode in {GUIDED, BRAKE} else (None, None)
+        self.goal, self.velocity_setpoint = (
+            ((self.xy[0], self.xy[1]), None) if mode in {GUIDED, BRAKE} else (None, None)
+        )
         self.goal_height = self.height
 
     def _step(self) -> None:
         if self.vehicle.armed:
             self._move()
-        if not self.deaf:
-            self._tell()
+        if not self.disconnected:
+            self._report_state()
 
     def _move(self) -> None:
         east, north, up = self._command()
@@ -207,21 +209,21 @@ class Plane(MavlinkAutopilot):
             self.velocity = [0.0, 0.0]
             self.climb = 0.0
 
-    def _command(self) -> tuple[float, float, float]:  # noqa: PLR0911 - one line a mode
+    def _command(self) -> tuple[float, float, float]:  # noqa: PLR0911 - one return for each mode
         mode = self.vehicle.mode
         if mode == LAND:
             return 0.0, 0.0, -CLIMB
         if mode in {RTL, SMART_RTL}:
-            away = math.hypot(*self.xy)
-            if away > 0.7:
+            distance = math.hypot(*self.xy)
+            if distance > 0.7:
                 high = 15.0 if mode == RTL else self.height
                 if self.height < high - 0.3:
                     return 0.0, 0.0, CLIMB
                 return (*self._toward((0.0, 0.0)), 0.0)
             return 0.0, 0.0, -CLIMB
-        if self.wanted is not None:
-            if self.now < self.wanted_until:
-                return self.wanted
+        if self.velocity_setpoint is not None:
+            if self.now < self.setpoint_end:
+                return self.velocity_setpoint
             self.set_to(mode)
         if self.goal is None:
             return 0.0, 0.0, 0.0
@@ -231,13 +233,13 @@ class Plane(MavlinkAutopilot):
     def _toward(self, goal: tuple[float, float]) -> tuple[float, float]:
         x = goal[0] - self.xy[0]
         y = goal[1] - self.xy[1]
-        away = math.hypot(x, y)
-        if away < 0.05:
+        distance = math.hypot(x, y)
+        if distance < 0.05:
             return 0.0, 0.0
-        speed = min(self.speed_mps, away, math.sqrt(ACCEL * away))
-        return x / away * speed, y / away * speed
+        speed = min(self.speed_mps, distance, math.sqrt(ACCEL * distance))
+        return x / distance * speed, y / distance * speed
 
-    def _tell(self) -> None:
+    def _report_state(self) -> None:
         place = FRAME.latlon(self.xy[0], self.xy[1])
         height = self.height
         state = (*place, height - self.raised_m, height + GROUND_M, self.heading, *self.velocity, -self.climb)
@@ -310,7 +312,7 @@ class Fence:
 
 
 class World:
-    """Everything on a drone; use it inside `fly`."""
+    """Mobility service and fake autopilot of one drone. Use it inside `virtual_time.fly`."""
 
     def __init__(
         self,
@@ -320,7 +322,7 @@ class World:
         grace_s: float = 5.0,
         boarding_s: float = 0.0,
         after: World | None = None,
-        known: bool = True,
+        initialised: bool = True,
         step_s: float = STEP_S,
     ) -> None:
         self.plane = after.plane if after is not None else Plane(step_s)
@@ -336,19 +338,21 @@ class World:
         parts = MobilityComponents(
             self.plane, MavlinkFailsafes(self.plane), self.fence, RtlParameters(self.plane, directory), journal=self.journal, grants=self.grants,  # type: ignore[arg-type]
             audit=self.audit, clock=lambda: 1_790_000_000.0 + self.plane.now, grace_s=grace_s, boarding_s=boarding_s,  # type: ignore[arg-type]
-            state=ControlState(decided=known, armed_seen=facts.armed if known else None, expected_mode=GUIDED),
+            state=ControlState(decided=initialised, armed_seen=facts.armed if initialised else None, expected_mode=GUIDED),
         )  # fmt: skip
         self.control = parts.control
         self.gate = parts.gate
         self.service = parts.service
         self.streams = parts.streams
-        self.tours = parts.poi_missions
+        self.poi_missions = parts.poi_missions
         self.monitor = parts.monitor
         self.supervisor = parts.supervisor
         self.observer = parts.observer  # fmt: skip
         self.control.failsafe_status = FailsafeStatus("", (), Airframe(retraces=retraces), 8.0, retraces)
         self.plane.on_parameter = self.observer.parameter
-        self._tasks = [asyncio.ensure_future(part) for part in (self.plane.run(), self.monitor.run(), self.tours.run())]
+        self._tasks = [
+            asyncio.ensure_future(part) for part in (self.plane.run(), self.monitor.run(), self.poi_missions.run())
+        ]
         self.events: list[ControlEvent] = []
 
     async def __aenter__(self) -> World:
@@ -399,7 +403,7 @@ class World:
                 await self.plane.update(0.1)
 
     def kinds(self, kind: str) -> list[dict[str, Any]]:
-        return [content for found, content in self.entries if found == kind]
+        return [content for entry_kind, content in self.entries if entry_kind == kind]
 
 
 async def end(motion: Any) -> Progress:
@@ -471,5 +475,5 @@ def goto(x: float, y: float, alt: float = 10.0, **more: Any) -> GotoArgs:
     return GotoArgs(*at(x, y), alt, **more)
 
 
-def clear_m(world: World, *box: float) -> float:
+def clearance_m(world: World, *box: float) -> float:
     return float(min(shapely.box(*box).distance(shapely.Point(x, y)) for x, y, _ in world.plane.trace))

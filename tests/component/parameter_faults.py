@@ -1,4 +1,4 @@
-"""Vehicles whose parameters are lost, absent, no numbers, or unusual, against a plain reading of what their services may fly."""
+"""Vehicles with missing, unreadable or unusual parameters. An independent computation of the limits is the oracle."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ NEEDED = {
     "return_altitude_m": (("RTL_ALT", 0.01), ("RTL_ALT_M", 1.0), -math.inf),
     "speed_mps": (("WPNAV_SPEED", 0.01), ("WP_SPD", 1.0), -math.inf),
 }
-"""What must be known of how a vehicle moves: its name before release 4.7 and since, each with its unit, and the least."""
+"""Required parameters by field: name and scale before release 4.7, name and scale since then, and minimum."""
 
-OTHERS = {
+OTHER_PARAMETERS = {
     "SYSID_MYGCS": 255.0, "FS_GCS_ENABLE": 0.0, "FS_GCS_TIMEOUT": 5.0, "GUID_TIMEOUT": 3.0, "BATT_FS_LOW_ACT": 0.0,
     "BATT_FS_CRT_ACT": 0.0, "FS_EKF_ACTION": 1.0, "SRTL_POINTS": 300.0, "FENCE_ENABLE": 0.0, "FENCE_AUTOENABLE": 0.0,
     "FENCE_TYPE": 7.0, "FENCE_ALT_MAX": 100.0, "FENCE_MARGIN": 2.0, "FENCE_ACTION": 1.0, "FENCE_OPTIONS": 0.0,
@@ -35,53 +35,53 @@ OTHERS = {
 
 @dataclass
 class _Parameters:
-    """A vehicle's parameters as the service reads and sets them."""
+    """Fake of the parameter interface that the service uses."""
 
     values: dict[str, float]
-    lost: set[str]
-    told: dict[str, float] = field(default_factory=dict)
+    unreadable: set[str]
+    reported: dict[str, float] = field(default_factory=dict)
     leg_speed: dict[str, float] = field(default_factory=dict)
 
-    async def read(self, wanted: Iterable[tuple[str, ...]]) -> dict[str, float]:
-        """Those that the vehicle has.
+    async def read(self, requested: Iterable[tuple[str, ...]]) -> dict[str, float]:
+        """Return the requested parameters that the vehicle has.
 
         Raises:
-            ParameterLost: one of them does not answer.
+            ParameterLost: A parameter is unreadable.
         """
-        names = {name for names in wanted for name in names}
-        if names & self.lost:
-            raise ParameterLost(f"{', '.join(sorted(names & self.lost))} cannot be read")
+        names = {name for alternatives in requested for name in alternatives}
+        if names & self.unreadable:
+            raise ParameterLost(f"{', '.join(sorted(names & self.unreadable))} cannot be read")
         return {name: value for name, value in self.values.items() if name in names}
 
     async def write(self, name: str, value: float) -> float:
-        """Set one."""
+        """Set a parameter."""
         self.values[name] = value
         return value
 
 
 def parameter_faults(seed: int, count: int) -> list[str]:
-    """Vehicles with random faults: what went wrong with which.
+    """Check vehicles with random parameter faults, and return a text for each violation.
 
-    A service may arm only a vehicle all of whose figures it knows, and flies it by these.
+    The service must arm a vehicle only if all required parameters are known, and it must use their values.
     """
     rng = random.Random(seed)
     logging.getLogger("fractus_services.mobility.mavlink.failsafes").setLevel(logging.CRITICAL + 1)
     with asyncio.Runner() as runner:
-        return [f"seed {seed}, vehicle {i}: {wrong}" for i in range(count) if (wrong := runner.run(_wrong(rng)))]
+        return [f"seed {seed}, vehicle {i}: {wrong}" for i in range(count) if (wrong := runner.run(_violation(rng)))]
 
 
-async def _wrong(rng: random.Random) -> str:
-    """What is wrong with what the service makes of one vehicle."""
-    values = dict(OTHERS)
-    lost = set()
+async def _violation(rng: random.Random) -> str:
+    """Return the violation of the service for one random vehicle, or an empty text."""
+    values = dict(OTHER_PARAMETERS)
+    unreadable = set()
     expected = {}
     known = True
-    for figure, (older, newer, least) in NEEDED.items():
+    for field_name, (older, newer, minimum) in NEEDED.items():
         name, scale = rng.choice((older, newer))
         value = rng.choice((rng.uniform(0.5, 10.0), 0.0, -1.0, 1e6)) / scale
-        match rng.choice(("told",) * 20 + ("lost", "absent", "no number")):
-            case "lost":
-                lost.add(name)
+        match rng.choice(("reported",) * 20 + ("unreadable", "absent", "no number")):
+            case "unreadable":
+                unreadable.add(name)
                 known = False
             case "absent":
                 known = False
@@ -90,22 +90,24 @@ async def _wrong(rng: random.Random) -> str:
                 known = False
             case _:
                 values[name] = value
-        expected[figure] = max(value * scale, least)
+        expected[field_name] = max(value * scale, minimum)
     name, scale, lean_deg = rng.choice(
         (("ANGLE_MAX", 0.01, 10.0), ("ANGLE_MAX", 0.01, 30.0), ("ATC_ANGLE_MAX", 1.0, 20.0))
     )
     values |= {name: lean_deg / scale, "PSC_ANGLE_MAX": rng.choice((0.0, 15.0))}
     braking_deg = (values["PSC_ANGLE_MAX"] or lean_deg) - 4.0
     expected["accel_mps2"] = min(expected["accel_mps2"], 9.81 * math.tan(math.radians(braking_deg)))
-    parameters = _Parameters(values, lost)
+    parameters = _Parameters(values, unreadable)
     autopilot: Any = SimpleNamespace(
         stack=ARDUCOPTER, vehicle_parameters=parameters, vehicle=SimpleNamespace(unsupported="")
     )
     checked = await MavlinkFailsafes(autopilot).configure()
     if not known:
-        return "" if checked.problem else f"may arm, though not all is known: {values}, lost {lost}"
+        return "" if checked.problem else f"may arm, though not all is known: {values}, unreadable {unreadable}"
     if checked.problem:
         return f"may not arm, though all is known: {checked.problem}"
-    flown = {figure: getattr(checked.airframe, figure, checked.speed_mps) for figure in expected}
-    differ = [figure for figure in expected if not math.isclose(flown[figure], expected[figure], abs_tol=1e-9)]
+    flown = {field_name: getattr(checked.airframe, field_name, checked.speed_mps) for field_name in expected}
+    differ = [
+        field_name for field_name in expected if not math.isclose(flown[field_name], expected[field_name], abs_tol=1e-9)
+    ]
     return f"{differ} of {flown} are not {expected}" if differ else ""

@@ -1,8 +1,8 @@
-"""Random fleets, applications and policies, and what a plan of them must be, by looking at everything.
+"""Exhaustive oracle for plans of random fleets, applications and policies.
 
-The oracle knows the rules (thesis chapter 8.5 and its errata, docs/policies.md), but nothing of the planner's indexes, searches and
-geometry: distances are geodesics, flights are sampled, zones are circles around which a grid is flooded, instances are
-assigned by trying all. Where a figure is so near its bound that rounding decides, a scene is `Undecided`.
+The oracle applies the rules (thesis chapter 8.5 and its errata, docs/policies.md) without the indexes, searches and geometry of the
+planner. Distances are geodesics, and flights are sampled. Zones are circles, routes around them are found by flood fill of a grid,
+and instances are assigned by exhaustive search. If rounding may decide a comparison, the scene is `Undecided`.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ from fractus_core.planning.coverage import Samples
 
 NOW_S = 1_780_000_000.0
 FLOWN_M = 10.0
-"""The altitude of all waypoints."""
+"""Altitude of all waypoints in metres."""
 SAFETY_M = 7.0
 NEAR_M = 800.0
 RESERVE = 0.2
 CRUISE_MPS = 5.0
 CLIMB_MPS = 1.5
 MARGIN_M = 2.5
-"""What a leg from standstill keeps from zones: position error and deviation of the autopilot."""
+"""Margin around zones for a leg from standstill: position error and deviation of the autopilot."""
 STEP_M = 3.0
 CPU = 0.1
 ROOMS = (0.05, 0.1, 0.2, 0.2, 4.0, 4.0)
@@ -42,7 +42,7 @@ OTHER = ("default", "other")
 
 
 class Undecided(Exception):
-    """Rounding decides."""
+    """Rounding may decide a comparison of this scene."""
 
 
 # -- scenes --
@@ -50,10 +50,10 @@ class Undecided(Exception):
 
 @dataclass
 class Scene:
-    """What is planned, and what the oracle is told of it in plain figures."""
+    """Planned application and inventory, and zones as circles for the oracle."""
 
     application: Application
-    stock: Inventory
+    inventory: Inventory
     settings: Settings
     frame: LocalFrame
     zones: dict[str, tuple[float, float, float]] = field(default_factory=dict)
@@ -62,8 +62,8 @@ class Scene:
         return self.frame.xy(place.lat, place.lon)
 
 
-class Maker:
-    """Makes the scene of a seed."""
+class SceneBuilder:
+    """Builds the random scene of a seed."""
 
     def __init__(self, seed: int) -> None:
         self.rng = random.Random(seed)
@@ -85,15 +85,15 @@ class Maker:
         path = [self.somewhere(250) for _ in range(rng.randint(1, 4))]
         drones = self.drones()
         edges = self.edges()
-        components = self.aboard(path)
-        components += self.on_the_ground([c["name"] for c in components if c["name"] == "Viewer"])
+        components = self.drone_components(path)
+        components += self.ground_components([c["name"] for c in components if c["name"] == "Viewer"])
         application = Application.from_body(body("Application", "app", {"components": components}))
         zones, policies = self.policies(path)
         hosts = [self.host(d.name, "drone") for d in drones] + [self.host(e.name, "edge") for e in edges]
         hosts += [self.host(f"cloud-{i}", "cloud") for i in range(rng.randint(0, 2) or 1)]
         flights = self.flights(path, drones) if rng.random() < 0.7 else {}
         claimed = {name: flight.holder for name, flight in flights.items()}
-        stock = Inventory(
+        inventory = Inventory(
             hosts={h.name: h for h in hosts},
             drones={d.name: d for d in drones},
             edge_nodes={e.name: e for e in edges},
@@ -110,17 +110,17 @@ class Maker:
             n: (*self.frame.xy(*z["area"]["circle"]["center"].values()), z["area"]["circle"]["radius"])
             for n, z in zones.items()
         }
-        return Scene(application, stock, settings, self.frame, circles)
+        return Scene(application, inventory, settings, self.frame, circles)
 
     def host(self, name: str, node_class: str) -> Host:
         rng = self.rng
-        plain = rng.random() < 0.92
+        usable = rng.random() < 0.92
         return Host(
             name,
             {"fractus.dev/class": node_class},
             {"cpu": rng.choice(ROOMS) if node_class != "cloud" or rng.random() < 0.1 else 4.0},
-            ready=plain or rng.random() < 0.5,
-            schedulable=plain or rng.random() < 0.5,
+            ready=usable or rng.random() < 0.5,
+            schedulable=usable or rng.random() < 0.5,
         )
 
     def interfaces(self) -> list[dict[str, Any]]:
@@ -132,7 +132,7 @@ class Maker:
 
     def drones(self) -> list[Drone]:
         rng = self.rng
-        found = []
+        drones = []
         for i in range(rng.randint(1, 6)):
             depot = rng.choice([*self.depots, "depot-0", "depot-0", None])
             home = self.at(*self.somewhere(rng.choice([30, 300, 900]))) if depot is None or rng.random() < 0.2 else None
@@ -160,8 +160,8 @@ class Maker:
             }
             spec = {"interfaces": self.interfaces(), "services": services}
             spec |= {k: v for k, v in (("depot", depot), ("home", home)) if v is not None}
-            found.append(Drone.from_body(body("Drone", f"d{i}", spec, status=status)))
-        return found
+            drones.append(Drone.from_body(body("Drone", f"d{i}", spec, status=status)))
+        return drones
 
     def edges(self) -> list[EdgeNode]:
         return [
@@ -171,33 +171,33 @@ class Maker:
             for i in range(self.rng.choice([0, 3, 5, 7, 9]))
         ]
 
-    def aboard(self, path: Sequence[tuple[float, float]]) -> list[dict[str, Any]]:
+    def drone_components(self, path: Sequence[tuple[float, float]]) -> list[dict[str, Any]]:
         rng = self.rng
-        way = [self.at(x, y, FLOWN_M) for x, y in path]
+        path_points = [self.at(x, y, FLOWN_M) for x, y in path]
         camera = [{"service": "camera", "methods": ["CaptureImage"]}] if rng.random() < 0.7 else []
         viewer = component("Viewer", "drone", services=camera, **{"class": "passenger"})
         kind = rng.choice(["none", "tour", "tour", "full", "full", "partial", "partial"])
         if kind == "none":
             return []
         if kind == "tour":
-            return [viewer | {"pointsOfInterest": {"points": way, "ordered": True}}]
+            return [viewer | {"pointsOfInterest": {"points": path_points, "ordered": True}}]
         starts: list[dict[str, Any]] = [
             {},
             {"point": {"depot": "depot-0"}},
             {"point": {"position": self.at(*path[0], FLOWN_M)}},
         ]
-        points = [{**rng.choice(starts), "navigation": "pathBased", "path": way}]
-        if kind == "partial" and len(way) > 1 and rng.random() < 0.5:
-            points = [points[0] | {"path": way[:1]}, {"navigation": "pathBased", "path": way[1:]}]
+        points = [{**rng.choice(starts), "navigation": "pathBased", "path": path_points}]
+        if kind == "partial" and len(path_points) > 1 and rng.random() < 0.5:
+            points = [points[0] | {"path": path_points[:1]}, {"navigation": "pathBased", "path": path_points[1:]}]
         mobility = [{"service": "mobility", "methods": ["Arm", "Takeoff", "Goto"]}]
         driver = component(
             "Driver", "drone", services=mobility, control=kind, controlPoints=points, **{"class": "driver"}
         )
         return [driver, *([viewer] if rng.random() < 0.5 else [])]
 
-    def on_the_ground(self, viewers: list[str]) -> list[dict[str, Any]]:
+    def ground_components(self, viewers: list[str]) -> list[dict[str, Any]]:
         rng = self.rng
-        found = []
+        components = []
         for i in range(rng.choice([0, 0, 1, 1, 2])):
             locations = [
                 {
@@ -207,11 +207,11 @@ class Maker:
                 }
                 for _ in range(rng.choice([1, 1, 2, 3]))
             ]
-            found.append(component(f"Static{i}", "edge", locations=locations))
-        targets = [c["name"] for c in found[:1]] + viewers
-        found += [component("Checker", "hybrid", hybridTo=targets)] if targets else []
-        found.append(component("Store", "cloud"))
-        return found
+            components.append(component(f"Static{i}", "edge", locations=locations))
+        targets = [c["name"] for c in components[:1]] + viewers
+        components += [component("Checker", "hybrid", hybridTo=targets)] if targets else []
+        components.append(component("Store", "cloud"))
+        return components
 
     def policies(self, path: Sequence[tuple[float, float]]) -> tuple[dict[str, Any], dict[str, Any]]:
         rng = self.rng
@@ -231,7 +231,7 @@ class Maker:
         return zones, policies
 
     def scope(self, zones: list[str]) -> dict[str, Any]:
-        """For whom and when a policy holds."""
+        """Return a random selector and validity window of a policy."""
         rng = self.rng
         selector: dict[str, Any] = {"zones": zones}
         if rng.random() < 0.6:
@@ -246,22 +246,28 @@ class Maker:
         return {"selector": selector} | window
 
     def flights(self, path: Sequence[tuple[float, float]], drones: list[Drone]) -> dict[str, Flight]:
-        """What drones of another application fly: along this one's points, against their order, past some, or elsewhere."""
+        """Return flights of another application: along the points, in reverse order, past some of them, or elsewhere."""
         rng = self.rng
-        found = {}
+        flights = {}
         for drone in rng.sample(drones, rng.randint(0, min(2, len(drones)))):
-            way = list(path)
+            waypoints = list(path)
             match rng.choice(["along", "against", "past", "elsewhere"]):
                 case "along":
-                    way = [self.somewhere(300), *((x + rng.uniform(-4, 4), y) for x, y in way), self.somewhere(300)]
+                    waypoints = [
+                        self.somewhere(300),
+                        *((x + rng.uniform(-4, 4), y) for x, y in waypoints),
+                        self.somewhere(300),
+                    ]
                 case "against":
-                    way = way[::-1]
+                    waypoints = waypoints[::-1]
                 case "past":
-                    way = [(x, y + rng.choice([0, 30])) for x, y in way]
+                    waypoints = [(x, y + rng.choice([0, 30])) for x, y in waypoints]
                 case _:
-                    way = [self.somewhere(400) for _ in range(3)]
-            found[drone.name] = Flight(OTHER, (tuple(Position.model_validate(self.at(x, y, FLOWN_M)) for x, y in way),))
-        return found
+                    waypoints = [self.somewhere(400) for _ in range(3)]
+            flights[drone.name] = Flight(
+                OTHER, (tuple(Position.model_validate(self.at(x, y, FLOWN_M)) for x, y in waypoints),)
+            )
+        return flights
 
 
 def body(kind: str, name: str, spec: dict[str, Any], **more: Any) -> dict[str, Any]:
@@ -277,26 +283,17 @@ def stamp(time_s: float) -> str:
     return datetime.fromtimestamp(time_s, UTC).isoformat()
 
 
-# -- what must be --
-
-
-@dataclass
-class Judged:
-    """What becomes of a way: None where rounding decides."""
-
-    legal: bool
-    needed_min: float
-    changed: bool
+# -- oracle --
 
 
 class Oracle:
-    """What a plan of a scene must be."""
+    """Expected plan of a scene."""
 
     def __init__(self, scene: Scene) -> None:
         self.scene = scene
         self.spec = scene.application.spec
-        self.stock = scene.stock
-        self.left = {name: host.allocatable["cpu"] for name, host in scene.stock.hosts.items()}
+        self.inventory = scene.inventory
+        self.free_cpu = {name: host.allocatable["cpu"] for name, host in scene.inventory.hosts.items()}
         self.reasons: dict[str, str] = {}
 
     def near(self, a: Any, b: Any, limit_m: float) -> bool:
@@ -305,35 +302,35 @@ class Oracle:
             raise Undecided
         return distance <= limit_m
 
-    def host_is_fine(self, name: str, count: int = 1) -> bool:
-        host = self.stock.hosts[name]
-        return host.ready and host.schedulable and self.left[name] >= count * CPU - 1e-9
+    def is_host_usable(self, name: str, count: int = 1) -> bool:
+        host = self.inventory.hosts[name]
+        return host.ready and host.schedulable and self.free_cpu[name] >= count * CPU - 1e-9
 
     # -- the drone --
 
     def expected_drone(self) -> str | None:
-        """The drone that flies; None where there is none (raises nothing)."""
+        """Return the drone that must be chosen, or None if no drone fits."""
         leader = self.spec.leader
         assert leader is not None
         candidates = []
-        for name, drone in self.stock.drones.items():
-            flight = self.stock.flights.get(name)
-            used = self.spec.driver is None and flight is not None and self.visits(flight)
-            if not used and not self.stands_right(drone):
+        for name, drone in self.inventory.drones.items():
+            flight = self.inventory.flights.get(name)
+            shared = self.spec.driver is None and flight is not None and self.visits(flight)
+            if not shared and not self.is_at_start(drone):
                 continue
-            reason = self.reason(drone, used=used)
+            reason = self.reason(drone, shared=shared)
             if reason:
                 self.reasons[name] = reason
             else:
                 minutes = drone.spec.services.mobility.max_flight_time if drone.spec.services.mobility else 0.0
                 assert drone.status is not None
                 assert drone.status.battery is not None
-                ready = 2.0 if used else 0.0 if drone.status.flight_state == "charging" else 1.0
-                score = ready + min(minutes * drone.status.battery.remaining / 1440, 0.999)
-                candidates.append((-score, name, used))
+                readiness = 2.0 if shared else 0.0 if drone.status.flight_state == "charging" else 1.0
+                score = readiness + min(minutes * drone.status.battery.remaining / 1440, 0.999)
+                candidates.append((-score, name, shared))
         candidates.sort()
-        for _, name, used in candidates:
-            if used or self.legal(self.stock.drones[name]):
+        for _, name, shared in candidates:
+            if shared or self.legal(self.inventory.drones[name]):
                 return name
             self.reasons[name] = "PolicyConflict"
         if candidates and self.scene.settings.policy_conflicts == "warn":
@@ -343,23 +340,23 @@ class Oracle:
         return None
 
     def home(self, drone: Drone) -> Any:
-        depot = self.stock.depots.get(drone.spec.depot or "")
+        depot = self.inventory.depots.get(drone.spec.depot or "")
         return drone.spec.home or (depot.spec.location if depot is not None else None)
 
-    def stands_right(self, drone: Drone) -> bool:
+    def is_at_start(self, drone: Drone) -> bool:
         home = self.home(drone)
         driver = self.spec.driver
         if home is None:
             return False
         first = driver.control_points[0] if driver is not None else None
         point = first.point if first is not None else None
-        kept = point is not None and point.depot is not None and drone.spec.depot == point.depot
+        in_depot = point is not None and point.depot is not None and drone.spec.depot == point.depot
         if point is not None and point.depot is not None:
-            named = self.stock.depots[point.depot].spec
+            named = self.inventory.depots[point.depot].spec
             limit = max(NEAR_M, named.radius) if driver is not None and driver.control == "partial" else named.radius
-            return kept or self.near(named.location, home, limit)
+            return in_depot or self.near(named.location, home, limit)
         if driver is not None and driver.control == "full" and point is not None:
-            depot = self.stock.depots.get(drone.spec.depot or "")
+            depot = self.inventory.depots.get(drone.spec.depot or "")
             around = depot is not None and self.near(depot.spec.location, point.position, depot.spec.radius)
             return around or self.near(point.position, home, SAFETY_M)
         return self.near(self.route()[0], home, NEAR_M)
@@ -368,46 +365,48 @@ class Oracle:
         if self.spec.driver is None:
             assert self.spec.points_of_interest is not None
             return list(self.spec.points_of_interest.points)
-        found: list[Any] = []
+        points: list[Any] = []
         for point in self.spec.driver.control_points:
             if point.point is not None:
-                found.append(
-                    self.stock.depots[point.point.depot].spec.location if point.point.depot else point.point.position
+                points.append(
+                    self.inventory.depots[point.point.depot].spec.location
+                    if point.point.depot
+                    else point.point.position
                 )
-            found += point.path or ()
-        return found
+            points += point.path or ()
+        return points
 
-    def reason(self, drone: Drone, *, used: bool) -> str:
-        """The first rule that a drone fails; empty if it keeps all."""
-        return next((reason for reason, broken in self.rules(drone, used=used) if broken), "")
+    def reason(self, drone: Drone, *, shared: bool) -> str:
+        """Return the reason of the first rule that a drone breaks, or an empty text."""
+        return next((reason for reason, broken in self.rules(drone, shared=shared) if broken), "")
 
-    def rules(self, drone: Drone, *, used: bool) -> Iterator[tuple[str, bool]]:
-        """The rules in their order, each with whether a drone fails it."""
+    def rules(self, drone: Drone, *, shared: bool) -> Iterator[tuple[str, bool]]:
+        """Yield the rules in order: reason, and whether the drone breaks the rule."""
         services = drone.spec.services
         mobility = drone.spec.services.mobility
         status = drone.status
         assert status is not None
-        aboard = list(self.spec.on("drone"))
-        for request in (request for one in aboard for request in one.services):
+        drone_components = list(self.spec.on("drone"))
+        for request in (request for item in drone_components for request in item.services):
             offered = getattr(services, request.service)
             yield "ServiceMissing", offered is None
             yield "MethodMissing", not set(request.methods) <= set(offered.methods)
         needed = 0.0
-        if not used:
+        if not shared:
             yield "ServiceMissing", mobility is None
             assert mobility is not None
             yield "TooHigh", mobility.max_altitude < FLOWN_M
-            needed = self.flight_min(drone, self.asked_m(drone), CRUISE_MPS, FLOWN_M)
-            yield "FlightTooLong", _over(needed, (1 - RESERVE) * mobility.max_flight_time)
-            yield "Claimed", drone.name in self.stock.claimed
-        host = self.stock.hosts[drone.name]
+            needed = self.flight_min(drone, self.requested_distance_m(drone), CRUISE_MPS, FLOWN_M)
+            yield "FlightTooLong", _exceeds(needed, (1 - RESERVE) * mobility.max_flight_time)
+            yield "Claimed", drone.name in self.inventory.claimed
+        host = self.inventory.hosts[drone.name]
         yield "NodeNotReady", not host.ready
         yield "NodeUnschedulable", not host.schedulable
         yield "DroneNotReady", status.conditions[0].status != "True"
-        yield "FlightTooLong", not used and _over(needed, self.available_min(drone))
-        yield "InsufficientResources", self.left[drone.name] < len(aboard) * CPU - 1e-9
+        yield "FlightTooLong", not shared and _exceeds(needed, self.available_min(drone))
+        yield "InsufficientResources", self.free_cpu[drone.name] < len(drone_components) * CPU - 1e-9
 
-    def asked_m(self, drone: Drone) -> float:
+    def requested_distance_m(self, drone: Drone) -> float:
         stops = [self.home(drone), *self.route(), self.home(drone)]
         return sum(geodesic_m(a, b) for a, b in itertools.pairwise(stops))
 
@@ -425,22 +424,22 @@ class Oracle:
         return mobility.max_flight_time * (status.battery.remaining - RESERVE)
 
     def visits(self, flight: Flight) -> bool:
-        """Whether a flight passes all points in order, by looking at it each quarter of a metre."""
+        """Return True if a flight passes all points in order. The flight is sampled every 0.25 m."""
         xy = [self.scene.xy(p) for leg in flight.legs for p in leg]
-        places = [np.array(xy[0])]
+        samples = [np.array(xy[0])]
         for a, b in itertools.pairwise(xy):
             count = max(int(math.dist(a, b) / 0.25), 1)
-            places += [np.array(a) + (np.array(b) - np.array(a)) * k / count for k in range(1, count + 1)]
-        way = np.array(places)
+            samples += [np.array(a) + (np.array(b) - np.array(a)) * k / count for k in range(1, count + 1)]
+        track = np.array(samples)
         at = 0
         for point in self.route():
-            away = np.hypot(*(way - np.array(self.scene.xy(point))).T)
-            if np.abs(away[at:].min() - SAFETY_M) < 0.3:
+            distances = np.hypot(*(track - np.array(self.scene.xy(point))).T)
+            if np.abs(distances[at:].min() - SAFETY_M) < 0.3:
                 raise Undecided
-            inside = np.flatnonzero(away[at:] <= SAFETY_M)
+            inside = np.flatnonzero(distances[at:] <= SAFETY_M)
             if not len(inside):
-                # What the flight left behind by a hair may count as ahead.
-                if (away[max(at - 4, 0) :] <= SAFETY_M).any():
+                # A point just behind the current sample may count as ahead.
+                if (distances[max(at - 4, 0) :] <= SAFETY_M).any():
                     raise Undecided
                 return False
             at += int(inside[0])
@@ -448,11 +447,11 @@ class Oracle:
 
     # -- policies --
 
-    def holding(self, drone: Drone, minutes: float) -> Iterator[Policy]:
-        for policy in self.stock.policies.values():
+    def active_policies(self, drone: Drone, minutes: float) -> Iterator[Policy]:
+        for policy in self.inventory.policies.values():
             selector = policy.spec.selector
-            wanted = selector.applications
-            if wanted is not None and "app" not in wanted.names:
+            applications = selector.applications
+            if applications is not None and "app" not in applications.names:
                 continue
             if any((drone.name in e.values) != (e.operator == "In") for e in selector.nodes):
                 continue
@@ -461,8 +460,8 @@ class Oracle:
                 yield policy
 
     def legal(self, drone: Drone) -> bool:
-        asked_min = self.flight_min(drone, self.asked_m(drone), CRUISE_MPS, FLOWN_M)
-        policies = list(self.holding(drone, asked_min))
+        requested_min = self.flight_min(drone, self.requested_distance_m(drone), CRUISE_MPS, FLOWN_M)
+        policies = list(self.active_policies(drone, requested_min))
         circles = [self.scene.zones[z] for p in policies for z in p.spec.selector.zones]
         speed = CRUISE_MPS
         height = FLOWN_M
@@ -490,44 +489,50 @@ class Oracle:
         detour = False
         for (a, b), system in zip(itertools.pairwise(stops), systems, strict=True):
             if _blocked([a, b], circles):
-                if not system or not self.way_around(a, b, circles, drone):
+                if not system or not self.has_detour(a, b, circles, drone):
                     return False
                 detour = True
         if detour or not changed:
-            if detour and (0.4 * self.available_min(drone) < asked_min or changed):
-                raise Undecided  # How long the detour is, is not known here.
+            if detour and (0.4 * self.available_min(drone) < requested_min or changed):
+                raise Undecided  # The oracle does not know the length of the detour.
             return True
-        return not _over(self.flight_min(drone, self.asked_m(drone), speed, height), self.available_min(drone))
+        return not _exceeds(
+            self.flight_min(drone, self.requested_distance_m(drone), speed, height), self.available_min(drone)
+        )
 
     def flown_by_system(self, legs: int) -> list[bool]:
-        """Which legs the system flies: all of a tour, those to control points under partial control, and the last."""
+        """Return for each leg whether the system flies it: all legs of a POI mission, legs to control points under partial control, and the last leg."""
         driver = self.spec.driver
         if driver is None:
             return [True] * legs
-        found = []
+        by_system = []
         for point in driver.control_points:
             places = (point.point is not None) + len(point.path or ())
-            found += [driver.control == "partial"] + [False] * (places - 1)
-        return [*found, True]
+            by_system += [driver.control == "partial"] + [False] * (places - 1)
+        return [*by_system, True]
 
-    def way_around(self, a: tuple[float, float], b: tuple[float, float], circles: Any, drone: Drone) -> bool:
-        """Whether a grid has a way between two places, in the hull of operation area and stand."""
+    def has_detour(self, a: tuple[float, float], b: tuple[float, float], circles: Any, drone: Drone) -> bool:
+        """Return True if a grid has a route between two points, in the hull of operation area and depot."""
         if any(abs(math.dist(p, (x, y)) - r - MARGIN_M) < 3 * STEP_M for p in (a, b) for x, y, r in circles):
-            raise Undecided  # The grid is too coarse there.
-        area = operation_area(self.spec, self.stock.depots, SAFETY_M)
+            raise Undecided  # The grid is too coarse near a zone.
+        area = operation_area(self.spec, self.inventory.depots, SAFETY_M)
         assert area is not None
-        depot = self.stock.depots.get(drone.spec.depot or "")
-        # The planner's frame lies a few hundred metres off ours: the same to a millimetre.
+        depot = self.inventory.depots.get(drone.spec.depot or "")
+        # The frames of planner and oracle are a few hundred metres apart, but agree to a millimetre.
         coordinates = shapely.get_coordinates(area.shape)
         points = [self.scene.frame.xy(*area.frame.latlon(x, y)) for x, y in coordinates]
-        stand = shapely.Point(self.scene.xy(self.home(drone))).buffer(depot.spec.radius if depot is not None else 30.0)
-        hull = shapely.union(shapely.MultiPoint(points), stand).convex_hull
-        answers = {self.floods(a, b, circles, hull, MARGIN_M + slack) for slack in (1.5 * STEP_M, -1.5 * STEP_M)}
-        if len(answers) > 1:
+        depot_area = shapely.Point(self.scene.xy(self.home(drone))).buffer(
+            depot.spec.radius if depot is not None else 30.0
+        )
+        hull = shapely.union(shapely.MultiPoint(points), depot_area).convex_hull
+        results = {self.is_connected(a, b, circles, hull, MARGIN_M + slack) for slack in (1.5 * STEP_M, -1.5 * STEP_M)}
+        if len(results) > 1:
             raise Undecided
-        return answers.pop()
+        return results.pop()
 
-    def floods(self, a: tuple[float, float], b: tuple[float, float], circles: Any, hull: Any, margin_m: float) -> bool:
+    def is_connected(
+        self, a: tuple[float, float], b: tuple[float, float], circles: Any, hull: Any, margin_m: float
+    ) -> bool:
         if _blocked([b, b], circles):
             return False
         west, south, east, north = hull.bounds
@@ -535,13 +540,13 @@ class Oracle:
         rows = int((north - south) / STEP_M) + 1
         x, y = np.meshgrid(west + STEP_M * np.arange(columns), south + STEP_M * np.arange(rows), indexing="ij")
         inner = hull.buffer(-margin_m)
-        free = shapely.contains_xy(inner, x, y) if not inner.is_empty else np.zeros_like(x, dtype=bool)
+        passable = shapely.contains_xy(inner, x, y) if not inner.is_empty else np.zeros_like(x, dtype=bool)
         for cx, cy, radius in circles:
-            free &= np.hypot(x - cx, y - cy) > radius + margin_m
+            passable &= np.hypot(x - cx, y - cy) > radius + margin_m
         reach = 2 * STEP_M + max(margin_m, 0)
         begin, goal = (np.hypot(x - p[0], y - p[1]) <= reach for p in (a, b))
-        pending = deque(map(tuple, np.argwhere(begin & free).tolist()))
-        seen = begin & free
+        pending = deque(map(tuple, np.argwhere(begin & passable).tolist()))
+        visited = begin & passable
         while pending:
             i, j = pending.popleft()
             if goal[i, j]:
@@ -549,19 +554,19 @@ class Oracle:
             for di, dj in itertools.product((-1, 0, 1), repeat=2):
                 k = i + di
                 m = j + dj
-                if 0 <= k < columns and 0 <= m < rows and free[k, m] and not seen[k, m]:
-                    seen[k, m] = True
+                if 0 <= k < columns and 0 <= m < rows and passable[k, m] and not visited[k, m]:
+                    visited[k, m] = True
                     pending.append((k, m))
         return False
 
     # -- edge nodes --
 
-    def check_statics(self, found: DeploymentPlanSpec | None) -> bool:
-        """Whether static components are where they must be; with no plan, whether there cannot be one."""
+    def check_statics(self, planned: DeploymentPlanSpec | None) -> bool:
+        """Check the placements of static components. Without a plan, return True if no plan is possible."""
         slots = [(c.name, i, spot) for c in self.spec.on("edge") for i, spot in enumerate(c.locations)]
         inside = {
             (name, i): sorted(
-                (n for n in self.stock.edge_nodes if self.near(spot.center, self.place(n), spot.radius)),
+                (n for n in self.inventory.edge_nodes if self.near(spot.center, self.place(n), spot.radius)),
                 key=lambda n, spot=spot: geodesic_m(spot.center, self.place(n)),
             )
             for name, i, spot in slots
@@ -570,142 +575,150 @@ class Oracle:
             away = [geodesic_m(spot.center, self.place(n)) for n in nodes]
             if any(b - a < 0.01 for a, b in itertools.pairwise(away)):
                 raise Undecided
-        rooms = {n: int(self.left[n] / CPU + 1e-9) if self.host_is_fine(n) else 0 for n in self.stock.edge_nodes}
+        rooms = {
+            n: int(self.free_cpu[n] / CPU + 1e-9) if self.is_host_usable(n) else 0 for n in self.inventory.edge_nodes
+        }
         numbered = [(name, i, int(spot.instances)) for name, i, spot in slots if spot.instances != "*"]
         greedy = self.greedy(numbered, inside, rooms)
         most = most_instances(numbered, inside, rooms)
-        if found is None:
+        if planned is None:
             return most is None
-        assert most is not None, "a plan where a location can have no instance"
-        self.check_placed(found, inside, rooms, greedy, most)
+        assert most is not None, "there is a plan although a location can have no instance"
+        self.check_placed(planned, inside, rooms, greedy, most)
         return True
 
     def check_placed(
         self,
-        found: DeploymentPlanSpec,
+        planned: DeploymentPlanSpec,
         inside: dict[tuple[str, int], list[str]],
         rooms: dict[str, int],
         greedy: dict[tuple[str, int], list[str]],
         most: int,
     ) -> None:
-        """That the instances of a plan are as many as there can be, and the nearest where the nearest do."""
+        """Check that the plan has the maximum number of instances, on the nearest nodes if these have enough room."""
         slots = [(c.name, i, spot) for c in self.spec.on("edge") for i, spot in enumerate(c.locations)]
         numbered = [(name, i, int(spot.instances)) for name, i, spot in slots if spot.instances != "*"]
         placed: dict[tuple[str, int], list[str]] = {key: [] for key in inside}
-        for p in found.placements:
+        for p in planned.placements:
             if p.role == "static":
                 placed[p.component, p.location or 0].append(p.node or "")
         if sum(map(len, greedy.values())) == sum(count for _, _, count in numbered):
             assert {k: placed[k] for k in greedy} == greedy, "not the nearest nodes"
-        assert sum(len(placed[name, i]) for name, i, _ in numbered) == most, "fewer instances than there can be"
+        assert sum(len(placed[name, i]) for name, i, _ in numbered) == most, "fewer instances than possible"
         for (name, i), nodes in placed.items():
             assert set(nodes) <= set(inside[name, i]), "outside its location"
         for name, i, count in numbered:
-            assert 1 <= len(placed[name, i]) <= count, "not as many instances as asked for"
+            assert 1 <= len(placed[name, i]) <= count, "wrong number of instances"
         for name in {name for name, _, _ in slots}:
-            nodes = [n for (c, _), some in placed.items() if c == name for n in some]
+            nodes = [n for (c, _), chosen in placed.items() if c == name for n in chosen]
             assert len(nodes) == len(set(nodes)), "two instances on one node"
-        for some in placed.values():
-            for node in some:
+        for chosen in placed.values():
+            for node in chosen:
                 rooms[node] -= 1
-                self.left[node] -= CPU
-        assert min(rooms.values(), default=0) >= 0, "more than a node has"
+                self.free_cpu[node] -= CPU
+        assert min(rooms.values(), default=0) >= 0, "a node is overbooked"
         for name, i, spot in slots:
             if spot.instances == "*":
-                hosts = {n for (c, _), some in placed.items() if c == name for n in some}
-                assert all(rooms[n] == 0 or n in hosts for n in inside[name, i]), "a suitable node is left out"
+                hosts = {n for (c, _), chosen in placed.items() if c == name for n in chosen}
+                assert all(rooms[n] == 0 or n in hosts for n in inside[name, i]), "a suitable node has no instance"
 
     def place(self, node: str) -> Any:
-        return self.stock.edge_nodes[node].spec.location
+        return self.inventory.edge_nodes[node].spec.location
 
-    def greedy(self, wanted: Any, inside: Any, rooms: dict[str, int]) -> dict[tuple[str, int], list[str]]:
-        """The nearest nodes, location by location, as the thesis has it."""
-        left = dict(rooms)
-        used = set()
-        found = {}
-        for name, i, count in wanted:
-            chosen = [n for n in inside[name, i] if left[n] > 0 and (name, n) not in used][:count]
-            found[name, i] = chosen
-            used |= {(name, n) for n in chosen}
+    def greedy(self, slots: Any, inside: Any, rooms: dict[str, int]) -> dict[tuple[str, int], list[str]]:
+        """Return the nearest nodes, chosen one location after the other as in the thesis."""
+        room_left = dict(rooms)
+        taken = set()
+        chosen_nodes = {}
+        for name, i, count in slots:
+            chosen = [n for n in inside[name, i] if room_left[n] > 0 and (name, n) not in taken][:count]
+            chosen_nodes[name, i] = chosen
+            taken |= {(name, n) for n in chosen}
             for n in chosen:
-                left[n] -= 1
-        return found
+                room_left[n] -= 1
+        return chosen_nodes
 
     def reach_m(self, a: Any, b: Any) -> float | None:
         ranges = [[i.range for i in node.spec.interfaces if i.range] for node in (a, b)]
         return min(ranges[0][0], ranges[1][0]) if all(ranges) else None
 
-    def expected_hybrids(self, found: DeploymentPlanSpec) -> list[tuple[str, str]]:
-        """Instances of Checker: (role, node), in order."""
+    def expected_hybrids(self, planned: DeploymentPlanSpec) -> list[tuple[str, str]]:
+        """Return the expected instances of Checker in order: (role, node)."""
         checker = self.spec.find("Checker")
         placed: list[tuple[str, str]] = []
-        for other in checker.hybrid_to if checker is not None else ():
-            if self.spec.component(other).placement == "edge":
-                for static in [p.node or "" for p in found.placements if p.component == other]:
+        for target in checker.hybrid_to if checker is not None else ():
+            if self.spec.component(target).placement == "edge":
+                for static in [p.node or "" for p in planned.placements if p.component == target]:
                     self.place_beside(static, placed)
-            elif found.drone is not None:
-                self.place_along(self.stock.drones[found.drone.node], placed)
+            elif planned.drone is not None:
+                self.place_along(self.inventory.drones[planned.drone.node], placed)
         return placed
 
-    def take(self, name: str, role: str, placed: list[tuple[str, str]]) -> None:
-        self.left[name] -= CPU
+    def place_instance(self, name: str, role: str, placed: list[tuple[str, str]]) -> None:
+        self.free_cpu[name] -= CPU
         placed.append((role, name))
 
     def place_beside(self, static: str, placed: list[tuple[str, str]]) -> None:
-        edges = self.stock.edge_nodes
-        here = self.stock.edge_nodes[static]
-        around = []
+        edges = self.inventory.edge_nodes
+        static_node = self.inventory.edge_nodes[static]
+        in_range = []
         for n in edges:
-            reach = self.reach_m(here, edges[n])
-            if n != here.name and reach is not None and self.near(here.spec.location, self.place(n), reach):
-                around.append(n)
-        around.sort(key=lambda n: geodesic_m(here.spec.location, self.place(n)))
-        for n in [here.name, *around]:
+            reach = self.reach_m(static_node, edges[n])
+            if (
+                n != static_node.name
+                and reach is not None
+                and self.near(static_node.spec.location, self.place(n), reach)
+            ):
+                in_range.append(n)
+        in_range.sort(key=lambda n: geodesic_m(static_node.spec.location, self.place(n)))
+        for n in [static_node.name, *in_range]:
             if n in {node for _, node in placed}:
                 return
-            if self.host_is_fine(n):
-                self.take(n, "hybrid-edge", placed)
+            if self.is_host_usable(n):
+                self.place_instance(n, "hybrid-edge", placed)
                 return
 
     def place_along(self, drone: Drone, placed: list[tuple[str, str]]) -> None:
-        area = operation_area(self.spec, self.stock.depots, SAFETY_M)
+        area = operation_area(self.spec, self.inventory.depots, SAFETY_M)
         assert area is not None
         xy = Samples(area.shape).xy()
         covers = {}
-        for n, node in sorted(self.stock.edge_nodes.items()):
+        for n, node in sorted(self.inventory.edge_nodes.items()):
             reach = self.reach_m(drone, node)
             if reach is not None:
-                away = np.hypot(*(xy - np.array(area.frame.xy(node.spec.location.lat, node.spec.location.lon))).T)
-                covers[n] = away <= reach
-        open_ = np.ones(len(xy), dtype=bool)
+                distances = np.hypot(*(xy - np.array(area.frame.xy(node.spec.location.lat, node.spec.location.lon))).T)
+                covers[n] = distances <= reach
+        uncovered = np.ones(len(xy), dtype=bool)
         for n in {node for _, node in placed} & covers.keys():
-            open_ &= ~covers[n]
+            uncovered &= ~covers[n]
         free = [n for n in covers if n not in {node for _, node in placed}]
-        while free and open_.sum() > (1 - 0.95) * len(xy):
-            gains = [int((covers[n] & open_).sum()) for n in free]
+        while free and uncovered.sum() > (1 - 0.95) * len(xy):
+            gains = [int((covers[n] & uncovered).sum()) for n in free]
             if max(gains) == 0:
                 return
             best = free.pop(gains.index(max(gains)))
-            if self.host_is_fine(best):
-                self.take(best, "hybrid-drone", placed)
-                open_ &= ~covers[best]
+            if self.is_host_usable(best):
+                self.place_instance(best, "hybrid-drone", placed)
+                uncovered &= ~covers[best]
 
 
-def most_instances(wanted: Any, inside: Any, rooms: dict[str, int]) -> int | None:
-    """By trying all: the most instances that all locations can have, each at least one; None if one can have none."""
+def most_instances(slots: Any, inside: Any, rooms: dict[str, int]) -> int | None:
+    """Return by exhaustive search the maximum number of instances. Return None if a location can have no instance."""
 
     def best(i: int, used: frozenset[tuple[str, str]]) -> int | None:
-        if i == len(wanted):
+        if i == len(slots):
             return 0
-        name, index, count = wanted[i]
-        free = [n for n in inside[name, index] if (name, n) not in used and sum(m == n for _, m in used) < rooms[n]]
-        found: int | None = None
+        name, index, count = slots[i]
+        candidates = [
+            n for n in inside[name, index] if (name, n) not in used and sum(m == n for _, m in used) < rooms[n]
+        ]
+        most: int | None = None
         for k in range(1, count + 1):
-            for chosen in itertools.combinations(free, k):
+            for chosen in itertools.combinations(candidates, k):
                 rest = best(i + 1, used | {(name, n) for n in chosen})
                 if rest is not None:
-                    found = max(found or 0, k + rest)
-        return found
+                    most = max(most or 0, k + rest)
+        return most
 
     return best(0, frozenset())
 
@@ -713,76 +726,80 @@ def most_instances(wanted: Any, inside: Any, rooms: dict[str, int]) -> int | Non
 def _blocked(leg: Sequence[tuple[float, float]], circles: Sequence[tuple[float, float, float]]) -> bool:
     line = shapely.LineString(leg) if leg[0] != leg[1] else shapely.Point(leg[0])
     for x, y, radius in circles:
-        away = line.distance(shapely.Point(x, y)) - radius - MARGIN_M
-        if abs(away) < 0.05 + 0.02 * radius:  # The planner's circle is a polygon around it.
+        distance = line.distance(shapely.Point(x, y)) - radius - MARGIN_M
+        if abs(distance) < 0.05 + 0.02 * radius:  # The planner replaces the circle by a polygon around it.
             raise Undecided
-        if away < 0:
+        if distance < 0:
             return True
     return False
 
 
-def _over(needed: float, available: float) -> bool:
+def _exceeds(needed: float, available: float) -> bool:
     if abs(needed - available) < 1e-3 * max(needed, 1):
         raise Undecided
     return needed > available
 
 
 def deviation(seed: int) -> str | None:
-    """What is wrong with the plan of a seed's scene; None if it is as the oracle says.
+    """Return the difference between plan and oracle for the scene of a seed, or None.
 
     Raises:
-        Undecided: rounding decides.
+        Undecided: Rounding may decide a comparison.
     """
-    scene = Maker(seed).scene()
+    scene = SceneBuilder(seed).scene()
     oracle = Oracle(scene)
     problem: Infeasible | None = None
-    found: DeploymentPlanSpec | None = None
+    planned: DeploymentPlanSpec | None = None
     try:
-        found = plan(scene.application, scene.stock, scene.settings)
+        planned = plan(scene.application, scene.inventory, scene.settings)
     except Infeasible as error:
         problem = error
     try:
-        if scene.application.spec.leader is not None and not _compare_drone(oracle, found, problem):
+        if scene.application.spec.leader is not None and not _compare_drone(oracle, planned, problem):
             return None
-        _compare_nodes(oracle, found, problem)
+        _compare_nodes(oracle, planned, problem)
     except AssertionError as error:
         return str(error) or "asserts"
     return None
 
 
-def _compare_drone(oracle: Oracle, found: DeploymentPlanSpec | None, problem: Infeasible | None) -> bool:
-    """Compare the drone, and why others do not fly; whether there is one."""
+def _compare_drone(oracle: Oracle, planned: DeploymentPlanSpec | None, problem: Infeasible | None) -> bool:
+    """Compare the drone and the reasons of rejected drones. Return True if there is a drone."""
     reason = problem.reason if problem is not None else ""
     spec = oracle.spec
-    flies = oracle.expected_drone()
-    assert (flies is None) == (reason in {"NoDrone", "DroneBusy", "PolicyConflict"}), (
-        f"{flies}, but {reason or 'a plan'}"
+    expected = oracle.expected_drone()
+    assert (expected is None) == (reason in {"NoDrone", "DroneBusy", "PolicyConflict"}), (
+        f"{expected}, but {reason or 'a plan'}"
     )
     leader = (spec.driver or next(spec.on("drone"))).name
-    rejected = problem.rejected if problem is not None else found.rejected if found is not None else ()
-    told = {r.node: r.reason for r in rejected if r.component == leader}
-    if found is not None or flies is None:
-        wrong = {n: (r, told.get(n)) for n, r in oracle.reasons.items() if told.get(n) != r}
+    rejected = problem.rejected if problem is not None else planned.rejected if planned is not None else ()
+    reported = {r.node: r.reason for r in rejected if r.component == leader}
+    if planned is not None or expected is None:
+        wrong = {n: (r, reported.get(n)) for n, r in oracle.reasons.items() if reported.get(n) != r}
         assert not wrong, f"rejected for another reason: {wrong}"
-    if flies is None:
+    if expected is None:
         return False
-    assert found is None or (found.drone is not None and found.drone.node == flies), f"another one flies than {flies}"
-    oracle.left[flies] -= CPU * len(list(spec.on("drone")))
+    assert planned is None or (planned.drone is not None and planned.drone.node == expected), (
+        f"the plan has another drone than {expected}"
+    )
+    oracle.free_cpu[expected] -= CPU * len(list(spec.on("drone")))
     return True
 
 
-def _compare_nodes(oracle: Oracle, found: DeploymentPlanSpec | None, problem: Infeasible | None) -> None:
-    """Compare where all other components are."""
+def _compare_nodes(oracle: Oracle, planned: DeploymentPlanSpec | None, problem: Infeasible | None) -> None:
+    """Compare the placements of all other components."""
     if problem is not None and problem.reason == "NoEdgeNode":
         assert oracle.check_statics(None), "a location can have an instance"
         return
     clouds = [
-        n for n, h in oracle.stock.hosts.items() if h.labels["fractus.dev/class"] == "cloud" and oracle.host_is_fine(n)
+        n
+        for n, h in oracle.inventory.hosts.items()
+        if h.labels["fractus.dev/class"] == "cloud" and oracle.is_host_usable(n)
     ]
-    assert (found is None) == (not clouds), f"cloud {clouds}, {problem}"
-    if found is None:
+    assert (planned is None) == (not clouds), f"cloud {clouds}, {problem}"
+    if planned is None:
         return
-    oracle.check_statics(found)
-    told = [(p.role, p.node) for p in found.placements if p.component == "Checker" and p.node is not None]
-    wanted = oracle.expected_hybrids(found)
-    assert told == wanted, f"hybrids {told}, not {wanted}"
+    oracle.check_statics(planned)
+    placed = [(p.role, p.node) for p in planned.placements if p.component == "Checker" and p.node is not None]
+    expected = oracle.expected_hybrids(planned)
+    assert placed == expected, f"hybrids {placed}, not {expected}"

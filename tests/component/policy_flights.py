@@ -187,9 +187,9 @@ class Walls:
         slope = (np.roll(x, -1, axis=2) - x) / np.where(rise == 0, 1.0, rise)
         return cls(y, np.roll(y, -1, axis=2), x - slope * y, slope)
 
-    def of_some(self, who: NDArray[np.int64]) -> Walls:
+    def of_some(self, rows: NDArray[np.int64]) -> Walls:
         """Return the edges of some drones."""
-        return Walls(self.y0[who], self.y1[who], self.x0[who], self.slope[who])
+        return Walls(self.y0[rows], self.y1[rows], self.x0[rows], self.slope[rows])
 
     def around(self, points: Floats) -> Flags:
         """Return which rings contain points of shape (n, 2), by rays to the east: shape (n, z)."""
@@ -201,7 +201,7 @@ class Walls:
 
 
 _ROWS = (
-    "place", "speed", "accel", "error", "gust", "settled", "beat", "phase", "latency", "goal", "cruise", "setpoint", "wanted",
+    "place", "speed", "accel", "error", "gust", "settled", "beat", "phase", "latency", "goal", "cruise", "setpoint", "velocity_setpoint",
     "held", "until",
 )  # fmt: skip
 
@@ -222,8 +222,8 @@ class Fleet:
         """Place each drone somewhere, with some velocity, wind and errors."""
         rng = self.rng
         count = len(self.scenes)
-        (other,) = rng.spawn(1)
-        self.airframes = [s.airframe(other) for s in self.scenes]
+        (generator,) = rng.spawn(1)
+        self.airframes = [s.airframe(generator) for s in self.scenes]
         self.place = np.column_stack((rng.uniform(-80, 80, (count, 2)), rng.uniform(3, 45, count)))
         angle = rng.uniform(0, 2 * math.pi, count)
         fast = rng.uniform(0, 8, count) * (rng.random(count) < 0.7)
@@ -246,16 +246,16 @@ class Fleet:
         self.sent: list[list[tuple[float, float, tuple[float, float, float]]]] = [[] for _ in range(count)]
         """Velocity setpoints of each drone with first and last time, in the order of arrival."""
         self.mail: list[tuple[float, int, Verdict]] = []
-        self.asked: list[Call | None] = [None] * count
+        self.last_calls: list[Call | None] = [None] * count
         self.legs: list[GotoArgs | None] = [None] * count
         """Last target of each drone, unless another command followed."""
         self.time_s = 0.0
-        self._seen: Floats | None = None
+        self._estimated: Floats | None = None
         # Commands: fly to a point with a speed, or hold a velocity until a time. All start at a time.
         self.goal = self.place.copy()
         self.cruise = np.full(count, 5.0)
         self.setpoint = np.full(count, 5.0)
-        self.wanted = np.zeros((count, 3))
+        self.velocity_setpoint = np.zeros((count, 3))
         self.held = np.zeros(count, dtype=bool)
         self.arrives, self.surely_returns = (np.zeros(count, dtype=bool) for _ in range(2))
         """Drones that fly a leg whose end has a legal return."""
@@ -271,16 +271,16 @@ class Fleet:
             for name in ("accel_mps2", "climb_accel_mps2", "jerk_mps3")
         )
 
-    def part(self, who: NDArray[np.int64]) -> Fleet:
+    def part(self, rows: NDArray[np.int64]) -> Fleet:
         """Return some of the drones in their present state, on independent flights."""
-        found = Fleet(np.random.default_rng(0), [self.scenes[i] for i in who])
-        found.rng = self.rng
-        found.time_s = self.time_s
-        found.airframes = [self.airframes[i] for i in who]
+        selected = Fleet(np.random.default_rng(0), [self.scenes[i] for i in rows])
+        selected.rng = self.rng
+        selected.time_s = self.time_s
+        selected.airframes = [self.airframes[i] for i in rows]
         for name in _ROWS:
-            setattr(found, name, getattr(self, name)[who].copy())
-        found.learn()
-        return found
+            setattr(selected, name, getattr(self, name)[rows].copy())
+        selected.learn()
+        return selected
 
     def sway(self) -> Floats:
         """Return the displacement of each drone by wind.
@@ -293,41 +293,41 @@ class Fleet:
         return self.gust * np.sin(self.beat * self.time_s + self.phase)[:, None]
 
     @property
-    def seen(self) -> Floats:
+    def estimated(self) -> Floats:
         """Return the position that each drone estimates."""
-        if self._seen is None:
-            self._seen = self.place + self.sway()
-        return self._seen
+        if self._estimated is None:
+            self._estimated = self.place + self.sway()
+        return self._estimated
 
     @property
     def true(self) -> Floats:
         """Return the true position of each drone."""
-        return self.seen + self.error
+        return self.estimated + self.error
 
-    def stop(self, who: NDArray[np.int64]) -> None:
+    def stop(self, rows: NDArray[np.int64]) -> None:
         """Send drones to the positions where their controllers can stop."""
         for axes, accels in ((slice(0, 2), self.accels), (slice(2, 3), self.climbs)):
-            accel = accels[who]
-            moving = self.speed[who, axes]
+            accel = accels[rows]
+            moving = self.speed[rows, axes]
             fast = np.linalg.norm(moving, axis=1)
             run = np.where(fast < accel / GAIN, fast / GAIN, accel / (2 * GAIN**2) + fast**2 / (2 * accel))
             ahead = moving / np.maximum(fast, 1e-9)[:, None] * run[:, None]
-            self.goal[who, axes] = self.place[who, axes] + ahead
-        self.held[who] = False
-        self.cruise[who] = 20.0
-        self.wanted[who] = 0.0
+            self.goal[rows, axes] = self.place[rows, axes] + ahead
+        self.held[rows] = False
+        self.cruise[rows] = 20.0
+        self.velocity_setpoint[rows] = 0.0
 
     def step(self) -> None:
         """Advance by one step and receive the messages that have arrived."""
-        for due, i, verdict in [letter for letter in self.mail if letter[0] <= self.time_s]:
-            self.mail.remove((due, i, verdict))
+        for due_s, i, verdict in [letter for letter in self.mail if letter[0] <= self.time_s]:
+            self.mail.remove((due_s, i, verdict))
             self.obey(i, verdict)
         late = self.held & (self.time_s >= self.until)
         if late.any():
             self.stop(np.flatnonzero(late))
         self._axes(slice(0, 2), self.accels, self.cruise, self.cruise)
         self._axes(slice(2, 3), self.climbs, np.full(len(self.place), UP_MPS), np.full(len(self.place), DOWN_MPS))
-        self._seen = None
+        self._estimated = None
         self.place = self.place + self.speed * STEP_S
         self.time_s += STEP_S
 
@@ -336,13 +336,13 @@ class Fleet:
         off = self.goal[:, axes] - self.place[:, axes]
         away = np.linalg.norm(off, axis=1)
         most = np.where(off[:, -1] < 0, least, most) if off.shape[1] == 1 else most
-        wanted = (
+        velocity = (
             off
             / np.maximum(away, 1e-9)[:, None]
             * np.minimum(_root(away, self.jerks / (RATIO * accel), (1 - 1 / RATIO) * accel), most)[:, None]
         )
-        wanted = np.where(self.held[:, None], self.wanted[:, axes], wanted)
-        change = wanted - self.speed[:, axes]
+        velocity = np.where(self.held[:, None], self.velocity_setpoint[:, axes], velocity)
+        change = velocity - self.speed[:, axes]
         size = np.linalg.norm(change, axis=1)
         push = np.minimum(_root(size, self.jerks / accel, self.jerks), accel)
         # A jerk-limited controller plans to finish a step ahead. Without this it oscillates by a step.
@@ -352,14 +352,14 @@ class Fleet:
         self.accel[:, axes] += step * np.minimum(1.0, self.jerks * STEP_S / np.maximum(jerk, 1e-9))[:, None]
         self.speed[:, axes] += self.accel[:, axes] * STEP_S
 
-    def situation(self, i: int, *, told: bool) -> Situation:
+    def situation(self, i: int, *, measured: bool) -> Situation:
         """Return the situation that the engine gets for one drone. Only some services know its acceleration."""
-        x, y, z = self.seen[i]
+        x, y, z = self.estimated[i]
         drift = self.gust[i] * self.beat[i] * math.cos(self.beat[i] * self.time_s + self.phase[i])
         east, north, up = (float(v) for v in self.speed[i] + drift)
         ground = math.hypot(east, north)
-        tends = float(np.linalg.norm(self.wanted[i, :2]))
-        forward = float(self.accel[i, 0] * east + self.accel[i, 1] * north) / max(ground, 0.05) if told else None
+        tends = float(np.linalg.norm(self.velocity_setpoint[i, :2]))
+        forward = float(self.accel[i, 0] * east + self.accel[i, 1] * north) / max(ground, 0.05) if measured else None
         return Situation(
             time_s=NOW, lat=float(HOME.lat + y / NORTH_M), lon=float(HOME.lon + x / EAST_M), altitude_m=float(z), north_mps=north, east_mps=east,
             down_mps=-up, home=HOME, armed=True, in_air=True, position_error_m=POSITION_ERROR_M,
@@ -371,10 +371,10 @@ class Fleet:
         """Return the setpoints that the state of a drone may not show yet."""
         now = self.time_s
         since = self.time_s - float(self.latency[i]) - COURSE_S
-        late = [told for told in self.sent[i] if told[1] >= since]
-        before = [told for told in self.sent[i] if told[1] < since][-1:]
+        late = [item for item in self.sent[i] if item[1] >= since]
+        before = [item for item in self.sent[i] if item[1] < since][-1:]
         east, north, up = (float(v) for v in self.speed[i])
-        self.sent[i] = [told for told in before if is_turning((north, east, -up), told[2])] + late
+        self.sent[i] = [item for item in before if is_turning((north, east, -up), item[2])] + late
         return tuple(dict.fromkeys(velocity for at, _, velocity in reversed(self.sent[i]) if at <= now))[::-1]
 
     def send(self, i: int, verdict: Verdict, *, returns: bool = False) -> None:
@@ -394,7 +394,7 @@ class Fleet:
             velocity = (args.north_mps, args.east_mps, args.down_mps)
             hold_s = args.hold_s
         elif isinstance(args, GotoArgs) and not verdict.brake_first:
-            x, y, z = self.seen[i]
+            x, y, z = self.estimated[i]
             east = (args.lon - HOME.lon) * EAST_M - x
             north = (args.lat - HOME.lat) * NORTH_M - y
             cruise = (args.speed_mps or float(self.setpoint[i])) / max(math.hypot(east, north), 1e-6)
@@ -406,7 +406,7 @@ class Fleet:
         self.sent[i].append((now, now + max(hold_s - RESEND_S, 0.0), velocity))
         if hold_s:
             self.sent[i].append((now + hold_s, now + hold_s, STILL))
-        before = max((due for due, who, _ in self.mail if who == i), default=self.time_s)
+        before = max((due_s for due_s, rows, _ in self.mail if rows == i), default=self.time_s)
         self.mail.append((max(before, self.time_s + self.rng.uniform(0, float(self.latency[i]))), i, verdict))
 
     def obey(self, i: int, verdict: Verdict) -> None:
@@ -416,9 +416,9 @@ class Fleet:
             self.setpoint[i] = args.speed_mps
             self.cruise[i] = self.cruise[i] if self.held[i] else args.speed_mps
             return
-        self.place[i] = self.seen[i]
+        self.place[i] = self.estimated[i]
         self.settled[i] = self._wind()[i]
-        self._seen = None
+        self._estimated = None
         self.arrives[i] = isinstance(args, GotoArgs) and not verdict.brake_first and self.surely_returns[i]
         if verdict.brake_first:
             self.stop(np.array([i]))
@@ -426,10 +426,10 @@ class Fleet:
             self.held[i] = False
             self.goal[i] = ((args.lon - HOME.lon) * EAST_M, (args.lat - HOME.lat) * NORTH_M, args.alt)
             self.setpoint[i] = self.cruise[i] = args.speed_mps or self.setpoint[i]
-            self.wanted[i] = 0.0
+            self.velocity_setpoint[i] = 0.0
         elif isinstance(args, VelocityArgs):
             self.held[i] = True
-            self.wanted[i] = (args.east_mps, args.north_mps, -args.down_mps)
+            self.velocity_setpoint[i] = (args.east_mps, args.north_mps, -args.down_mps)
             self.until[i] = self.time_s + args.hold_s + self.rng.uniform(0, float(self.latency[i]))
 
     def trespassing(self) -> Flags:
@@ -443,22 +443,24 @@ class Fleet:
             return trespasses(true[:, :2], true[:, 2], self.walls, self.kinds, self.bands)
         # A stationary drone sways slowly and is observed twice a second.
         fast |= round(self.time_s / STEP_S) % 10 == 0
-        found = np.zeros((len(true), ZONES + 1), dtype=bool)
-        who = np.flatnonzero(fast)
-        found[who] = trespasses(true[who, :2], true[who, 2], self.walls.of_some(who), self.kinds[who], self.bands[who])
-        return found
+        broken = np.zeros((len(true), ZONES + 1), dtype=bool)
+        rows = np.flatnonzero(fast)
+        broken[rows] = trespasses(
+            true[rows, :2], true[rows, 2], self.walls.of_some(rows), self.kinds[rows], self.bands[rows]
+        )
+        return broken
 
 
 def trespasses(points: Floats, heights: Floats, walls: Walls, kinds: NDArray[np.int64], bands: Floats) -> Flags:
     """Return the zones broken at some points. The last column is True outside all inclusion zones."""
-    here = walls.around(points)
+    inside = walls.around(points)
     up = heights[:, None]
     within = (bands[..., 0] <= up) & (up <= bands[..., 1])
     slack = HEIGHT_ERROR_M + TRACKING_M + JUST_M
     allowed = (bands[..., 0] - slack <= up) & (up <= bands[..., 1] + slack)
-    broken = (here & within & (kinds == EXCLUSION)) | (here & ~allowed & (kinds == LIMIT))
-    kept = kinds == INCLUSION
-    outside = kept.any(axis=1) & ~(here & within & kept).any(axis=1)
+    broken = (inside & within & (kinds == EXCLUSION)) | (inside & ~allowed & (kinds == LIMIT))
+    inclusion = kinds == INCLUSION
+    outside = inclusion.any(axis=1) & ~(inside & within & inclusion).any(axis=1)
     return np.column_stack((broken, outside))
 
 
@@ -486,19 +488,19 @@ class Tally:
 
     Attributes:
         changed: Vehicles whose parameters another station changed in flight.
-        homeward: Return flights by the system.
-        straight: Return flights by the autopilot.
+        system_returns: Return flights by the system.
+        autopilot_returns: Return flights by the autopilot.
     """
 
-    asked: int = 0
+    requests: int = 0
     permitted: int = 0
     corrected: int = 0
     braked: int = 0
     taken: int = 0
     shortened: int = 0
     changed: int = 0
-    homeward: int = 0
-    straight: int = 0
+    system_returns: int = 0
+    autopilot_returns: int = 0
     wrong: list[str] = field(default_factory=list)
     stopped: list[str] = field(default_factory=list)
     """Permitted flights that the monitor stopped."""
@@ -533,21 +535,23 @@ def flights(
     scenes = [s for s in (scene(rng) for _ in range(math.ceil(count / shared))) for _ in range(shared)][:count]
     fleet = Fleet(rng, scenes)
     tally = Tally()
-    pardoned = excused(fleet)
-    told: list[str] = [""] * count
-    (other,) = rng.spawn(1)
+    exempt = excused(fleet)
+    permitted: list[str] = [""] * count
+    (generator,) = rng.spawn(1)
     for turn in range(requests):
         if turn:
-            _change(fleet, tally, told, pardoned, other)
-        flown = _ask_all(fleet, tally, told, rng, watched if watch_every else 0)
-        called_s = fleet.time_s + other.uniform(1.5, 8.0) if returns is not None and turn == requests - 1 else math.inf
+            _change(fleet, tally, permitted, exempt, generator)
+        flown = _request_all(fleet, tally, permitted, rng, watched if watch_every else 0)
+        called_s = (
+            fleet.time_s + generator.uniform(1.5, 8.0) if returns is not None and turn == requests - 1 else math.inf
+        )
         # Every third request arrives before the previous one can have taken effect.
         span_s = 30.0 if turn == requests - 1 else rng.choice([rng.uniform(0.05, 0.6), *rng.uniform(0.4, 7.0, 2)])
         for n in range(int(span_s / STEP_S)):
             fleet.step()
             if returns is not None and fleet.time_s >= called_s:
                 called_s = math.inf
-                returns.called(fleet, pardoned, tally)
+                returns.fly_by_system(fleet, exempt, tally)
             if (
                 turn == requests - 1
                 and math.isinf(called_s)
@@ -556,87 +560,89 @@ def flights(
             ):
                 break
             if watch_every and n % watch_every == 0:
-                _watch(fleet, tally, flown, pardoned)
-            found = fleet.trespassing() & ~pardoned
-            for i in np.flatnonzero(found.any(axis=1)):
+                measured(fleet, tally, flown, exempt)
+            broken = fleet.trespassing() & ~exempt
+            for i in np.flatnonzero(broken.any(axis=1)):
                 # A drone without a permitted command may drift in the wind.
-                if not told[i]:
+                if not permitted[i]:
                     continue
-                tally.wrong.append(f"seed {seed}, drone {i}, turn {turn}, {fleet.time_s:.2f} s: {told[i]}")
-                pardoned[i] = True
+                tally.wrong.append(f"seed {seed}, drone {i}, turn {turn}, {fleet.time_s:.2f} s: {permitted[i]}")
+                exempt[i] = True
     if returns is not None:
-        returns.alone(fleet, pardoned, tally)
+        returns.fly_by_autopilot(fleet, exempt, tally)
     return tally
 
 
 class Returns(Protocol):
     """Return flights after the requests of drones, each in a separate world."""
 
-    def called(self, fleet: Fleet, pardoned: Flags, tally: Tally) -> None:
+    def fly_by_system(self, fleet: Fleet, exempt: Flags, tally: Tally) -> None:
         """Let the system fly home some drones that are in flight."""
 
-    def alone(self, fleet: Fleet, pardoned: Flags, tally: Tally) -> None:
+    def fly_by_autopilot(self, fleet: Fleet, exempt: Flags, tally: Tally) -> None:
         """Let the autopilots of some drones at rest fly home."""
 
 
-def _change(fleet: Fleet, tally: Tally, told: list[str], pardoned: Flags, rng: np.random.Generator) -> None:
+def _change(fleet: Fleet, tally: Tally, permitted: list[str], exempt: Flags, rng: np.random.Generator) -> None:
     """Change parameters of some vehicles as another station does, and inform their services.
 
     Earlier permissions, and motion that no command can prevent, are not judged any longer.
     """
     expected = {i for _, i, _ in fleet.mail}
-    who = np.array([i for i in np.flatnonzero(rng.random(len(told)) < CHANGED) if i not in expected], dtype=np.int64)
-    for i in who:
+    rows = np.array(
+        [i for i in np.flatnonzero(rng.random(len(permitted)) < CHANGED) if i not in expected], dtype=np.int64
+    )
+    for i in rows:
         other = fleet.scenes[i].airframe(rng)
         fleet.airframes[i] = replace(other, retraces=fleet.airframes[i].retraces)
-        told[i] = ""
+        permitted[i] = ""
         fleet.arrives[i] = False
     fleet.learn()
-    if len(who):
-        pardoned[who] |= excused(fleet.part(who))
-    tally.changed += len(who)
+    if len(rows):
+        exempt[rows] |= excused(fleet.part(rows))
+    tally.changed += len(rows)
 
 
 Flown = dict[int, tuple[str, GotoArgs | None, bool]]
 """Per drone: the permitted request, its leg, and whether its acceleration is reported."""
 
 
-def _watch(fleet: Fleet, tally: Tally, flown: Flown, pardoned: Flags) -> None:
+def measured(fleet: Fleet, tally: Tally, flown: Flown, exempt: Flags) -> None:
     """Report drones that the monitor would stop, each once."""
-    for i, (what, end, told) in list(flown.items()):
+    for i, (request, end, measured) in list(flown.items()):
         if np.abs(fleet.speed[i]).max() < STANDING_MPS:
             continue
-        now = fleet.situation(i, told=told)
+        now = fleet.situation(i, measured=measured)
         verdict = monitor(now, fleet.scenes[i].grant, current_leg=None if fleet.held[i] else end)
         if verdict is None:
             continue
         del flown[i]
         slots = [ZONES if name == "in" else int(name[4:]) for name in verdict.policies if name[:2] in {"in", "ou"}]
-        if not slots or not pardoned[i, slots].all():
-            tally.stopped.append(f"{fleet.time_s:.2f} s, drone {i}: {verdict} at {now} after {what}")
+        if not slots or not exempt[i, slots].all():
+            tally.stopped.append(f"{fleet.time_s:.2f} s, drone {i}: {verdict} at {now} after {request}")
 
 
-def _ask_all(fleet: Fleet, tally: Tally, told: list[str], rng: np.random.Generator, watched: int) -> Flown:
+def _request_all(fleet: Fleet, tally: Tally, permitted: list[str], rng: np.random.Generator, watched: int) -> Flown:
     """Make one request per drone. Return the watched drones that the monitor does not object to."""
     flown: Flown = {}
     legs: list[tuple[int, GotoArgs]] = []
     near = vicinity(fleet).any(axis=1)
     for i, place in enumerate(fleet.scenes):
-        call = fleet.asked[i] = _again(rng, fleet.asked[i]) or _request(rng)
+        call = fleet.last_calls[i] = _repeated(rng, fleet.last_calls[i]) or _request(rng)
         measured = bool(rng.random() < 0.5)
-        now = fleet.situation(i, told=measured)
+        now = fleet.situation(i, measured=measured)
         verdict = judge(call, now, place.grant)
-        tally.asked += 1
+        tally.requests += 1
         tally.permitted += verdict.permits
         tally.corrected += verdict.action == "correct"
         tally.braked += verdict.permits and verdict.brake_first
         tally.taken += verdict.action == "takeover"
         if verdict.permits and not _flies_faster(fleet, i, verdict, now):
-            what = f"{call} in {now} -> {verdict}"
-            tally.wrong += [f"{odd}: {what}" for odd in _odd(verdict, now, place)]
+            text = f"{call} in {now} -> {verdict}"
+            tally.wrong += [f"{defect}: {text}" for defect in _defects(verdict, now, place)]
             # SetSpeed moves nothing.
             moves = not isinstance(verdict.args, SetSpeedArgs)
-            told[i] = what if moves else told[i] and f"{told[i]}, then {what}"
+            permitted[i] = text if moves else permitted[i] and f"{permitted[i]}, then {text}"
             tally.shortened += "the last legal point" in verdict.reason
             if isinstance(verdict.args, GotoArgs):
                 legs.append((i, verdict.args))
@@ -646,8 +652,8 @@ def _ask_all(fleet: Fleet, tally: Tally, told: list[str], rng: np.random.Generat
             level = low - HEIGHT_ERROR_M <= now.altitude_m <= high + HEIGHT_ERROR_M
             if moves and level and watched and i % watched == 0 and monitor(now, place.grant) is None:
                 leg = verdict.args if isinstance(verdict.args, GotoArgs) and not verdict.brake_first else None
-                flown[i] = told[i], leg, measured
-    tally.wrong += [f"target inside the margin of a fence: {told[i]}" for i in _too_near(fleet, legs)]
+                flown[i] = permitted[i], leg, measured
+    tally.wrong += [f"target inside the margin of a fence: {permitted[i]}" for i in _too_near(fleet, legs)]
     return flown
 
 
@@ -667,15 +673,15 @@ def _flies_faster(fleet: Fleet, i: int, verdict: Verdict, now: Situation) -> boo
 
 def _too_near(fleet: Fleet, legs: list[tuple[int, GotoArgs]]) -> Iterator[int]:
     """Return drones whose legs end inside the margin of a fence."""
-    who = np.array([i for i, _ in legs for _ in _CIRCLE], dtype=np.int64)
+    rows = np.array([i for i, _ in legs for _ in _CIRCLE], dtype=np.int64)
     heights = np.array([leg.alt for _, leg in legs for _ in _CIRCLE])
     ends = [[(leg.lon - HOME.lon) * EAST_M, (leg.lat - HOME.lat) * NORTH_M] for _, leg in legs]
     around = (np.array(ends).reshape(-1, 1, 2) + _CIRCLE * (POSITION_ERROR_M + TRACKING_M - 0.05)).reshape(-1, 2)
-    broken = trespasses(around, heights, fleet.walls.of_some(who), fleet.kinds[who], fleet.bands[who])
-    yield from sorted(set(who[broken.any(axis=1)].tolist()))
+    broken = trespasses(around, heights, fleet.walls.of_some(rows), fleet.kinds[rows], fleet.bands[rows])
+    yield from sorted(set(rows[broken.any(axis=1)].tolist()))
 
 
-def _again(rng: np.random.Generator, last: Call | None) -> Call | None:
+def _repeated(rng: np.random.Generator, last: Call | None) -> Call | None:
     """Repeat the request of half of the drivers that use velocities, with the same or a slightly higher speed."""
     if last is None or not isinstance(last.args, VelocityArgs) or rng.random() < 0.5:
         return None
@@ -697,12 +703,12 @@ def _request(rng: np.random.Generator) -> Call:
     return Call("SetVelocity", VelocityArgs(float(north), float(east), down, hold_s=float(rng.uniform(0.1, 2.0))))
 
 
-def _odd(verdict: Verdict, now: Situation, place: Scene) -> Iterator[str]:
+def _defects(verdict: Verdict, now: Situation, place: Scene) -> Iterator[str]:
     """Return the defects of corrected arguments."""
     args = verdict.args
     if verdict.action == "correct":
-        again = judge(Call(METHOD_OF[type(args)], args), now, place.grant)
-        if (again.action, again.args) != ("allow", args):
+        verdict_again = judge(Call(METHOD_OF[type(args)], args), now, place.grant)
+        if (verdict_again.action, verdict_again.args) != ("allow", args):
             yield "corrected to arguments that are not allowed unchanged"
     if isinstance(args, VelocityArgs) and math.hypot(args.north_mps, args.east_mps) > place.top_mps + 1e-6:
         yield "too fast"
@@ -729,23 +735,25 @@ def excused(fleet: Fleet) -> Flags:
     """
     trial = fleet.part(np.arange(len(fleet.scenes)))
     trial.held[:] = True
-    trial.wanted = trial.speed.copy()
+    trial.velocity_setpoint = trial.speed.copy()
     trial.until = fleet.time_s + fleet.latency
-    found = np.zeros((len(fleet.scenes), ZONES + 1), dtype=bool)
+    broken = np.zeros((len(fleet.scenes), ZONES + 1), dtype=bool)
     for n in range(int(SLOWEST_STOP_S / STEP_S)):
         if n % 4 == 0:
-            found |= vicinity(trial)
+            broken |= vicinity(trial)
             if trial.time_s > trial.until.max() and np.abs(trial.speed).max() < STANDING_MPS:
                 break
         trial.step()
-    return found
+    return broken
 
 
 def vicinity(fleet: Fleet) -> Flags:
     """Return the fences that each drone breaks or is closer to than its margin, shape (n, ZONES + 1)."""
     tall = HEIGHT_ERROR_M + TRACKING_M + 0.1
     around = np.where((fleet.kinds == EXCLUSION)[..., None], [-tall, tall], [tall, -tall])
-    found = np.zeros((len(fleet.scenes), ZONES + 1), dtype=bool)
+    broken = np.zeros((len(fleet.scenes), ZONES + 1), dtype=bool)
     for dx in (*_CIRCLE * (POSITION_ERROR_M + TRACKING_M + 0.1), np.zeros(2)):
-        found |= trespasses(fleet.seen[:, :2] + dx, fleet.seen[:, 2], fleet.walls, fleet.kinds, fleet.bands + around)
-    return found
+        broken |= trespasses(
+            fleet.estimated[:, :2] + dx, fleet.estimated[:, 2], fleet.walls, fleet.kinds, fleet.bands + around
+        )
+    return broken

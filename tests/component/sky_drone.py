@@ -1,4 +1,4 @@
-"""A drone whose driver may arm, with the real service on the simulated vehicle in virtual time."""
+"""Drone whose driver may arm, with the complete service on the simulated vehicle in virtual time."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ async def until(condition: Callable[[], object], timeout_s: float = 120.0) -> No
 
 @contextlib.asynccontextmanager
 async def ready(sky: Sky, directory: Path) -> AsyncGenerator[tuple[Drone, ActiveGrant]]:
-    """A drone whose driver may arm."""
+    """Yield a drone and the Grant of its driver, who has control and may arm."""
     drone = Drone(directory, Account(0))
-    turning = asyncio.ensure_future(sky.turn())
+    turning = asyncio.ensure_future(sky.run_vehicle())
     grant = drone.grants.put(spec())
     following = asyncio.ensure_future(drone.follow(grant))
     try:
@@ -39,6 +39,6 @@ async def ready(sky: Sky, directory: Path) -> AsyncGenerator[tuple[Drone, Active
 def fly(
     work: Callable[[Sky, Path], Awaitable[None]], directory: Path, parameters: dict[str, float] | None = None
 ) -> None:
-    sky = Sky(1, Weather(there_s=0.02, back_s=0.02), parameters or {})
+    sky = Sky(1, Weather(uplink_s=0.02, downlink_s=0.02), parameters or {})
     with asyncio.Runner(loop_factory=lambda: sky) as runner:
         runner.run(work(sky, directory))  # type: ignore[arg-type]

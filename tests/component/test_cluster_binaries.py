@@ -1,4 +1,4 @@
-"""Programs: pinned sources, accepted versions, and messages of what is missing."""
+"""Programs of the cluster: pinned sources, accepted versions, and errors for missing programs."""
 
 from __future__ import annotations
 
@@ -39,10 +39,10 @@ REQUIRED = {
 }
 
 
-def script(path: Path, prints: str) -> None:
-    """A program that says its version."""
+def script(path: Path, output: str) -> None:
+    """Create a program that prints its version."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(f"#!/bin/sh\necho '{prints}'\n")
+    path.write_text(f"#!/bin/sh\necho '{output}'\n")
     path.chmod(0o755)
 
 
@@ -51,9 +51,9 @@ def script(path: Path, prints: str) -> None:
 def test_go_mod_pins_the_version_of_the_catalog(program: str, module: str, minor: str) -> None:
     entry = PROGRAMS[minor][program]
     text = (GOMOD / entry.module / "go.mod").read_text()
-    found = re.search(rf"^(?:require )?\s*{re.escape(module)} v(\S+)", text, re.MULTILINE)
-    assert found is not None
-    assert found[1] == entry.version
+    requirement = re.search(rf"^(?:require )?\s*{re.escape(module)} v(\S+)", text, re.MULTILINE)
+    assert requirement is not None
+    assert requirement[1] == entry.version
 
 
 @pytest.mark.parametrize("module", sorted(set(MODULES) - {"pause"}))
@@ -72,7 +72,7 @@ def test_staging_modules_match_kubernetes(module: str, minor: str, version: str)
 
 @pytest.fixture
 def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A machine with an empty cache, nothing on PATH but a shell, and no Go."""
+    """Machine with an empty cache, an empty PATH and no Go."""
     monkeypatch.setenv("FRACTUS_CACHE", str(tmp_path / "cache"))
     monkeypatch.setenv("PATH", str(tmp_path / "path"))
     for name in ("KUBEBUILDER_ASSETS", "FRACTUS_KUBERNETES"):
@@ -80,24 +80,24 @@ def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def test_takes_programs_from_assets_and_path(machine: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_programs_are_found_in_assets_and_on_path(machine: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     script(machine / "assets" / "etcd", "etcd Version: 3.5.1")
     script(machine / "path" / "etcd", "etcd Version: 3.6.0")
     script(machine / "path" / "kubectl", f"Client Version: v{KUBERNETES_VERSIONS[DEFAULT_KUBERNETES]}")
     assert ensure_binaries(["etcd", "kubectl"], report=print)["etcd"] == machine / "path" / "etcd"
     monkeypatch.setenv("KUBEBUILDER_ASSETS", str(machine / "assets"))
-    found = ensure_binaries(["etcd", "kubectl"], report=print)
-    assert found["etcd"] == machine / "assets" / "etcd"
-    assert found["kubectl"] == machine / "path" / "kubectl"
+    binaries = ensure_binaries(["etcd", "kubectl"], report=print)
+    assert binaries["etcd"] == machine / "assets" / "etcd"
+    assert binaries["kubectl"] == machine / "path" / "kubectl"
 
 
-def test_does_not_take_another_version(machine: Path) -> None:
+def test_program_of_another_version_is_not_used(machine: Path) -> None:
     script(machine / "path" / "kubectl", "Client Version: v1.32.4")
     with pytest.raises(PrerequisiteError, match=r"Go 1\.25"):
         ensure_binaries(["kubectl"], report=print)
 
 
-def test_takes_programs_of_the_chosen_version(machine: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_programs_of_the_chosen_version_are_used(machine: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     script(machine / "assets" / "kubectl", "Client Version: v1.34.1")
     script(machine / "path" / "kubectl", "Client Version: v1.35.1")
     monkeypatch.setenv("KUBEBUILDER_ASSETS", str(machine / "assets"))
@@ -106,18 +106,18 @@ def test_takes_programs_of_the_chosen_version(machine: Path, monkeypatch: pytest
     assert ensure_binaries(["kubectl"], report=print)["kubectl"] == machine / "assets" / "kubectl"
 
 
-def test_builds_of_two_versions_are_kept_apart(machine: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_builds_of_each_version_have_their_own_directory(machine: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for minor, version in KUBERNETES_VERSIONS.items():
-        own = machine / "cache" / f"v{version}"
-        script(own / "bin" / "kubelet", f"Kubernetes v{version}")
+        directory = machine / "cache" / f"v{version}"
+        script(directory / "bin" / "kubelet", f"Kubernetes v{version}")
         digest = build_module.module_digest(MODULES[f"kubernetes-{minor}"])
-        write_ledger(own / "built.json", {"kubelet": digest})
+        write_ledger(directory / "built.json", {"kubelet": digest})
         monkeypatch.setenv("FRACTUS_KUBERNETES", minor)
-        assert ensure_binaries(["kubelet"], report=print)["kubelet"] == own / "bin" / "kubelet"
+        assert ensure_binaries(["kubelet"], report=print)["kubelet"] == directory / "bin" / "kubelet"
 
 
 @pytest.mark.parametrize("chosen", ["1.33", "1.34.4", "latest"])
-def test_other_kubernetes_is_refused(machine: Path, monkeypatch: pytest.MonkeyPatch, chosen: str) -> None:
+def test_unsupported_kubernetes_version_is_refused(machine: Path, monkeypatch: pytest.MonkeyPatch, chosen: str) -> None:
     monkeypatch.setenv("FRACTUS_KUBERNETES", chosen)
     with pytest.raises(ClusterError) as error:
         ensure_binaries(["kubelet"], report=print)
@@ -138,17 +138,17 @@ def test_old_go_is_refused(machine: Path) -> None:
         ensure_binaries(["pause"], report=print)
 
 
-def test_failed_build_leaves_nothing(machine: Path) -> None:
+def test_failed_build_leaves_no_files(machine: Path) -> None:
     go = machine / "path" / "go"
     script(go, "")
     go.write_text('#!/bin/sh\n[ "$1" = env ] && echo go1.25.0 local && exit 0\necho "compiler on fire" >&2\nexit 2\n')
     with pytest.raises(ClusterError, match="compiler on fire"):
         ensure_binaries(["pause"], report=print)
-    left = list((machine / "cache").rglob("*"))
-    assert [path.name for path in left if path.is_file()] == ["lock"]
+    remaining = list((machine / "cache").rglob("*"))
+    assert [path.name for path in remaining if path.is_file()] == ["lock"]
 
 
-def test_wrong_version_of_a_build_is_refused(machine: Path) -> None:
+def test_built_program_with_wrong_version_is_refused(machine: Path) -> None:
     script(machine / "etcd", "etcd Version: 3.5.9")
     with pytest.raises(ClusterError, match=r"reports 3\.5\.9"):
         build_module.check_version(machine / "etcd", PROGRAMS[DEFAULT_KUBERNETES]["etcd"])
@@ -165,15 +165,15 @@ def test_cluster_programs_are_in_the_catalog() -> None:
     assert not {"kwok", "crane"} & set(CLUSTER_PROGRAMS)
 
 
-def test_other_users_are_told_to_use_sudo(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_error_for_other_users_suggests_sudo(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("os.geteuid", lambda: 1000)
     with pytest.raises(PrerequisiteError, match="sudo"):
         check_root()
 
 
 def test_missing_packages_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    there = {"containerd", "ctr", "ip", "nsenter", "unshare", "mount", "iptables"}
-    monkeypatch.setattr("shutil.which", lambda name, path=None: name if name in there else None)
+    installed = {"containerd", "ctr", "ip", "nsenter", "unshare", "mount", "iptables"}
+    monkeypatch.setattr("shutil.which", lambda name, path=None: name if name in installed else None)
     monkeypatch.setattr(prerequisites, "plugin_directory", lambda: None)
     assert prerequisites.missing_packages() == ["containernetworking-plugins", "nftables", "runc"]
     monkeypatch.setattr(prerequisites, "check_root", lambda: None)

@@ -77,8 +77,8 @@ def test_status_shows_drones_edge_nodes_and_applications(run: Run, monkeypatch: 
     assert re.search(r"default/traffic +Flying +drone-1 +3/3 +drone-1 flies", output)
     assert re.search(r"default/new +Pending .*not processed by the operator yet", output)
     code, output = run("status", "-n", "other", "-o", "json")
-    seen = json.loads(output)
-    assert (seen["drones"][0]["onMission"], seen["applications"]) == ("True", [])
+    parsed = json.loads(output)
+    assert (parsed["drones"][0]["onMission"], parsed["applications"]) == ("True", [])
 
 
 def test_status_watch_repeats_until_interrupted(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -249,7 +249,7 @@ def test_doctor_warns_about_single_node_that_is_drone_and_cloud(run: Run, health
     healthy[f"{V1}/edgenodes"] = []
     code, output = run("doctor", "-o", "json")
     assert code == 0, output
-    (warned,) = [found["message"] for found in json.loads(output) if found["level"] != "ok"]
+    (warned,) = [value["message"] for value in json.loads(output) if value["level"] != "ok"]
     assert warned == "drone-1 is also a cloud node: any pod on it can reach the autopilot"
 
 
@@ -317,12 +317,12 @@ PROBLEMS: list[tuple[str, Any, str, str]] = [
 
 
 @pytest.mark.parametrize(
-    ("path", "found", "level", "words"), PROBLEMS, ids=[f"{n}-{x[3]}" for n, x in enumerate(PROBLEMS)]
+    ("path", "value", "level", "words"), PROBLEMS, ids=[f"{n}-{x[3]}" for n, x in enumerate(PROBLEMS)]
 )
 def test_doctor_reports_problem_with_remedy(
-    run: Run, healthy: Body, path: str, found: Any, level: str, words: str
+    run: Run, healthy: Body, path: str, value: Any, level: str, words: str
 ) -> None:
-    healthy[path] = found
+    healthy[path] = value
     code, output = run("doctor", "-o", "json")
     assert code == (2 if level == "error" else 0)
     assert any(f["level"] == level and words in f["message"] + f["remedy"] for f in json.loads(output)), output

@@ -9,19 +9,19 @@ from itertools import pairwise
 from pathlib import Path
 
 import pytest
-from control_courses import FLIGHTS, Course
-from control_flights import Trace, trace_of
-from control_wanderings import wandering
+from control_flights import Trace, fly_script
+from control_random_flights import random_flight
+from control_scripts import FLIGHTS, Script
 from depth import DEEP
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "control"
-WANDERINGS = (*range(12), 361)
+RANDOM_SEEDS = (*range(12), 361)
 """Seeds of random flights. In 361 a system task is stopped from within its own call while a POI mission begins."""
 
 
-def courses() -> dict[str, Course]:
+def scripts() -> dict[str, Script]:
     """Return all flights by the names of their recordings."""
-    return FLIGHTS | {f"wandering_{seed:02}": wandering(seed) for seed in WANDERINGS}
+    return FLIGHTS | {f"random_{seed:02}": random_flight(seed) for seed in RANDOM_SEEDS}
 
 
 def features(trace: Trace) -> set[tuple[str, ...]]:
@@ -35,35 +35,37 @@ def features(trace: Trace) -> set[tuple[str, ...]]:
 def selected_flights() -> list[str]:
     """Return the flights to fly: all in a deep run, else a small subset that covers the features of all."""
     if DEEP:
-        return list(courses())
+        return list(scripts())
     traces: dict[str, Trace] = {path.stem: json.loads(path.read_text()) for path in sorted(GOLDEN.glob("*.json"))}
-    shows = {name: features(trace) for name, trace in traces.items()}
-    missing = set().union(*shows.values())
+    features_of = {name: features(trace) for name, trace in traces.items()}
+    missing = set().union(*features_of.values())
     names = list[str]()
     while missing:
-        names.append(max(shows, key=lambda name: len(shows[name] & missing) / (1 + len(traces[name]["path"]))))
-        missing -= shows[names[-1]]
+        names.append(
+            max(features_of, key=lambda name: len(features_of[name] & missing) / (1 + len(traces[name]["path"])))
+        )
+        missing -= features_of[names[-1]]
     return names
 
 
 @pytest.mark.parametrize("name", selected_flights())
 def test_golden_flight_matches_recorded_trace(tmp_path: Path, name: str) -> None:
     recorded = json.loads((GOLDEN / f"{name}.json").read_text())
-    assert trace_of(tmp_path, courses()[name]).trace == recorded, "see control_flights.py to record it again"
+    assert fly_script(tmp_path, scripts()[name]).trace == recorded, "see control_flights.py to record it again"
 
 
 def test_golden_flights_and_recordings_have_the_same_names() -> None:
-    assert {path.stem for path in GOLDEN.glob("*.json")} == set(courses())
+    assert {path.stem for path in GOLDEN.glob("*.json")} == set(scripts())
 
 
 def record() -> None:
     """Record all flights again. Changes of behaviour appear in the diff."""
     GOLDEN.mkdir(parents=True, exist_ok=True)
-    for left in GOLDEN.glob("*.json"):
-        left.unlink()
-    for name, course in courses().items():
+    for recording in GOLDEN.glob("*.json"):
+        recording.unlink()
+    for name, script in scripts().items():
         with tempfile.TemporaryDirectory() as directory:
-            trace = trace_of(Path(directory), course).trace
+            trace = fly_script(Path(directory), script).trace
         (GOLDEN / f"{name}.json").write_text(json.dumps(trace, indent=1) + "\n")
 
 

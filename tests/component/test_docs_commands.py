@@ -24,7 +24,7 @@ from fractus_runtime.audit import AuditLog
 NAMES = [str(page.relative_to(ROOT)) for page in PAGES]
 _FRACTUS = re.compile(r"(?:^|[|;&(]\s*|kubectl |[A-Z_]+=\S* )fractus (?!-)([^|;&()<>#]*)")
 OFFLINE = ("fractus plan -f examples", "fractus policy check", "fractus zones import town", "fractus audit ")
-"""Beginnings of the commands that run here: they need no cluster and end by themselves."""
+"""Prefixes of the commands that these tests run. These commands need no cluster, and they end."""
 
 ZONES = {
     "type": "FeatureCollection",
@@ -47,11 +47,11 @@ def problems(arguments: str) -> list[str]:
         name = words.pop(0)
         if name.isupper() or name == "...":
             return []
-        found = command.get_command(context, name)
-        if found is None:
+        found_problems = command.get_command(context, name)
+        if found_problems is None:
             return [f"no command {name}"]
-        command = found
-        context = click.Context(found, parent=context)
+        command = found_problems
+        context = click.Context(found_problems, parent=context)
     if "--" in words:
         words = words[: words.index("--")]
     known = {name for parameter in command.params for name in (*parameter.opts, *parameter.secondary_opts)}
@@ -63,10 +63,10 @@ def problems(arguments: str) -> list[str]:
 @pytest.mark.parametrize("page", NAMES)
 def test_documented_fractus_commands_and_options_exist(page: str) -> None:
     wrong = {
-        arguments: found
+        arguments: found_problems
         for text in (*shell_lines(page), *code_spans(page))
         for arguments in _FRACTUS.findall(text)
-        if (found := problems(arguments))
+        if (found_problems := problems(arguments))
     }
     assert wrong == {}
 
@@ -109,7 +109,7 @@ def test_documented_chart_values_exist(page: str) -> None:
 
 @pytest.fixture
 def checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder as a reader has it: examples, zones, signed Grants, and audit logs of a flight."""
+    """Folder of a reader with examples, zones, signed Grants, and audit logs of a flight."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "examples").symlink_to(ROOT / "examples")
     (tmp_path / "town.geojson").write_text(json.dumps(ZONES))

@@ -1,4 +1,4 @@
-"""Commands over links so slow that an answer takes longer than a fast link's is waited for."""
+"""Commands over links with a delay above the acknowledgement timeout of a fast link."""
 
 from __future__ import annotations
 
@@ -17,50 +17,50 @@ MODE = mavlink.MAV_CMD_DO_SET_MODE
 SPEED = mavlink.MAV_CMD_DO_CHANGE_SPEED
 
 
-def slow(plane: Plane, each_way_s: float) -> None:
-    plane.uplink_s = plane.downlink_s = each_way_s
+def set_delay(plane: Plane, one_way_s: float) -> None:
+    plane.uplink_s = plane.downlink_s = one_way_s
 
 
-async def measured(plane: Plane, each_way_s: float) -> None:
+async def wait_until_measured(plane: Plane, one_way_s: float) -> None:
     """Wait until the service knows the delay of a link."""
-    slow(plane, each_way_s)
-    while not 2 * each_way_s <= plane.downlink_latency_s < math.inf:
+    set_delay(plane, one_way_s)
+    while not 2 * one_way_s <= plane.downlink_latency_s < math.inf:
         await plane.update(0.1)
 
 
-@pytest.mark.parametrize("each_way_s", [0.4, 1.0, 1.4])
-def test_a_command_is_sent_once_over_a_slow_link(tmp_path: Path, each_way_s: float) -> None:
+@pytest.mark.parametrize("one_way_s", [0.4, 1.0, 1.4])
+def test_command_is_sent_once_over_a_slow_link(tmp_path: Path, one_way_s: float) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             plane = world.plane
-            await measured(plane, each_way_s)
+            await wait_until_measured(plane, one_way_s)
             plane.commands.clear()
             began = plane.now
             await plane.set_speed(5.0)
             assert plane.commands.count(SPEED) == 1
-            assert plane.now - began == pytest.approx(2 * each_way_s)
+            assert plane.now - began == pytest.approx(2 * one_way_s)
 
     fly(flight)
 
 
-@pytest.mark.parametrize("each_way_s", [0.4, 1.0, 1.5])
+@pytest.mark.parametrize("one_way_s", [0.4, 1.0, 1.5])
 @pytest.mark.parametrize("refused_first", [True, False])
-def test_answers_to_what_was_sent_again_are_not_for_the_next_command(
-    tmp_path: Path, each_way_s: float, refused_first: bool
+def test_late_acknowledgements_are_not_assigned_to_the_next_command(
+    tmp_path: Path, one_way_s: float, refused_first: bool
 ) -> None:
-    """The link has become slow just now: the first command is sent again, or given up, as the delay is not measured."""
+    """The link has just become slow. The service has not measured the delay yet, so it repeats or gives up the first command."""
 
     async def flight() -> None:
         async with World(tmp_path) as world:
             plane = world.plane
-            slow(plane, each_way_s)
+            set_delay(plane, one_way_s)
             plane.commands.clear()
             plane.refuses = {SPEED} if refused_first else set()
             first = asyncio.ensure_future(plane.set_speed(5.0))
             await asyncio.wait([first])
-            assert was_refused(first) == (refused_first and each_way_s < 1.5)
-            # What is still under way of the first command arrives before the second one.
-            asyncio.get_running_loop().call_later(each_way_s - 0.05, plane.refuses.symmetric_difference_update, {SPEED})
+            assert was_refused(first) == (refused_first and one_way_s < 1.5)
+            # Pending transmissions of the first command arrive before the second command.
+            asyncio.get_running_loop().call_later(one_way_s - 0.05, plane.refuses.symmetric_difference_update, {SPEED})
             second = asyncio.ensure_future(plane.set_speed(6.0))
             await asyncio.wait([second])
             assert plane.commands.count(SPEED) > 2
@@ -69,15 +69,15 @@ def test_answers_to_what_was_sent_again_are_not_for_the_next_command(
     fly(flight)
 
 
-def test_acknowledgements_measure_a_slow_link_to_a_vehicle_that_answers_nothing_else(
+def test_delay_is_measured_by_acknowledgements_without_timesync(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             plane = world.plane
-            hear = plane._hear
-            monkeypatch.setattr(plane, "_hear", lambda sent: None if sent.name == "TIMESYNC" else hear(sent))
-            slow(plane, 0.5)
+            receive = plane._receive
+            monkeypatch.setattr(plane, "_receive", lambda sent: None if sent.name == "TIMESYNC" else receive(sent))
+            set_delay(plane, 0.5)
             await asyncio.sleep(20.0)
             assert plane.timing.unanswering
             assert 1.0 <= plane.downlink_latency_s < 1.1
@@ -90,54 +90,56 @@ def was_refused(command: asyncio.Future[None]) -> bool:
     return isinstance(error, AutopilotError) and error.refused
 
 
-def test_a_change_of_mode_waits_for_none_that_is_not_answered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The way home is flown as soon as it is asked for, and what it overtakes is not sent again behind it."""
+def test_mode_change_does_not_wait_for_unacknowledged_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A requested return begins at once. The mode change before it is not repeated after it."""
 
     async def flight() -> None:
         async with World(tmp_path) as world:
             plane = world.plane
-            heard: list[tuple[float, float]] = []
-            await measured(plane, 1.0)
-            hear = plane._hear
-            lost = [LOITER, RTL]
+            received: list[tuple[float, float]] = []
+            await wait_until_measured(plane, 1.0)
+            receive = plane._receive
+            pending_losses = [LOITER, RTL]
 
-            def listen(outgoing: Message) -> None:
+            def receive_or_lose(outgoing: Message) -> None:
                 if outgoing.values.get("command") == MODE:
-                    heard.append((plane.now, outgoing.real("param2")))
-                    if lost:
-                        lost.pop()
+                    received.append((plane.now, outgoing.real("param2")))
+                    if pending_losses:
+                        pending_losses.pop()
                         return
-                hear(outgoing)
+                receive(outgoing)
 
-            monkeypatch.setattr(plane, "_hear", listen)
+            monkeypatch.setattr(plane, "_receive", receive_or_lose)
             began = plane.now
             first = asyncio.ensure_future(plane.set_mode(LOITER))
             await asyncio.sleep(0.1)
             await plane.set_mode(RTL)
             await asyncio.wait([first])
             assert isinstance(first.exception(), AutopilotError)
-            assert heard[1] == (pytest.approx(began + 1.1), plane.stack.mode_parameters(RTL)[0])
-            assert [number for _, number in heard[1:]] == [heard[1][1]] * len(heard[1:]), "nothing undoes it"
+            assert received[1] == (pytest.approx(began + 1.1), plane.stack.mode_parameters(RTL)[0])
+            assert [number for _, number in received[1:]] == [received[1][1]] * len(received[1:]), (
+                "no later command changes the mode"
+            )
             assert plane.vehicle.mode == RTL
 
     fly(flight)
 
 
-def test_a_slow_link_brings_the_drone_down(tmp_path: Path) -> None:
-    """A flight over a link that becomes as slow as one and a half seconds each way: the driver's grant ends, and it comes home."""
+def test_drone_lands_over_a_slow_link(tmp_path: Path) -> None:
+    """The link becomes slow (1.5 s one way), then the Grant of the driver is removed. The drone flies home and lands."""
 
     async def flight() -> None:
         async with World(tmp_path) as world:
             grant = world.grants.put(spec())
             plane = world.plane
             await world.up(grant)
-            slow(plane, 1.5)
+            set_delay(plane, 1.5)
             await asyncio.sleep(5.0)
             assert plane.vehicle.mode == GUIDED
             plane.commands.clear()
             world.grants.remove(grant)
             await world.until(lambda: not plane.vehicle.armed)
-            assert plane.commands.count(MODE) <= 2, "each is sent once"
+            assert plane.commands.count(MODE) <= 2, "each mode change is sent once"
             assert plane.vehicle.mode in {RTL, LAND}
 
     fly(flight)

@@ -1,4 +1,4 @@
-"""Link controllers, heuristics, interface checks and rulesets without a device, a table or a network."""
+"""Link controllers, heuristics, interface checks and rulesets, without devices, nftables or networks."""
 
 from __future__ import annotations
 
@@ -134,7 +134,7 @@ def test_guards_of_both_ends_follow_the_callers_of_a_service() -> None:
     assert redirector.callers == {Endpoint(IPv4Address("10.88.0.2"), 80): frozenset()}, "before any drone has linked"
     virtual = Endpoint(IPv4Address("10.96.0.5"), 8080)
     assert allowed_callers([named]) == {virtual: {IPv4Address("10.87.0.2")}}
-    # A service without callers is open at both ends.
+    # A service without callers has no guard at either end.
     object.__setattr__(named.spec, "services", [services[0].model_copy(update={"callers": None})])
     assert not allowed_callers([named])
     assert not isolated_pods([named])

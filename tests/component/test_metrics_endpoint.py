@@ -1,4 +1,4 @@
-"""The HTTP endpoint of metrics. Any host that reaches it may send requests, and it must not disturb the process."""
+"""HTTP endpoint of metrics. Any host may send requests, and these must not disturb the process."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The motion monitor on flights of the policy oracle: silent on permitted legs, in time before a zone."""
+"""The motion monitor on flights of the policy oracle: it permits judged legs, and stops drones in time before a new zone."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def test_monitor_stops_accelerating_drone_before_new_zone(appears_s: float) -> N
     coasting = stop_point(at(north_mps=fleet.speed[0, 1], forward_mps2=0.0), (0.0, 0.0))[1]
     wall_m = fleet.place[0, 1] + coasting + 16.0
     grant = compiled(exclusion(box(-50, wall_m, 50, wall_m + 40), "revoke"))
-    looks = 0
+    checks = 0
     while True:
         x, y, z = fleet.place[0]
         now = at(x, y, z, north_mps=fleet.speed[0, 1], speed_setpoint_mps=12.0, forward_mps2=fleet.accel[0, 1])
@@ -73,17 +73,19 @@ def test_monitor_stops_accelerating_drone_before_new_zone(appears_s: float) -> N
             break
         assert monitor(now, grant) is None
         fleet.step()
-        looks += 1
-    assert looks > 2, "there was room to fly on"
-    assert (verdict.action, verdict.takeover) == ("deny", "hover"), "whether it would go in is not sure"
-    assert monitor(now, grant) is None, "on a way that was judged by these fences it has room"
+        checks += 1
+    assert checks > 2, "the monitor permitted some of the motion"
+    assert (verdict.action, verdict.takeover) == ("deny", "hover"), (
+        "it is not certain that the drone would enter the zone"
+    )
+    assert monitor(now, grant) is None, "a leg judged by the same fences has enough room"
     for _ in range(int(now.latency_s / STEP_S)):
         fleet.step()
     # The service commands a zero velocity.
     fleet.held[:] = True
-    fleet.wanted[:] = 0.0
+    fleet.velocity_setpoint[:] = 0.0
     fleet.until[:] = math.inf
     for _ in range(int(20 / STEP_S)):
         fleet.step()
     rest_m = wall_m - fleet.place[0, 1]
-    assert now.position_error_m < rest_m < 5.0, "neither inside for all that is known, nor needlessly far"
+    assert now.position_error_m < rest_m < 5.0, "the drone stops certainly outside, but close to the zone"

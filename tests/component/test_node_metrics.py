@@ -49,24 +49,24 @@ def test_decision_metrics_count_entries_of_the_audit_log() -> None:
         {"time": "", "kind": "state", "lat": 1.0},
     ):
         decisions.take_entry(each)
-    seen = values(text(decisions.collect))
-    assert {key: value for key, value in seen.items() if key[0] == "fractus_verdicts_total"} == {
+    samples = values(text(decisions.collect))
+    assert {key: value for key, value in samples.items() if key[0] == "fractus_verdicts_total"} == {
         ("fractus_verdicts_total", action, "Code"): 1.0 for action in ("allow", "correct", "deny")
     }
-    assert seen["fractus_policy_verdicts_total", "correct", "fence"] == 1.0
-    assert seen["fractus_policy_verdicts_total", "deny", "fence"] == 1.0
-    assert seen["fractus_policy_verdicts_total", "deny", "campus"] == 1.0
-    assert seen["fractus_takeovers_total", "Code", "system"] == 1.0
-    assert seen["fractus_monitor_interventions_total", "deny", "Code"] == 1.0
+    assert samples["fractus_policy_verdicts_total", "correct", "fence"] == 1.0
+    assert samples["fractus_policy_verdicts_total", "deny", "fence"] == 1.0
+    assert samples["fractus_policy_verdicts_total", "deny", "campus"] == 1.0
+    assert samples["fractus_takeovers_total", "Code", "system"] == 1.0
+    assert samples["fractus_monitor_interventions_total", "deny", "Code"] == 1.0
 
 
 def test_decision_metrics_limit_the_number_of_policy_labels() -> None:
     decisions = ServiceMetrics()
     for number in range(MAX_POLICIES + 10):
         decisions.take_entry(entry("call", "deny", f"policy-{number}"))
-    seen = values(text(decisions.collect))
-    assert seen["fractus_policy_verdicts_total", "deny", "other"] == 10.0
-    assert len([key for key in seen if key[0] == "fractus_policy_verdicts_total"]) == MAX_POLICIES + 1
+    samples = values(text(decisions.collect))
+    assert samples["fractus_policy_verdicts_total", "deny", "other"] == 10.0
+    assert len([key for key in samples if key[0] == "fractus_policy_verdicts_total"]) == MAX_POLICIES + 1
 
 
 def test_mobility_service_metrics_equal_their_documentation(tmp_path: Path) -> None:
@@ -92,16 +92,23 @@ def test_mobility_service_metrics_equal_their_documentation(tmp_path: Path) -> N
     assert on_ground["fractus_control_authority", "system"] == 1
     whole = text(metrics.collect) + scrapes[1]
     assert_documented(whole, "Mobility and camera", "Mobility")
-    seen = values(whole)
-    assert seen["fractus_audit_sequence",] == 3
+    samples = values(whole)
+    assert samples["fractus_audit_sequence",] == 3
     last = json.loads((tmp_path / "audit.jsonl").read_text().splitlines()[-1])
-    assert f"{int(seen['fractus_audit_head',]):013x}" == last["hash"][:13]
-    assert seen["fractus_audit_waiting",] == seen["fractus_audit_failing",] == seen["fractus_recording_failing",] == 0
-    assert seen["fractus_grants",] == 2
-    assert seen["fractus_in_air",] == seen["fractus_companion_alive",] == seen["fractus_failsafes_verified",] == 1
-    assert seen["fractus_control_authority", "driver"] == 1
-    assert 0 <= seen["fractus_telemetry_age_seconds",] < 1
-    assert 0 <= seen["fractus_autopilot_heartbeat_age_seconds",] < 3
+    assert f"{int(samples['fractus_audit_head',]):013x}" == last["hash"][:13]
+    assert (
+        samples["fractus_audit_waiting",]
+        == samples["fractus_audit_failing",]
+        == samples["fractus_recording_failing",]
+        == 0
+    )
+    assert samples["fractus_grants",] == 2
+    assert (
+        samples["fractus_in_air",] == samples["fractus_companion_alive",] == samples["fractus_failsafes_verified",] == 1
+    )
+    assert samples["fractus_control_authority", "driver"] == 1
+    assert 0 <= samples["fractus_telemetry_age_seconds",] < 1
+    assert 0 <= samples["fractus_autopilot_heartbeat_age_seconds",] < 3
     problem[0] = "the disk is full"
     assert values(text(metrics.collect))["fractus_recording_failing",] == 1
 
@@ -117,11 +124,11 @@ def test_agent_metrics_equal_their_documentation() -> None:
     )
     scrape = text(agent.collect)
     assert_documented(scrape, "Agent")
-    seen = values(scrape)
-    assert seen["fractus_agent_report_age_seconds",] == math.inf
-    assert seen["fractus_agent_watch_age_seconds", "grants"] == 3.0
-    assert seen["fractus_audit_checkpoint_sequence", "mobility"] == 7.0
-    assert seen["fractus_audit_checkpoint_head", "mobility"] == 0xFEDCBA9876543
+    samples = values(scrape)
+    assert samples["fractus_agent_report_age_seconds",] == math.inf
+    assert samples["fractus_agent_watch_age_seconds", "grants"] == 3.0
+    assert samples["fractus_audit_checkpoint_sequence", "mobility"] == 7.0
+    assert samples["fractus_audit_checkpoint_head", "mobility"] == 0xFEDCBA9876543
 
 
 def test_link_metrics_equal_their_documentation() -> None:
@@ -136,7 +143,7 @@ def test_link_metrics_equal_their_documentation() -> None:
     metrics.update(report)
     scrape = text(metrics.collect)
     assert_documented(scrape, "Direct links of a drone")
-    seen = values(scrape)
-    assert seen["fractus_switches_total",] == seen["fractus_traffic_direct",] == 1
-    assert seen["fractus_path_bandwidth_mbps", "cloud"] == 0
-    assert seen["fractus_path_bandwidth_mbps", "e1"] == 8.0
+    samples = values(scrape)
+    assert samples["fractus_switches_total",] == samples["fractus_traffic_direct",] == 1
+    assert samples["fractus_path_bandwidth_mbps", "cloud"] == 0
+    assert samples["fractus_path_bandwidth_mbps", "e1"] == 8.0

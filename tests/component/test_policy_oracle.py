@@ -20,17 +20,16 @@ from fractus_core.policy.engine import MIN_TAKEOFF_ALTITUDE_M
 from fractus_core.policy.limits import MIN_LEG_ALTITUDE_M
 from fractus_core.policy.monitoring import monitor
 from fractus_services.mobility.mavlink import failsafes
-from homeward_flights import WaysHome
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from parameter_faults import parameter_faults
 from policy_flights import CORNERS, EAST_M, LIMIT, NORTH_M, ZONES, Fleet, Scene, excused, flights
 from policy_world import HOME, Corners, altitude, ask, at, compiled, exclusion, goto, inclusion, ring, target
+from return_flights import ReturnFlights
 
-EARTH_M = 6_371_000.0
 STEP_S = 0.05
 ACCEL_MPS2 = 2.5
-JUST = 0.02  # sphere against ellipsoid, at these distances
+TOLERANCE_M = 0.02  # difference of sphere and ellipsoid at these distances
 _cases = settings(max_examples=examples(600), deadline=None, derandomize=True)
 
 
@@ -42,11 +41,11 @@ def flat(lat: float, lon: float) -> tuple[float, float]:
 
 def inside(point: tuple[float, float], corners: Corners) -> bool:
     x, y = point
-    found = False
+    result = False
     for (x0, y0), (x1, y1) in zip(corners, corners[1:] + corners[:1], strict=True):
         if (y0 > y) != (y1 > y) and x < (x1 - x0) * (y - y0) / (y1 - y0) + x0:
-            found = not found
-    return found
+            result = not result
+    return result
 
 
 def fly(
@@ -65,9 +64,9 @@ def fly(
             dy = to[1] - y
             away = math.hypot(dx, dy)
             linear = ACCEL_MPS2
-            wanted = away if away < linear else math.sqrt(2 * ACCEL_MPS2 * (away - linear / 2))
-            wanted = min(wanted, cruise)
-            wx, wy = (dx / away * wanted, dy / away * wanted) if away > 1e-6 else (0.0, 0.0)
+            expected = away if away < linear else math.sqrt(2 * ACCEL_MPS2 * (away - linear / 2))
+            expected = min(expected, cruise)
+            wx, wy = (dx / away * expected, dy / away * expected) if away > 1e-6 else (0.0, 0.0)
             ex = (wx - vx) / STEP_S
             ey = (wy - vy) / STEP_S
             size = math.hypot(ex, ey)
@@ -234,7 +233,7 @@ def test_oracle_no_permitted_request_breaks_a_policy() -> None:
     """A small version of `bench/oracle.py`: velocities, legs in flight, bands, schedules, limits, wind."""
     tally = flights(seed=7, count=500)
     assert tally.wrong == []
-    assert tally.permitted > tally.asked / 3
+    assert tally.permitted > tally.requests / 3
     assert tally.corrected > 100
     assert tally.taken > 20
     assert tally.braked > 0
@@ -246,10 +245,10 @@ def test_oracle_detects_too_small_margins(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def test_oracle_return_flights_break_no_policy() -> None:
-    tally = flights(seed=11, count=160, requests=2, returns=WaysHome(11, 4))
+    tally = flights(seed=11, count=160, requests=2, returns=ReturnFlights(11, 4))
     assert tally.wrong == []
-    assert tally.homeward > 30
-    assert tally.straight > 5
+    assert tally.system_returns > 30
+    assert tally.autopilot_returns > 5
     assert tally.changed > 0
 
 
@@ -257,9 +256,9 @@ def test_oracle_detects_return_flights_through_zones(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(free_space, "check_straight_return", lambda *_, **__: None)
     monkeypatch.setattr(goto_rules, "check_return", lambda *_: None)
     monkeypatch.setattr(free_space.FreeSpace, "blockers", lambda *_: [])
-    wrong = flights(seed=11, count=160, requests=2, returns=WaysHome(11, 2)).wrong
-    assert any("the way home of drone" in line for line in wrong)
-    assert any("alone on its way home" in line for line in wrong)
+    wrong = flights(seed=11, count=160, requests=2, returns=ReturnFlights(11, 2)).wrong
+    assert any("return flight of drone" in line for line in wrong)
+    assert any("returning by its autopilot" in line for line in wrong)
 
 
 def test_oracle_arms_only_vehicles_with_known_parameters() -> None:
@@ -311,7 +310,7 @@ def test_oracle_monitor_never_stops_permitted_flights(seed: int) -> None:
     assert tally.wrong == []
     assert tally.stopped == []
     assert tally.shortened > 5
-    assert tally.permitted > tally.asked / 3
+    assert tally.permitted > tally.requests / 3
 
 
 @pytest.mark.usefixtures("shortening")

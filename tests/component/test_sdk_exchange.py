@@ -13,7 +13,7 @@ from fractus.exchange import ATTEMPT_HEADER, ID_HEADER, SERVICE, Request, Reques
 
 
 class Worker:
-    """Counts what it carries out."""
+    """Fake component that counts executed requests."""
 
     def __init__(self) -> None:
         self.done: list[str] = []
@@ -40,7 +40,7 @@ class Worker:
 
 async def until(condition: Callable[[], int]) -> None:
     async with asyncio.timeout(20):
-        while not condition():  # noqa: ASYNC110 - what is waited for has no event
+        while not condition():  # noqa: ASYNC110 - the condition has no event
             await asyncio.sleep(0.02)
 
 
@@ -60,10 +60,10 @@ async def test_requester_reconnects_before_the_next_request() -> None:
     async with worker.serving() as responder:
 
         async def pass_on(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-            """Both ways, between a client and the responder."""
-            there, back = await asyncio.open_connection("127.0.0.1", responder.port)
+            """Forward data in both directions between a client and the responder."""
+            upstream_reader, upstream_writer = await asyncio.open_connection("127.0.0.1", responder.port)
             opened.append(writer)
-            await asyncio.gather(copy(reader, back), copy(there, writer))
+            await asyncio.gather(copy(reader, upstream_writer), copy(upstream_reader, writer))
 
         async def copy(source: asyncio.StreamReader, sink: asyncio.StreamWriter) -> None:
             with suppress(ConnectionError):
@@ -77,7 +77,7 @@ async def test_requester_reconnects_before_the_next_request() -> None:
             await asking.request("work", b"this")
             for number in (1, 2):
                 opened[-1].transport.abort()
-                await until(lambda wanted=number + 1: len(opened) == wanted)  # type: ignore[misc]
+                await until(lambda expected=number + 1: len(opened) == expected)  # type: ignore[misc]
             assert await asking.request("work", b"that") == b"did that"
             assert len(opened) == 3
 
@@ -105,10 +105,10 @@ async def test_repeated_request_waits_for_running_handler() -> None:
     worker = Worker()
     worker.slow.clear()
     async with worker.serving() as responder, Requester(f"127.0.0.1:{responder.port}", attempt_timeout_s=0.3) as asking:
-        answer = asyncio.ensure_future(asking.request("work", b"slow"))
+        response = asyncio.ensure_future(asking.request("work", b"slow"))
         await until(lambda: responder.responses.repeated)
         worker.slow.set()
-        assert await answer == b"did slow"
+        assert await response == b"did slow"
     assert len(worker.done) == 1
     assert asking.repeated >= 1
 
@@ -124,9 +124,9 @@ async def test_temporary_handler_error_is_retried(failure: Exception) -> None:
 
 async def test_refused_request_is_not_retried() -> None:
     worker = Worker()
-    worker.failures = [ValueError("this is no picture")]
+    worker.failures = [ValueError("not a picture")]
     async with worker.serving() as responder, Requester(f"127.0.0.1:{responder.port}") as asking:
-        with pytest.raises(InvalidRequest, match="this is no picture"):
+        with pytest.raises(InvalidRequest, match="not a picture"):
             await asking.request("work", b"x")
         with pytest.raises(InvalidRequest):
             await asking.request("play", b"x")
@@ -140,12 +140,12 @@ async def test_requester_finds_restarted_server() -> None:
     async with worker.serving() as responder:
         port = responder.port
     async with Requester(f"127.0.0.1:{port}") as asking:
-        answer = asyncio.ensure_future(asking.request("work", b"x"))
+        response = asyncio.ensure_future(asking.request("work", b"x"))
         await until(lambda: asking.repeated)
-        again = Responder({"work": worker.work}, port)
-        await again.start()
-        assert await answer == b"did x"
-        await again.stop(0.0)
+        restarted = Responder({"work": worker.work}, port)
+        await restarted.start()
+        assert await response == b"did x"
+        await restarted.stop(0.0)
 
 
 async def test_request_without_response_fails_at_its_timeout() -> None:

@@ -98,7 +98,7 @@ def test_arming_is_refused_if_failsafe_verification_changes_meanwhile(
 
             if during == "choice":
                 control.dispatch(ArmingRequested(grant.key, grant.identity, (39.3604, 22.95, 10.0)))
-                control.dispatch(Airborne())  # as after a landing during the mission
+                control.dispatch(Airborne())  # same as after a landing during the mission
                 plane.vehicle_parameters.write = chosen  # type: ignore[method-assign]
             elif during == "fence":
                 world.fence.raise_around = raised  # type: ignore[method-assign]
@@ -134,7 +134,7 @@ def test_return_mode_is_kept_after_link_reconnects_in_flight(tmp_path: Path) -> 
             grant = world.grants.put(spec())
             await world.drive(grant)
             control.dispatch(ArmingRequested(grant.key, grant.identity, (39.3604, 22.95, 10.0)))
-            control.dispatch(Airborne())  # as after a landing during the mission
+            control.dispatch(Airborne())  # same as after a landing during the mission
             await world.service.arm(grant)
             await end(world.service.take_off(grant, TakeoffArgs(10.0)))
             assert plane.parameters["FS_GCS_ENABLE"] == 1.0

@@ -24,7 +24,7 @@ async def until(condition: Callable[[], object]) -> None:
 async def armed(sky: Sky, directory: Path) -> FailsafeStatus:
     """Return the verified vehicle parameters at the time of arming."""
     drone = Drone(directory, Account(0))
-    turning = asyncio.ensure_future(sky.turn())
+    turning = asyncio.ensure_future(sky.run_vehicle())
     grant = drone.grants.put(spec())
     following = asyncio.ensure_future(drone.follow(grant))
     try:
@@ -47,7 +47,7 @@ async def armed(sky: Sky, directory: Path) -> FailsafeStatus:
 def test_arming_uses_vehicle_parameters_after_cold_start_with_frame_loss(
     tmp_path: Path, loss: float, seed: int
 ) -> None:
-    sky = Sky(seed, Weather(there_s=0.03, back_s=0.03, loss=loss), SLOW)
+    sky = Sky(seed, Weather(uplink_s=0.03, downlink_s=0.03, loss=loss), SLOW)
     with asyncio.Runner(loop_factory=lambda: sky) as runner:
         checked = runner.run(armed(sky, tmp_path))
     assert not checked.problem

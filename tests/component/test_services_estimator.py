@@ -39,8 +39,8 @@ def test_drone_returns_home_if_estimator_has_no_absolute_position(
                 pass
             async for _ in drone.service.goto(grant, goto(0.0, 32.0), 0.0):
                 pass
-            kept_m: list[float] = []
-            sky.witnesses.append(lambda: kept_m.append(WALL.distance(shapely.Point(*oracle.place()[:2]))))
+            distances_m: list[float] = []
+            sky.witnesses.append(lambda: distances_m.append(WALL.distance(shapely.Point(*oracle.place()[:2]))))
             since_s = sky.time()
             estimate = Estimator.estimate
 
@@ -52,7 +52,7 @@ def test_drone_returns_home_if_estimator_has_no_absolute_position(
             monkeypatch.setattr(Estimator, "flags", FLOW)
             await asyncio.sleep(2.0)
             assert not located(drone.control), "camera requests must not use this position"
-            await until(lambda: drone.control.state.returning or min(kept_m) <= 0.0)
-            assert min(kept_m) > 1.0
+            await until(lambda: drone.control.state.returning or min(distances_m) <= 0.0)
+            assert min(distances_m) > 1.0
 
     fly(work, tmp_path)

@@ -1,4 +1,4 @@
-"""How the mobility service flies: around zones, home, for passengers, and what it does not fly any more."""
+"""Flights by the mobility service: transits, returns and POI missions around zones, and superseded commands."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from mobility_world import (
     RTL,
     SMART_RTL,
     World,
-    clear_m,
+    clearance_m,
     end,
     goto,
     partial,
@@ -49,7 +49,7 @@ def test_transit_and_return_fly_around_exclusion_zone(tmp_path: Path) -> None:
             assert await world.control.return_control(grant)
             await world.until(lambda: not world.plane.vehicle.armed)
             assert math.dist(world.plane.xy, (0, 0)) < 1.5
-            assert clear_m(world, *WALL) > 1.0
+            assert clearance_m(world, *WALL) > 1.0
             assert max(abs(x) for x, _, _ in world.plane.trace) > 41
             await stream
 
@@ -65,7 +65,7 @@ def test_transit_replans_around_zone_added_in_flight(tmp_path: Path) -> None:
             world.grants.put(partial(zone("wall", "ignore", *WALL)))
             await driving
             assert math.dist(world.plane.xy, (0, 70)) < 1.5
-            assert clear_m(world, *WALL) > 0.5
+            assert clearance_m(world, *WALL) > 0.5
             assert world.kinds("control")[-1]["action"] == "granted"
 
     fly(flight)
@@ -81,7 +81,7 @@ def test_transit_ends_revoked_if_zone_with_revoke_appears_ahead(tmp_path: Path) 
             world.grants.put(partial(zone("wall", "revoke", *wall)))
             await world.until(lambda: not world.plane.vehicle.armed)
             assert world.outcome().startswith("revoked:")
-            assert clear_m(world, *wall) > 0.5
+            assert clearance_m(world, *wall) > 0.5
             with pytest.raises(Refused, match="about to enter zone wall-zone"):
                 await driving
 
@@ -97,13 +97,13 @@ def test_accelerating_drone_brakes_before_new_zone_without_takeover(tmp_path: Pa
             await world.up(grant)
             going = asyncio.ensure_future(refusal(world.service.goto(grant, goto(0, 90), 0)))
             await world.until(lambda: world.plane.xy[1] > 8)
-            assert math.hypot(*world.plane.velocity) < 7, "it is still accelerating"
+            assert math.hypot(*world.plane.velocity) < 7, "the drone is still accelerating"
             world.grants.put(spec(zone("wall", "revoke", *WALL)))
             why = await going
             assert (why.verdict.code, why.verdict.action) == ("ExclusionZoneAhead", "deny")
             await asyncio.sleep(20)
             assert world.control.authority is Authority.DRIVER, "the drone neither entered the zone nor was about to"
-            assert clear_m(world, *WALL) > 5
+            assert clearance_m(world, *WALL) > 5
 
     fly(flight)
 
@@ -122,7 +122,7 @@ def test_shortened_leg_is_flown_to_its_corrected_target(tmp_path: Path, speed_mp
             assert isinstance(arrived.verdict.args, GotoArgs)
             assert world.plane.vehicle.distance_m(arrived.verdict.args.lat, arrived.verdict.args.lon) < 1.5
             assert not world.kinds("monitor")
-            assert 1.0 < clear_m(world, *WALL) < 5.0
+            assert 1.0 < clearance_m(world, *WALL) < 5.0
 
     fly(flight)
 
@@ -194,7 +194,7 @@ def test_return_respects_zones_of_removed_grant(tmp_path: Path) -> None:
                 await end(world.service.goto(grant, goto(x, y), 0))
             world.grants.remove(grant)
             await world.until(lambda: not world.plane.vehicle.armed)
-            assert clear_m(world, *WALL) > 1.0
+            assert clearance_m(world, *WALL) > 1.0
             assert world.outcome() == "revoked: the grant was removed"
 
     fly(flight)
@@ -214,7 +214,7 @@ def test_drone_of_lost_driver_hovers_and_returns_around_zone(tmp_path: Path) -> 
             assert world.plane.vehicle.mode == GUIDED
             assert world.plane.xy[0] > -30
             await world.until(lambda: not world.plane.vehicle.armed)
-            assert clear_m(world, *WALL) > 1.0
+            assert clearance_m(world, *WALL) > 1.0
             assert math.dist(world.plane.xy, (0, 0)) < 1.5
             assert world.outcome() == "failed: driver lost"
             with pytest.raises(Exception, match="driver"):
@@ -238,8 +238,8 @@ def test_return_replans_around_zone_added_in_flight(tmp_path: Path) -> None:
             begun = len(world.plane.trace)
             await world.until(lambda: not world.plane.vehicle.armed)
             del world.plane.trace[: begun - 1]
-            assert clear_m(world, *WALL) > 0.5
-            assert clear_m(world, *second) > 0.5
+            assert clearance_m(world, *WALL) > 0.5
+            assert clearance_m(world, *second) > 0.5
 
     fly(flight)
 
@@ -253,11 +253,11 @@ def test_poi_mission_visits_all_points_and_returns(tmp_path: Path) -> None:
             grant = world.grants.put(touring(zone("wall", "ignore", *WALL), tour=((0, 70), (60, 70))))
             await asyncio.sleep(5)
             assert not world.plane.vehicle.armed
-            world.tours.passenger_called(grant)
+            world.poi_missions.passenger_called(grant)
             await world.until(lambda: world.outcome() == "complete")
             assert world.control.state.missions["m1"].waypoints == 2
             await world.until(lambda: not world.plane.vehicle.armed)
-            assert clear_m(world, *WALL) > 1.0
+            assert clearance_m(world, *WALL) > 1.0
             for place in ((0, 70), (60, 70)):
                 assert min(math.dist(place, (x, y)) for x, y, _ in world.plane.trace) < 1.2
             assert not world.kinds("takeover")
@@ -338,7 +338,7 @@ def test_poi_mission_waits_until_driver_returns_control(tmp_path: Path) -> None:
     fly(flight)
 
 
-# Turns, stale and repeated commands
+# Turns, and stale or repeated commands
 
 
 def test_goto_brakes_first_before_sharp_turn_near_zone(tmp_path: Path) -> None:
@@ -350,11 +350,11 @@ def test_goto_brakes_first_before_sharp_turn_near_zone(tmp_path: Path) -> None:
             await world.until(lambda: world.plane.velocity[1] > 5 and world.plane.xy[1] > 35)
             first = world.service.calls.check(Call("Goto", goto(-60, 50)), grant)
             assert first.brake_first, first
-            there = await end(world.service.goto(grant, goto(-60, 50), 0))
-            assert there.verdict.permits
-            assert not there.verdict.brake_first
+            final = await end(world.service.goto(grant, goto(-60, 50), 0))
+            assert final.verdict.permits
+            assert not final.verdict.brake_first
             assert (await flying).verdict.code == "Replaced"
-            assert clear_m(world, -200, 63, 200, 100) > 1.0
+            assert clearance_m(world, -200, 63, 200, 100) > 1.0
 
     fly(flight)
 
@@ -383,7 +383,7 @@ def test_pending_command_is_dropped_after_control_is_lost(tmp_path: Path, event:
             grant = world.grants.put(spec())
             stream = await world.up(grant)
             assert world.control.effects.takeover_reason == "", "a driver has control"
-            world.plane.deaf = True  # the autopilot neither acts nor acknowledges, so commands are retried
+            world.plane.disconnected = True  # the autopilot neither acts nor acknowledges, so commands are retried
             asking = asyncio.ensure_future(refusal(world.service.set_speed(grant, SetSpeedArgs(3.0))))
             await asyncio.sleep(0.3)
             if event == "takeover":
@@ -395,7 +395,7 @@ def test_pending_command_is_dropped_after_control_is_lost(tmp_path: Path, event:
             else:
                 stream.cancel()
                 await asyncio.sleep(0)
-            world.plane.deaf = False
+            world.plane.disconnected = False
             why = await asking
             assert why.verdict.code in {"NotInControl", "ControlLost"}
             assert mavlink.MAV_CMD_DO_CHANGE_SPEED not in world.plane.commands, "the retry was dropped"
@@ -412,11 +412,11 @@ def test_resent_goto_is_judged_again(tmp_path: Path) -> None:
         async with World(tmp_path) as world:
             grant = world.grants.put(spec())
             await world.up(grant)
-            world.plane.deaf = True
+            world.plane.disconnected = True
             asking = asyncio.ensure_future(refusal(world.service.goto(grant, goto(0, 70, speed_mps=5.0), 0)))
             await asyncio.sleep(0.3)
             world.grants.put(spec(zone("wall", "ignore", *WALL)))
-            world.plane.deaf = False
+            world.plane.disconnected = False
             why = await asking
             assert why.verdict.code == "LegThroughExclusionZone"
             assert 192 not in world.plane.commands
@@ -484,8 +484,8 @@ def test_goto_altitude_is_converted_from_amsl_and_refused_for_unknown_terrain(tm
         async with World(tmp_path) as world:
             grant = world.grants.put(spec())
             await world.up(grant)
-            there = await end(world.service.goto(grant, goto(0, 30, 28.0, reference="amsl"), 0))
-            assert there.verdict.args == replace(goto(0, 30, 18.0), speed_mps=there.verdict.args.speed_mps)  # type: ignore[union-attr]
+            final = await end(world.service.goto(grant, goto(0, 30, 28.0, reference="amsl"), 0))
+            assert final.verdict.args == replace(goto(0, 30, 18.0), speed_mps=final.verdict.args.speed_mps)  # type: ignore[union-attr]
             assert world.plane.height == pytest.approx(18.0, abs=0.9)
             why = await refusal(_goto(world, grant, goto(0, 40, 20.0, reference="terrain")))
             assert why.verdict.code == "TerrainUnknown"

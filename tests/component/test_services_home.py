@@ -31,9 +31,9 @@ DOWN = (0.0, 0.0, -60.0)
 CEILING = {"name": "low", "spec": {"type": "LimitControl", "kind": "altitude", "upperLimit": 15}}
 
 
-def move(world: World, where: tuple[float, float, float]) -> None:
+def move(world: World, target: tuple[float, float, float]) -> None:
     """Move home as a ground station does with "set home here"."""
-    east, north, up = where
+    east, north, up = target
     lat, lon = FRAME.latlon(east, north)
     world.plane.move_home(round(lat * 1e7), round(lon * 1e7), GROUND_M + up)
 
@@ -64,13 +64,13 @@ def home_moved_entries(world: World) -> list[dict[str, Any]]:
     return [entry for entry in world.kinds("control") if entry["code"] == "HomeMoved"]
 
 
-@pytest.mark.parametrize("where", [AWAY, UP, DOWN])
-def test_moved_home_is_restored_before_flight_continues(tmp_path: Path, where: tuple[float, float, float]) -> None:
+@pytest.mark.parametrize("target", [AWAY, UP, DOWN])
+def test_moved_home_is_restored_before_flight_continues(tmp_path: Path, target: tuple[float, float, float]) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world, flying(world, CEILING) as grant:
             leg = asyncio.ensure_future(refusal(world.service.goto(grant, GotoArgs(*at(0, 90), 12.0), 0)))
             await world.until(lambda: world.plane.xy[1] > 20)
-            move(world, where)
+            move(world, target)
             # Until home is restored, altitudes are invalid: neither motions nor camera requests may use them.
             assert not located(world.control)
             with pytest.raises(Unavailable):
@@ -118,7 +118,7 @@ def test_mission_ends_if_moved_home_cannot_be_restored(tmp_path: Path) -> None:
 def test_drone_lands_at_original_home_if_home_keeps_moving(tmp_path: Path, refused: bool) -> None:
     """The restore is refused, or home is moved again every time. SmartRTL still leads to where the mission armed."""
 
-    async def again_and_again(world: World) -> None:
+    async def move_home_repeatedly(world: World) -> None:
         while True:
             move(world, AWAY)
             await asyncio.sleep(0.1)
@@ -128,7 +128,7 @@ def test_drone_lands_at_original_home_if_home_keeps_moving(tmp_path: Path, refus
             await end(world.service.goto(grant, GotoArgs(*at(0, 60), 12.0), 0))
             if refused:
                 world.plane.refuses.add(mavlink.MAV_CMD_DO_SET_HOME)
-            moving = asyncio.ensure_future(again_and_again(world))
+            moving = asyncio.ensure_future(move_home_repeatedly(world))
             await world.control.return_control(grant)
             await world.until(lambda: world.plane.vehicle.mode == SMART_RTL, 120)
             await world.until(lambda: not world.plane.vehicle.armed, 200)
@@ -275,7 +275,7 @@ def test_vertical_home_move_is_detected_without_home_position_message(
     async def work(sky: Sky, directory: Path) -> None:
         station = Endpoint(255, mavlink.MAV_COMP_ID_MISSIONPLANNER)
         parser = Parser()
-        lost = []
+        lost_messages = []
         async with ready(sky, directory) as (drone, grant):
             (wire,) = sky.wires
             deliver = wire._protocol.data_received
@@ -286,8 +286,8 @@ def test_vertical_home_move_is_detected_without_home_position_message(
 
             def lose_the_first(data: Any) -> None:
                 for received in parser.feed(bytes(data)):
-                    if received.name == "HOME_POSITION" and not lost:
-                        lost.append(received)
+                    if received.name == "HOME_POSITION" and not lost_messages:
+                        lost_messages.append(received)
                     else:
                         deliver(received.frame)
 
@@ -300,7 +300,7 @@ def test_vertical_home_move_is_detected_without_home_position_message(
             lat, lon = (round(degrees * 1e7) for degrees in at(0, 0))
             place = {"x": lat, "y": lon, "z": GROUND_M + up_m}
             send("COMMAND_INT", command=mavlink.MAV_CMD_DO_SET_HOME, frame=mavlink.MAV_FRAME_GLOBAL, **place)
-            await until(lambda: lost, 2.0)
+            await until(lambda: lost_messages, 2.0)
             with contextlib.suppress(Refused):
                 await end(drone.service.goto(grant, GotoArgs(*at(0, 20), 15.0), 0.0))
             await until(lambda: not drone.control.home_moved, 3.0)
@@ -315,10 +315,10 @@ async def test_home_position_request_is_rate_limited_after_refusal() -> None:
     class Refusing:
         vehicle = Vehicle(stack=ARDUCOPTER, armed=True, heartbeat_at=10.0)
         connected = True
-        asked = 0
+        requests = 0
 
         async def request_home(self) -> None:
-            self.asked += 1
+            self.requests += 1
             raise AutopilotError("refused", refused=True)
 
     autopilot = Refusing()
@@ -330,6 +330,6 @@ async def test_home_position_request_is_rate_limited_after_refusal() -> None:
     for _ in range(20):
         await asyncio.sleep(0)
         monitor.take("ATTITUDE")
-    assert autopilot.asked == 1
+    assert autopilot.requests == 1
     assert monitor._request is not None
     monitor._request.cancel()

@@ -1,4 +1,4 @@
-"""Return flights: start at rest, retries after refusals, limits and new zones, and state left after the mission."""
+"""Return flights: start at rest, retries after refusals, limits and new zones, and cleanup after the mission."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from mobility_world import (
     World,
     area,
     at,
-    clear_m,
+    clearance_m,
     end,
     partial,
     refusal,
@@ -36,7 +36,7 @@ REPOSITION = 192
 
 
 async def return_from_behind_wall(world: World) -> None:
-    """Return control at a place from which a zone blocks the direct route home."""
+    """Return control at a position from which a zone blocks the direct route home."""
     grant = world.grants.put(spec(zone("wall", "ignore", *WALL)))
     await world.up(grant)
     for x, y in ((60, 30), (60, 70), (0, 70)):
@@ -54,9 +54,9 @@ def test_return_to_launch_begins_after_drone_stopped(tmp_path: Path) -> None:
             turned: list[float] = []
             go_to = world.plane.go_to
 
-            async def noted(*where: Any) -> None:
+            async def noted(*position: Any) -> None:
                 turned.append(math.hypot(*world.plane.velocity))
-                await go_to(*where)
+                await go_to(*position)
 
             world.plane.go_to = noted  # type: ignore[method-assign]
             await end(world.service.return_to_launch(grant))
@@ -73,13 +73,13 @@ def test_return_to_launch_proceeds_if_gusts_prevent_standstill(tmp_path: Path) -
         async with World(tmp_path) as world:
             grant = world.grants.put(spec())
             await world.up(grant)
-            tell = world.plane._tell
+            report_state = world.plane._report_state
 
             def gusty() -> None:
-                tell()
+                report_state()
                 world.plane.vehicle.east_mps += 0.7
 
-            world.plane._tell = gusty  # type: ignore[method-assign]
+            world.plane._report_state = gusty  # type: ignore[method-assign]
             await end(world.service.return_to_launch(grant))
 
     fly(flight)
@@ -95,7 +95,7 @@ def test_return_avoids_zone_after_one_refused_command(tmp_path: Path) -> None:
             await world.until(lambda: REPOSITION in plane.commands)
             plane.refuses.clear()
             await world.until(lambda: not plane.vehicle.armed)
-            assert clear_m(world, *WALL) > 1.0
+            assert clearance_m(world, *WALL) > 1.0
             assert "NoLegalWay" not in {e["code"] for e in world.kinds("control")}
 
     fly(flight)
@@ -140,7 +140,7 @@ def test_fence_is_lowered_after_mission_ends(tmp_path: Path, how: str) -> None:
                 await world.until(lambda: world.fence.raised)
                 await asyncio.wait([arming])
                 if how == "unused":
-                    assert world.fence.raised, "the fence stays while the motors run"
+                    assert world.fence.raised, "the fence is kept while the motors run"
                     await world.service.disarm(grant)
                 else:
                     assert "command COMPONENT_ARM_DISARM" in str(arming.exception())
@@ -198,12 +198,12 @@ def test_failsafe_setup_is_retried_after_missing_parameter(tmp_path: Path) -> No
             plane = world.plane
             grant = world.grants.put(spec())
             plane.parameters |= {"SYSID_MYGCS": 244.0}
-            lost = plane.parameters.pop("FS_GCS_ENABLE")
+            removed_value = plane.parameters.pop("FS_GCS_ENABLE")
             world.observer.found()
             await world.until(lambda: control.failsafe_status is not None)
             assert control.failsafe_status is not None
             assert "FS_GCS_ENABLE" in control.failsafe_status.problem
-            plane.parameters["FS_GCS_ENABLE"] = lost
+            plane.parameters["FS_GCS_ENABLE"] = removed_value
             await world.until(lambda: control.failsafe_status is not None and not control.failsafe_status.problem, 10)
             await world.drive(grant)
             await world.service.arm(grant)
@@ -220,10 +220,10 @@ def test_failsafe_setup_is_retried_after_exception(tmp_path: Path) -> None:
             read = plane.vehicle_parameters.read
             broken = [KeyError("FENCE_ENABLE"), KeyError("FENCE_ENABLE")]
 
-            async def breaking(wanted: Any) -> dict[str, float]:
+            async def breaking(requested: Any) -> dict[str, float]:
                 if broken:
                     raise broken.pop()
-                return await read(wanted)
+                return await read(requested)
 
             plane.vehicle_parameters.read = breaking  # type: ignore[method-assign]
             world.observer.found()
@@ -233,9 +233,9 @@ def test_failsafe_setup_is_retried_after_exception(tmp_path: Path) -> None:
     fly(flight)
 
 
-@pytest.mark.parametrize("who", ["tour", "driver"])
+@pytest.mark.parametrize("pilot_kind", ["tour", "driver"])
 def test_internal_error_ends_mission_without_arming_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, who: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pilot_kind: str
 ) -> None:
     def broken(*_: object, **__: object) -> None:
         raise ZeroDivisionError
@@ -243,10 +243,10 @@ def test_internal_error_ends_mission_without_arming_again(
     async def flight() -> None:
         async with World(tmp_path) as world:
             monkeypatch.setattr("fractus_services.mobility.flight.route_following.route_steps", broken)
-            grant = world.grants.put(touring(tour=((0.0, 60.0),)) if who == "tour" else partial())
-            if who == "driver":
-                why = await refusal(world.drive(grant))
-                assert "has an internal error" in str(why)
+            grant = world.grants.put(touring(tour=((0.0, 60.0),)) if pilot_kind == "tour" else partial())
+            if pilot_kind == "driver":
+                reason = await refusal(world.drive(grant))
+                assert "has an internal error" in str(reason)
             await world.until(world.outcome)
             assert world.outcome().startswith("failed: the mobility service has an internal error")
             await world.until(lambda: not world.plane.vehicle.armed)
@@ -260,8 +260,8 @@ def test_internal_error_ends_mission_without_arming_again(
 SLOW = {"maxAltitude": 60, "maxSpeed": 4}
 
 
-@pytest.mark.parametrize("who", ["driver", "failsafe", "system"])
-def test_return_avoids_new_zone_within_speed_limit(tmp_path: Path, who: str) -> None:
+@pytest.mark.parametrize("controller", ["driver", "failsafe", "system"])
+def test_return_avoids_new_zone_within_speed_limit(tmp_path: Path, controller: str) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             plane = world.plane
@@ -269,9 +269,9 @@ def test_return_avoids_new_zone_within_speed_limit(tmp_path: Path, who: str) -> 
             await world.up(grant)
             await end(world.service.goto(grant, GotoArgs(*at(0, 120), 10.0), 0))
             homeward = None
-            if who == "system":
+            if controller == "system":
                 await world.control.return_control(grant)
-            elif who == "driver":
+            elif controller == "driver":
                 homeward = asyncio.ensure_future(end(world.service.return_to_launch(grant)))
             else:
                 plane.vehicle.failsafe = True
@@ -286,10 +286,10 @@ def test_return_avoids_new_zone_within_speed_limit(tmp_path: Path, who: str) -> 
                 await plane.update(0.1)
                 fastest = max(fastest, math.hypot(*plane.velocity))
             assert fastest <= 4.0 + 1e-6
-            assert clear_m(world, *WALL) > 1.0
+            assert clearance_m(world, *WALL) > 1.0
             assert math.hypot(*plane.xy) < 1.0
             alarms = [entry["action"] for entry in world.kinds("monitor")]
-            assert ("takeBack" in alarms) == (who == "failsafe")
+            assert ("takeBack" in alarms) == (controller == "failsafe")
             if homeward is not None:
                 await homeward
 
@@ -332,23 +332,25 @@ def test_restarted_service_takes_over_only_failsafe_return(tmp_path: Path, fails
             plane.set_to(RTL)
             world.observer.heartbeat()
             await world.until(lambda: plane.xy[1] < 90)
-        async with World(tmp_path, after=world, known=False) as again:
-            again.grants.put(spec(zone("wall", "revoke", *WALL)))
-            again.observer.found()
-            again.plane.trace.clear()
-            commands = len(again.plane.commands)
-            await again.until(lambda: not again.plane.vehicle.armed)
+        async with World(tmp_path, after=world, initialised=False) as restarted:
+            restarted.grants.put(spec(zone("wall", "revoke", *WALL)))
+            restarted.observer.found()
+            restarted.plane.trace.clear()
+            commands = len(restarted.plane.commands)
+            await restarted.until(lambda: not restarted.plane.vehicle.armed)
             expected_action = "takeBack" if failsafe else "alarm"
-            assert (expected_action, "ExclusionZoneAhead") in [(e["action"], e["code"]) for e in again.kinds("monitor")]
-            assert (mavlink.MAV_CMD_DO_SET_MODE in again.plane.commands[commands:]) is failsafe
-            assert (clear_m(again, *WALL) > 1.0) is failsafe
+            assert (expected_action, "ExclusionZoneAhead") in [
+                (e["action"], e["code"]) for e in restarted.kinds("monitor")
+            ]
+            assert (mavlink.MAV_CMD_DO_SET_MODE in restarted.plane.commands[commands:]) is failsafe
+            assert (clearance_m(restarted, *WALL) > 1.0) is failsafe
 
     fly(flight)
 
 
-@pytest.mark.parametrize("who", ["driver", "system"])
+@pytest.mark.parametrize("controller", ["driver", "system"])
 @pytest.mark.parametrize("low", [12.0, 5.0])
-def test_return_keeps_altitude_and_speed_limits(tmp_path: Path, who: str, low: float) -> None:
+def test_return_keeps_altitude_and_speed_limits(tmp_path: Path, controller: str, low: float) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             plane = world.plane
@@ -367,7 +369,7 @@ def test_return_keeps_altitude_and_speed_limits(tmp_path: Path, who: str, low: f
             await end(world.service.goto(grant, GotoArgs(*at(0, 90), 10.0), 0))
             plane.trace.clear()
             fastest = 0.0
-            if who == "system":
+            if controller == "system":
                 await world.control.return_control(grant)
             else:
                 homeward = asyncio.ensure_future(end(world.service.return_to_launch(grant)))
@@ -378,7 +380,7 @@ def test_return_keeps_altitude_and_speed_limits(tmp_path: Path, who: str, low: f
             assert max(z for *_, z in plane.trace) <= 12.2
             assert max(z for _, y, z in plane.trace if y < 50) <= low + 0.3
             assert math.hypot(*plane.xy) < 1.0
-            if who == "driver":
+            if controller == "driver":
                 await homeward
 
     fly(flight)
@@ -418,7 +420,7 @@ def test_landing_takeover_flies_home_if_zone_is_below(tmp_path: Path, upper: flo
             if upper < 20.0:
                 await refusal_of(world, GotoArgs(*at(0, 55), 5.0))
             await world.until(lambda: not world.plane.vehicle.armed)
-            assert (math.hypot(*world.plane.xy) < 2.0) is (upper < 20.0), "inside the zone it lands immediately"
+            assert (math.hypot(*world.plane.xy) < 2.0) is (upper < 20.0), "inside the zone the drone lands immediately"
             assert world.outcome().startswith("failed:")
 
     fly(flight)
@@ -455,14 +457,14 @@ def test_monitor_stops_failsafe_return_into_zone_after_earlier_return_was_given_
             await world.up(grant)
             for x, y in ((60, 30), (60, 70), (0, 70)):
                 await end(world.service.goto(grant, GotoArgs(*at(x, y), 10.0), 0))
-            world.monitor._return_flight.given_up = grant  # as after a return flight that its driver stopped
+            world.monitor._return_flight.given_up = grant  # same as after a return flight that its driver stopped
             await asyncio.sleep(2)
             plane.vehicle.failsafe = True
             plane.set_to(RTL)
             world.observer.heartbeat()
             await world.until(lambda: not plane.vehicle.armed)
             assert "takeBack" in [entry["action"] for entry in world.kinds("monitor")]
-            assert clear_m(world, *WALL) > 0
+            assert clearance_m(world, *WALL) > 0
 
     fly(flight)
 
@@ -564,8 +566,8 @@ def test_parameter_changed_on_ground_is_verified_before_arming(tmp_path: Path) -
             await world.until(lambda: world.control.failsafe_status is not None, 10)
             await world.drive(grant)
             change_parameter(world, "WPNAV_ACCEL", 100.0)
-            why = await refusal(world.service.arm(grant))
-            assert why.verdict.code == "FailsafesNotVerified"
+            reason = await refusal(world.service.arm(grant))
+            assert reason.verdict.code == "FailsafesNotVerified"
             await world.until(
                 lambda: world.control.failsafe_status is not None and not world.control.failsafe_status.problem, 5
             )
@@ -628,6 +630,6 @@ def test_goto_stops_when_scheduled_zone_becomes_active_on_leg(tmp_path: Path, ho
             await world.until(lambda: world.gate.situation().time_s > began.timestamp() - 5.0, 30)
             stopped = await refusal(end(world.service.goto(grant, GotoArgs(*at(0, 190), 10.0), 0)))
             assert stopped.verdict.policies == ("later",)
-            assert 10.0 < world.plane.xy[1] < 80.0, "it stops long before the zone"
+            assert 10.0 < world.plane.xy[1] < 80.0, "the drone stops long before the zone"
 
     fly(flight)

@@ -17,7 +17,7 @@ from fractus_services.errors import AutopilotError, PreconditionFailed, Refused,
 from fractus_services.mobility.authority.effects import FlightConstraints
 from fractus_services.mobility.flight import monitor as monitoring
 from fractus_services.mobility.flight.route_following import RouteFollower, SystemFlight
-from mobility_world import GUIDED, LOITER, World, area, clear_m, end, goto, partial, refusal, spec, zone
+from mobility_world import GUIDED, LOITER, World, area, clearance_m, end, goto, partial, refusal, spec, zone
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from virtual_time import fly
 
@@ -107,14 +107,14 @@ def slow_zone() -> dict[str, Any]:
     return slow | {"zones": [{"name": "slow-zone", "area": area(-50, SLOW_FROM, 50, 180)}]}
 
 
-@pytest.mark.parametrize("asked_mps", [None, 3.0])
-def test_set_speed_is_limited_by_current_leg(tmp_path: Path, asked_mps: float | None) -> None:
+@pytest.mark.parametrize("requested_mps", [None, 3.0])
+def test_set_speed_is_limited_by_current_leg(tmp_path: Path, requested_mps: float | None) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             grant = world.grants.put(spec(slow_zone()))
             await world.up(grant)
             flying = asyncio.ensure_future(
-                fastest(world, world.service.goto(grant, goto(0, 90, speed_mps=asked_mps), 0))
+                fastest(world, world.service.goto(grant, goto(0, 90, speed_mps=requested_mps), 0))
             )
             await world.until(lambda: world.plane.velocity[1] > 2.5)
             verdict, speed = await world.service.set_speed(grant, SetSpeedArgs(1.0))
@@ -289,8 +289,8 @@ def test_correction_is_dropped_after_pilot_takeover(tmp_path: Path) -> None:
     fly(flight)
 
 
-@pytest.mark.parametrize("what", ["course", "launch"])
-def test_refused_system_flight_leaves_current_motion_running(tmp_path: Path, what: str) -> None:
+@pytest.mark.parametrize("flight_kind", ["course", "launch"])
+def test_refused_system_flight_leaves_current_motion_running(tmp_path: Path, flight_kind: str) -> None:
     def forbidden(_motion: object) -> Any:
         def check() -> None:
             raise PreconditionFailed("ControlLost", "the driver is gone")
@@ -307,8 +307,8 @@ def test_refused_system_flight_leaves_current_motion_running(tmp_path: Path, wha
             with pytest.raises(PreconditionFailed, match="is gone"):
                 async for _ in (
                     RouteFollower(world.control, world.gate).fly(trip, away)
-                    if what == "course"
-                    else world.tours._launch(trip, Position(lat=away.lat, lon=away.lon))
+                    if flight_kind == "course"
+                    else world.poi_missions._launch(trip, Position(lat=away.lat, lon=away.lon))
                 ):
                     pass
             flown.check()
@@ -317,7 +317,7 @@ def test_refused_system_flight_leaves_current_motion_running(tmp_path: Path, wha
     fly(flight)
 
 
-# Commands that are lost
+# Lost commands
 
 
 def test_goto_is_judged_again_at_current_position_after_lost_command(tmp_path: Path) -> None:
@@ -329,46 +329,46 @@ def test_goto_is_judged_again_at_current_position_after_lost_command(tmp_path: P
             first = asyncio.ensure_future(refusal(world.service.goto(grant, goto(0, 56), 0)))
             await world.until(lambda: plane.velocity[1] > 5 and plane.xy[1] > 22)
             send = plane.send
-            lost = []
+            lost_count = []
 
             def lossy(outgoing: Any) -> None:
-                if outgoing.name == "COMMAND_INT" and len(lost) < 3:
-                    lost.append(math.hypot(*plane.velocity))
+                if outgoing.name == "COMMAND_INT" and len(lost_count) < 3:
+                    lost_count.append(math.hypot(*plane.velocity))
                 else:
                     send(outgoing)
 
             plane.send = lossy  # type: ignore[method-assign]
             begun = len(plane.commands)
-            there = await end(world.service.goto(grant, goto(-60, 50), 0))
-            assert there.verdict.permits
-            assert min(lost[:2]) > 5, "it flew on without a new command"
-            assert plane.commands[begun] == 84, "it has to stop first by then"
+            final = await end(world.service.goto(grant, goto(-60, 50), 0))
+            assert final.verdict.permits
+            assert min(lost_count[:2]) > 5, "the drone continued without a new command"
+            assert plane.commands[begun] == 84, "by then the drone has to stop first"
             assert (await first).verdict.code == "Replaced"
-            assert clear_m(world, -200, 63, 200, 100) > 1.0
+            assert clearance_m(world, -200, 63, 200, 100) > 1.0
 
     fly(flight)
 
 
-@pytest.mark.parametrize(("lost", "arrives"), [(3, True), (100, False)])
-def test_goto_stops_and_restarts_once_after_lost_speed_command(tmp_path: Path, lost: int, arrives: bool) -> None:
+@pytest.mark.parametrize(("lost_count", "arrives"), [(3, True), (100, False)])
+def test_goto_stops_and_restarts_once_after_lost_speed_command(tmp_path: Path, lost_count: int, arrives: bool) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             plane = world.plane
             grant = world.grants.put(spec(limit("speed", 2.0)))
             await world.up(grant)
             send = plane.send
-            left = lost
+            remaining = lost_count
             top = 0.0
 
             def lossy(outgoing: Any) -> None:
-                nonlocal left, top
+                nonlocal remaining, top
                 top = max(top, math.hypot(*plane.velocity))
                 if (
                     outgoing.name == "COMMAND_LONG"
                     and outgoing.integer("command") == mavlink.MAV_CMD_DO_CHANGE_SPEED
-                    and left > 0
+                    and remaining > 0
                 ):
-                    left -= 1
+                    remaining -= 1
                 else:
                     send(outgoing)
 
@@ -380,7 +380,7 @@ def test_goto_stops_and_restarts_once_after_lost_speed_command(tmp_path: Path, l
                 with pytest.raises(AutopilotError, match="does not acknowledge the speed"):
                     await flying
                 await world.until(lambda: math.hypot(*plane.velocity) < 0.2, 5)
-            assert top < 4.0, "it does not keep flying at its default speed"
+            assert top < 4.0, "the drone does not continue at its default speed"
 
     fly(flight)
 
@@ -401,11 +401,13 @@ def test_permitted_goto_is_flown_while_drone_brakes_before_new_zone(
             await world.until(lambda: world.plane.velocity[1] > 7.5 and world.plane.xy[1] > 30)
             grant = world.grants.put(spec(zone("new", "ignore", -30, 50, 30, 70)))
             assert (await flying).verdict.code == "ExclusionZoneAhead"
-            back = goto(*target)
-            await world.until(lambda: judge(Call("Goto", back), world.gate.situation(), grant.compiled).permits, 5)
-            assert world.plane.velocity[1] > 5, "it is still moving toward the zone"
-            await end(world.service.goto(grant, back, 0))
-            assert clear_m(world, -30, 50, 30, 70) > 0.0
+            toward_home = goto(*target)
+            await world.until(
+                lambda: judge(Call("Goto", toward_home), world.gate.situation(), grant.compiled).permits, 5
+            )
+            assert world.plane.velocity[1] > 5, "the drone is still moving toward the zone"
+            await end(world.service.goto(grant, toward_home, 0))
+            assert clearance_m(world, -30, 50, 30, 70) > 0.0
             codes = [note["code"] for note in world.kinds("control") if note["action"] == "brake"]
             assert codes == ["ExclusionZoneAhead"], "the monitor stopped one motion, not two"
 
@@ -450,9 +452,9 @@ def test_return_stays_inside_shrunk_inclusion_zone(tmp_path: Path) -> None:
             side = 1 if await start_return(world) else -1
             edge = world.plane.xy[0] + side * 16.0
             west, east = (-200.0, edge) if side > 0 else (edge, 200.0)
-            kept = zone("shrunk", "revoke", west, -200.0, east, 200.0)
-            kept["spec"]["kind"] = "inclusion"
-            world.grants.put(spec(zone("wall", "ignore", *WALL), kept))
+            inclusion_zone = zone("shrunk", "revoke", west, -200.0, east, 200.0)
+            inclusion_zone["spec"]["kind"] = "inclusion"
+            world.grants.put(spec(zone("wall", "ignore", *WALL), inclusion_zone))
             begun = len(world.plane.trace)
             await world.until(lambda: not world.plane.vehicle.armed)
             codes = [note["code"] for note in world.kinds("control") if note["action"] == "brake"]
@@ -468,14 +470,14 @@ def test_return_brakes_if_position_is_lost(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path, retraces=True) as world:
             await start_return(world)
-            tell = world.plane._tell
+            report_state = world.plane._report_state
             begun = world.plane.now
 
             def blind() -> None:
-                tell()
+                report_state()
                 world.plane.vehicle.position_at = begun
 
-            world.plane._tell = blind  # type: ignore[method-assign]
+            world.plane._report_state = blind  # type: ignore[method-assign]
             await world.until(lambda: world.kinds("control")[-1]["action"] != "returned", 3)
             codes = [note["code"] for note in world.kinds("control") if note["action"] == "brake"]
             assert codes == ["PositionUnknown"]
@@ -485,7 +487,7 @@ def test_return_brakes_if_position_is_lost(tmp_path: Path) -> None:
     fly(flight)
 
 
-# Grants that change
+# Changed Grants
 
 
 @pytest.fixture
@@ -515,7 +517,7 @@ def test_monitor_flags_fences_changed_until_drone_rests(tmp_path: Path, changed:
             await world.service.hover(grant)
             with pytest.raises(Refused):
                 await going
-            assert changed[-1], "it is still moving"
+            assert changed[-1], "the drone is still moving"
             await world.until(lambda: math.hypot(*world.plane.velocity) < 0.01)
             await asyncio.sleep(2.0)
             await end(world.service.goto(grant, goto(0, 40), 1.0))
@@ -573,12 +575,12 @@ async def cut(world: World, seconds: float, *, frozen: bool = False) -> None:
     """Cut the link for some seconds. If `frozen`, the vehicle and its clock stand still meanwhile."""
     plane = world.plane
     step = plane._step
-    plane.deaf = True
+    plane.disconnected = True
     if frozen:
         plane._step = lambda: None  # type: ignore[method-assign]
     await asyncio.sleep(seconds)
     plane._step = step
-    plane.deaf = False  # type: ignore[method-assign]
+    plane.disconnected = False  # type: ignore[method-assign]
 
 
 @pytest.mark.parametrize(("seconds", "frozen"), [(1.5, False), (3.0, False), (4.5, False), (5.0, True)])

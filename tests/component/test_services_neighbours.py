@@ -103,13 +103,15 @@ def test_command_is_resent_if_acknowledgement_belongs_to_another_station(tmp_pat
             write = wire.write
             parser = Parser()
             arrived = []
-            theirs = {
+            foreign = {
                 "target_system": 1,
                 "target_component": 1,
                 "command": mavlink.MAV_CMD_SET_MESSAGE_INTERVAL,
                 "param1": 147.0,
             }
-            station = Endpoint(255, mavlink.MAV_COMP_ID_MISSIONPLANNER).encode("COMMAND_LONG", theirs | {"param2": 1e6})
+            station = Endpoint(255, mavlink.MAV_COMP_ID_MISSIONPLANNER).encode(
+                "COMMAND_LONG", foreign | {"param2": 1e6}
+            )
 
             def lose_the_first(data: Any) -> None:
                 for sent in parser.feed(bytes(data)):
@@ -154,7 +156,7 @@ def test_restarted_service_selects_known_vehicle_and_sends_nothing_to_foreign_ve
     stranger: bytes, tmp_path: Path
 ) -> None:
     async def work(sky: Sky, directory: Path) -> None:
-        turning = asyncio.ensure_future(sky.turn())
+        turning = asyncio.ensure_future(sky.run_vehicle())
 
         def started() -> Drone:
             return Drone(
@@ -169,12 +171,12 @@ def test_restarted_service_selects_known_vehicle_and_sends_nothing_to_foreign_ve
             wire.close()
         deliver_first(sky, stranger)
         sent_names = messages_to(sky, 2)
-        again = started()
-        await until(lambda: again.autopilot.connected)
-        assert again.autopilot.target == (1, 1)
+        restarted = started()
+        await until(lambda: restarted.autopilot.connected)
+        assert restarted.autopilot.target == (1, 1)
         await asyncio.sleep(5.0)
         assert not sent_names
-        await again.close()
+        await restarted.close()
         turning.cancel()
 
     fly(work, tmp_path)

@@ -24,7 +24,7 @@ async def until_with_heartbeats(world: World, condition: Callable[[], object], t
     await world.until(beats, timeout_s)
 
 
-def taken_over(world: World) -> list[dict[str, Any]]:
+def takeovers(world: World) -> list[dict[str, Any]]:
     return [entry for entry in world.kinds("takeover") if entry["code"] == "FailsafeLost"]
 
 
@@ -46,7 +46,7 @@ def test_changed_fence_ends_mission_although_return_limit_check_fails(tmp_path: 
             world.observer._safeguards = replace(world.observer._safeguards, limit_return=fails)
             world.fence.hold = changed  # type: ignore[method-assign]
             await world.until(lambda: world.outcome().startswith("failed:"), 30)
-            reason = taken_over(world)[0]["reason"]
+            reason = takeovers(world)[0]["reason"]
             assert "another station changed its fence" in reason
             assert ("no space left" in reason) is not link
             await world.until(lambda: not world.plane.vehicle.armed)
@@ -64,7 +64,7 @@ def test_system_returns_drone_if_rtl_limits_cannot_be_applied(tmp_path: Path) ->
                 raise OSError("no space left on device")
 
             world.observer._safeguards = replace(world.observer._safeguards, limit_return=fails)
-            await world.until(lambda: taken_over(world), 30)
+            await world.until(lambda: takeovers(world), 30)
             assert "no space left" in world.outcome()
 
     fly(flight)
@@ -77,11 +77,11 @@ def test_drone_returns_home_if_parameters_stay_unverified(tmp_path: Path) -> Non
             await world.up(world.grants.put(spec()))
             world.plane.parameters.clear()
             silent_at = world.plane.now
-            await until_with_heartbeats(world, lambda: taken_over(world), 2 * SETTINGS.unverified_timeout_s)
+            await until_with_heartbeats(world, lambda: takeovers(world), 2 * SETTINGS.unverified_timeout_s)
             assert world.plane.now - silent_at > SETTINGS.unverified_timeout_s
             assert "has not reported" in world.outcome()
             await world.until(lambda: not world.plane.vehicle.armed)
-            assert len(taken_over(world)) == 1
+            assert len(takeovers(world)) == 1
 
     fly(flight)
 
@@ -99,7 +99,7 @@ def test_short_parameter_outages_do_not_end_mission(tmp_path: Path) -> None:
                 await until_with_heartbeats(world, lambda: world.plane.now - begun > silent_s, 2 * silent_s)  # noqa: B023
                 world.plane.parameters |= saved
                 await until_with_heartbeats(world, lambda: world.observer._unverified_since is None, 60)
-            assert not taken_over(world)
+            assert not takeovers(world)
             assert not world.outcome()
 
     fly(flight)

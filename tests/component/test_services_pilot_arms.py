@@ -93,15 +93,15 @@ def test_drone_armed_by_others_stays_with_pilot_after_service_restart(mode: Flig
             assert world.control.authority is Authority.PILOT
         world.plane.height = 20.0
         world.plane.set_to(mode)
-        async with World(tmp_path, after=world, known=False) as again:
+        async with World(tmp_path, after=world, initialised=False) as restarted:
             world.plane.commands.clear()
-            again.observer.found()
-            assert (again.control.authority, again.control.state.armed_by_others) == (Authority.PILOT, True)
-            await again.plane.update(5.0)
-            assert mavlink.MAV_CMD_DO_SET_MODE not in again.plane.commands
-            again.plane.vehicle.armed = False
-            again.observer.heartbeat()
-            assert (again.control.authority, again.journal.record.armed_by_others) == (Authority.SYSTEM, False)
+            restarted.observer.found()
+            assert (restarted.control.authority, restarted.control.state.armed_by_others) == (Authority.PILOT, True)
+            await restarted.plane.update(5.0)
+            assert mavlink.MAV_CMD_DO_SET_MODE not in restarted.plane.commands
+            restarted.plane.vehicle.armed = False
+            restarted.observer.heartbeat()
+            assert (restarted.control.authority, restarted.journal.record.armed_by_others) == (Authority.SYSTEM, False)
 
     virtual_time.fly(work)
 

@@ -60,13 +60,13 @@ def test_return_bounds_forbid_climb_if_limit_datum_is_unknown() -> None:
 
 def test_return_altitudes_end_with_heights_below_overhead_zones() -> None:
     now = at(50, 0, alt=33, airframe=Airframe(return_altitude_m=40))
-    zones = [exclusion(box(*where), name=name, lower=low) for name, low, where in (
+    zones = [exclusion(box(*zone_box), name=name, lower=low) for name, low, zone_box in (
         ("above", 35, (20, -20, 80, 20)), ("lower", 20, (0, -5, 10, 5)), ("ground", 12, (0, 5, 10, 15)),
         ("beyond", 15, (500, 0, 510, 10)), ("higher", 60, (0, 0, 10, 10)),
     )]  # fmt: skip
     assert return_altitudes_m(now, compiled(*zones), 150.0) == (40.0, 33.0, 32.5, 17.5)
-    kept_up = compiled(*zones, altitude(lowerLimit=25), limits=None)
-    assert return_altitudes_m(now, kept_up, 150.0) == (40.0, 33.0, 32.5)
+    with_minimum = compiled(*zones, altitude(lowerLimit=25), limits=None)
+    assert return_altitudes_m(now, with_minimum, 150.0) == (40.0, 33.0, 32.5)
 
 
 @pytest.mark.parametrize(
@@ -102,10 +102,10 @@ def test_rtl_limits_are_applied_during_mission_and_restored_after(tmp_path: Path
                 await world.until(lambda: not world.plane.vehicle.armed)
                 await world.until(lambda: held(world) == OWNED, 30)
         if restarted:
-            async with World(tmp_path, after=world, known=False) as again:
-                again.observer.found()
-                await again.until(lambda: not again.plane.vehicle.armed)
-                await again.until(lambda: held(again) == OWNED, 30)
+            async with World(tmp_path, after=world, initialised=False) as second:
+                second.observer.found()
+                await second.until(lambda: not second.plane.vehicle.armed)
+                await second.until(lambda: held(second) == OWNED, 30)
         assert not (tmp_path / "return.json").exists()
 
     fly(flight)
@@ -153,10 +153,10 @@ def test_mission_parameters_are_held_during_mission_and_restored_after(tmp_path:
                 await world.until(lambda: not world.plane.vehicle.armed)
                 await world.until(lambda: current_values(world) == FLOWN, 30)
         if restarted:
-            async with World(tmp_path, after=world, known=False) as again:
-                again.observer.found()
-                await again.until(lambda: not again.plane.vehicle.armed)
-                await again.until(lambda: current_values(again) == FLOWN, 30)
+            async with World(tmp_path, after=world, initialised=False) as second:
+                second.observer.found()
+                await second.until(lambda: not second.plane.vehicle.armed)
+                await second.until(lambda: current_values(second) == FLOWN, 30)
 
     fly(flight)
 
@@ -224,9 +224,9 @@ def test_arming_is_refused_if_rtl_speed_cannot_be_limited(tmp_path: Path) -> Non
             world.plane.fixed = ("WPNAV_SPEED",)
             grant = world.grants.put(spec(limits=LIMITS))
             await world.drive(grant)
-            why = await refusal(world.service.arm(grant))
-            assert why.verdict.code == "ReturnNotLimited"
-            assert "WPNAV_SPEED cannot be set to 350; it remains 1000" in str(why)
+            reason = await refusal(world.service.arm(grant))
+            assert reason.verdict.code == "ReturnNotLimited"
+            assert "WPNAV_SPEED cannot be set to 350; it remains 1000" in str(reason)
             assert not world.plane.vehicle.armed
             await world.until(lambda: held(world) == OWNED, 30)
 

@@ -18,7 +18,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sky_drone import fly, ready, until
 
 WALL = shapely.box(-100.0, 40.0, 100.0, 70.0)
-KEPT_M = 1.0
+MIN_DISTANCE_M = 1.0
 
 
 @pytest.mark.parametrize("action", ["ignore", "returnToLaunch"])
@@ -38,8 +38,8 @@ def test_drone_commanded_by_another_station_stops_before_zone(action: str, tmp_p
                 pass
             # Wait until the previous grant no longer affects the monitor.
             await asyncio.sleep(35.0)
-            kept_m: list[float] = []
-            sky.witnesses.append(lambda: kept_m.append(WALL.distance(shapely.Point(*oracle.place()[:2]))))
+            distances_m: list[float] = []
+            sky.witnesses.append(lambda: distances_m.append(WALL.distance(shapely.Point(*oracle.place()[:2]))))
             lat, lon = FRAME.latlon(0.0, 90.0)
             send(
                 "COMMAND_INT", command=mavlink.MAV_CMD_DO_REPOSITION, frame=mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT, param1=12.0,
@@ -54,7 +54,7 @@ def test_drone_commanded_by_another_station_stops_before_zone(action: str, tmp_p
             )
             await until(lambda: oracle.speeds()[0] > 5.0)
             await until(lambda: oracle.speeds()[0] < 0.2 or not sky.truth.armed)
-            assert KEPT_M <= min(kept_m) < 15.0
+            assert MIN_DISTANCE_M <= min(distances_m) < 15.0
 
     fly(work, tmp_path)
 

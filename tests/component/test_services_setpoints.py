@@ -11,7 +11,7 @@ import pytest
 from fractus_core.policy.decision_types import VelocityArgs
 from fractus_core.policy.kinematics import motion_before_reaction
 from fractus_services.errors import AutopilotError
-from mobility_world import World, clear_m, end, goto, refusal, spec, zone
+from mobility_world import World, clearance_m, end, goto, refusal, spec, zone
 from virtual_time import fly
 
 WALL = (-40.0, 25.0, 40.0, 40.0)
@@ -63,7 +63,7 @@ def test_velocity_setpoints_do_not_enter_exclusion_zone(tmp_path: Path) -> None:
                     assert "no-fly" in str(error)
                 await asyncio.sleep(0.2)
             assert refused > 50
-            assert clear_m(world, -50, 30, 50, 60) > 0.5
+            assert clearance_m(world, -50, 30, 50, 60) > 0.5
             assert world.control.state.controller == grant.identity
 
     fly(flight)
@@ -112,9 +112,9 @@ def test_velocity_setpoint_expires_directly_after_hover(tmp_path: Path) -> None:
             await world.service.hover(grant)
             await world.service.set_velocity(grant, VelocityArgs(4.0, 0.0, hold_s=0.5))
             await asyncio.sleep(0.4)
-            assert world.plane.wanted == (0.0, 4.0, 0.0)
+            assert world.plane.velocity_setpoint == (0.0, 4.0, 0.0)
             await asyncio.sleep(0.2)
-            assert world.plane.wanted == (0.0, 0.0, 0.0)
+            assert world.plane.velocity_setpoint == (0.0, 0.0, 0.0)
             assert world.control.motion is None
 
     fly(flight)
@@ -128,10 +128,10 @@ def test_velocity_setpoint_ends_when_driver_opens_second_stream(tmp_path: Path) 
             await world.service.set_velocity(grant, VelocityArgs(4.0, 0.0, hold_s=2.0))
             await world.drive(grant)
             await asyncio.sleep(0.3)
-            assert world.plane.wanted == (0.0, 0.0, 0.0), "the old setpoint is stopped"
+            assert world.plane.velocity_setpoint == (0.0, 0.0, 0.0), "the old setpoint is stopped"
             assert world.control.motion is None
             await world.service.set_velocity(grant, VelocityArgs(0.0, 2.0, hold_s=0.5))
-            assert world.plane.wanted == (2.0, 0.0, 0.0)
+            assert world.plane.velocity_setpoint == (2.0, 0.0, 0.0)
 
     fly(flight)
 
@@ -154,7 +154,7 @@ def test_failed_velocity_setpoint_stops_previous_setpoint(tmp_path: Path, monkey
                 await asyncio.sleep(0.05)
             for _ in range(10):
                 await asyncio.sleep(0.1)
-                assert world.plane.wanted == (0.0, 0.0, 0.0)
+                assert world.plane.velocity_setpoint == (0.0, 0.0, 0.0)
 
     fly(flight)
 
@@ -174,9 +174,9 @@ def test_delayed_velocity_setpoint_expires_after_hold_time(tmp_path: Path, monke
 
             monkeypatch.setattr(world.control.modes, "change_mode", slow)
             await world.service.set_velocity(grant, VelocityArgs(0.0, 3.0, hold_s=0.5))
-            assert world.plane.wanted == (3.0, 0.0, 0.0)
+            assert world.plane.velocity_setpoint == (3.0, 0.0, 0.0)
             await asyncio.sleep(0.7)
-            assert world.plane.wanted == (0.0, 0.0, 0.0), "the setpoint expired"
+            assert world.plane.velocity_setpoint == (0.0, 0.0, 0.0), "the setpoint expired"
 
     fly(flight)
 

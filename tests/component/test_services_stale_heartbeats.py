@@ -25,22 +25,24 @@ def test_stale_disarmed_heartbeats_in_flight_do_not_end_control(
             (wire,) = sky.wires
             deliver = wire._protocol.data_received
             parser = Parser()
-            kept = []
+            stale_frames = []
 
             def keep(data: Any) -> None:
-                kept.extend(m.frame for m in parser.feed(bytes(data)) if m.name == "HEARTBEAT" and not sky.truth.armed)
+                stale_frames.extend(
+                    m.frame for m in parser.feed(bytes(data)) if m.name == "HEARTBEAT" and not sky.truth.armed
+                )
                 deliver(data)
 
             monkeypatch.setattr(wire._protocol, "data_received", keep)
-            await until(lambda: len(kept) >= 3)
+            await until(lambda: len(stale_frames) >= 3)
             await drone.service.arm(grant, 120.0)
             climb = asyncio.ensure_future(end(drone.service.take_off(grant, TakeoffArgs(15.0))))
             await asyncio.sleep(0.5)
             assert not drone.autopilot.vehicle.in_air
-            deliver(b"".join(kept[:3]))
+            deliver(b"".join(stale_frames[:3]))
             await climb
             for _ in range(3):
-                deliver(b"".join(kept[:3]))
+                deliver(b"".join(stale_frames[:3]))
                 await asyncio.sleep(2.5)
             assert drone.state is StreamState.GRANTED
             await end(drone.service.goto(grant, goto(20, 0, 15), 0.0))

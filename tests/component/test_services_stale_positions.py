@@ -25,22 +25,22 @@ def test_stale_home_position_does_not_land_returning_drone(tmp_path: Path, monke
             (wire,) = sky.wires
             deliver = wire._protocol.data_received
             parser = Parser()
-            kept = []
+            stale_frames = []
 
             def keep(data: Any) -> None:
-                kept.extend(m.frame for m in parser.feed(bytes(data)) if m.name == "GLOBAL_POSITION_INT")
+                stale_frames.extend(m.frame for m in parser.feed(bytes(data)) if m.name == "GLOBAL_POSITION_INT")
                 deliver(data)
 
             await drone.service.arm(grant, 120.0)
             await end(drone.service.take_off(grant, TakeoffArgs(15.0)))
             monkeypatch.setattr(wire._protocol, "data_received", keep)
-            await until(lambda: kept)
+            await until(lambda: stale_frames)
             await end(drone.service.goto(grant, goto(0, 60, 15), 0.0))
-            deliver(kept[0])
+            deliver(stale_frames[0])
             assert drone.autopilot.vehicle.distance_m(*FRAME.latlon(0, 0)) > 50.0
             await drone.control.return_control(grant)
             for _ in range(50):
-                deliver(kept[0])
+                deliver(stale_frames[0])
                 await asyncio.sleep(0.02)
             await until(lambda: not sky.truth.armed)
             assert away_m() < 3.0

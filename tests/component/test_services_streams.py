@@ -66,8 +66,8 @@ def test_lost_stream_request_is_repeated_despite_duplicate_acknowledgement(
 ) -> None:
     async def work(sky: Sky, directory: Path) -> None:
         connect = sky.create_connection
-        wanted = float(message_id(kind))
-        lost = []
+        requested_id = float(message_id(kind))
+        dropped = []
         answer = {
             "command": mavlink.MAV_CMD_SET_MESSAGE_INTERVAL,
             "result": mavlink.MAV_RESULT_ACCEPTED,
@@ -82,11 +82,11 @@ def test_lost_stream_request_is_repeated_despite_duplicate_acknowledgement(
 
             def lose_the_first(data: Any) -> None:
                 for sent in parser.feed(bytes(data)):
-                    asks = (
+                    is_request = (
                         sent.name == "COMMAND_LONG" and sent.integer("command") == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL
                     )
-                    if asks and sent.real("param1") == wanted and not lost:
-                        lost.append(sent)
+                    if is_request and sent.real("param1") == requested_id and not dropped:
+                        dropped.append(sent)
                         sky.call_later(0.01, protocol.data_received, twice)
                     else:
                         write(sent.frame)
@@ -97,7 +97,7 @@ def test_lost_stream_request_is_repeated_despite_duplicate_acknowledgement(
         monkeypatch.setattr(sky, "create_connection", create_connection)
         async with ready(sky, directory) as (drone, grant):
             await drone.service.arm(grant, 60.0)
-            assert lost
+            assert dropped
             assert sky.truth.armed
 
     fly(work, tmp_path)

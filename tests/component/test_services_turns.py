@@ -109,7 +109,7 @@ async def test_long_computation_yields_to_other_tasks(monkeypatch: pytest.Monkey
     task = asyncio.ensure_future(other())
     assert await in_slices(long()) == "done"
     task.cancel()
-    assert turns > 80, "it yields every four milliseconds"
+    assert turns > 80, "the computation yields every four milliseconds"
 
 
 def test_route_search_uses_fences_changed_during_search(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -128,7 +128,9 @@ def test_route_search_uses_fences_changed_during_search(tmp_path: Path, monkeypa
             monkeypatch.setattr(route_following, "in_slices", slowly)
             await world.drive(grant)
             assert searches > 2
-            assert max(abs(x) for x, _, _ in world.plane.trace) > 41, "around the wall from the first leg"
+            assert max(abs(x) for x, _, _ in world.plane.trace) > 41, (
+                "the route leads around the wall from the first leg"
+            )
             assert not [e for e in world.kinds("control") if e["action"] == "brake"]
 
     fly(flight)
@@ -142,17 +144,17 @@ def test_throttling_delays_driver_less_than_other_callers(tmp_path: Path, monkey
             await world.drive(grant)
             monkeypatch.setattr(authorization, "time", Clock())
 
-            async def ask(who: Any, times: int) -> float:
+            async def call_repeatedly(caller: Any, times: int) -> float:
                 async def once() -> None:
-                    await world.service.calls.throttle(who)
-                    world.service.calls.check(Call("GetPosition"), who)
+                    await world.service.calls.throttle(caller)
+                    world.service.calls.check(Call("GetPosition"), caller)
 
                 begun = world.plane.now
                 await asyncio.gather(*(once() for _ in range(times)))
                 return world.plane.now - begun
 
-            flood = asyncio.ensure_future(ask(other, 101))
-            assert await ask(grant, 101) == pytest.approx(0.1, abs=0.02)
+            flood = asyncio.ensure_future(call_repeatedly(other, 101))
+            assert await call_repeatedly(grant, 101) == pytest.approx(0.1, abs=0.02)
             assert not flood.done()
             assert await flood == pytest.approx(0.4, abs=0.05)
 
@@ -207,12 +209,12 @@ def test_throttle_delay_is_not_shortened_by_cheap_call(
             other = w.grants.put(spec(instance="app-other"), "m2")
             await w.up(grant)
             costly(w, "Goto", monkeypatch)
-            for who, rest_s in ((grant, 0.1), (other, 0.4)):
-                await w.service.calls.throttle(who)
+            for caller, rest_s in ((grant, 0.1), (other, 0.4)):
+                await w.service.calls.throttle(caller)
                 begun = w.plane.now
-                w.service.calls.check(Call("Goto"), who)
-                w.service.calls.check(Call("Hover"), who)
-                await w.service.calls.throttle(who)
+                w.service.calls.check(Call("Goto"), caller)
+                w.service.calls.check(Call("Hover"), caller)
+                await w.service.calls.throttle(caller)
                 assert w.plane.now - begun == pytest.approx(rest_s, abs=0.02)
 
     fly(flight)
@@ -254,11 +256,11 @@ def test_throttled_call_is_replaced_by_later_call(world: Callable[[], World], mo
                 with pytest.raises(PermissionError, match="Replaced"):
                     await replaced
 
-            [kept] = await waiting(handlers.Goto(goto, Context(grant)))
+            [latest] = await waiting(handlers.Goto(goto, Context(grant)))
             for call in (handlers.Hover(hover, Context(other)), handlers.Goto(goto, Context(other))):
                 with pytest.raises(PermissionError, match="NotInControl"):
                     await call
-            await kept
+            await latest
             assert w.plane.xy == pytest.approx([0.0, 90.0], abs=2.0)
 
     fly(flight)

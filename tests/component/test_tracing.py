@@ -43,7 +43,7 @@ def close(collector: Collector, monkeypatch: pytest.MonkeyPatch) -> Iterator[Cal
 
 @pytest.mark.parametrize("named", [tracing.collector, fractus.tracing.collector])
 @pytest.mark.parametrize(
-    ("environment", "found"),
+    ("environment", "expected"),
     [
         ({}, ""),
         ({"OTEL_SERVICE_NAME": "s", "OTEL_TRACES_SAMPLER": "always_on"}, ""),
@@ -59,9 +59,9 @@ def close(collector: Collector, monkeypatch: pytest.MonkeyPatch) -> Iterator[Cal
     ],
 )
 def test_collector_is_read_from_the_standard_variables(
-    named: Callable[[dict[str, str]], str], environment: dict[str, str], found: str
+    named: Callable[[dict[str, str]], str], environment: dict[str, str], expected: str
 ) -> None:
-    assert named(environment) == found
+    assert named(environment) == expected
 
 
 SERVICE = "from fractus_runtime import tracing; tracing.configure('mobility', 'n', os.environ)()"
@@ -122,7 +122,7 @@ async def test_child_spans_belong_to_the_call_in_its_tasks_too(close: Callable[[
             raise OSError("lat 50.1")
     close()
     part, failed, call = collector.spans
-    assert [one.name for one in collector.spans] == ["part", "failed", METHOD]
+    assert [span.name for span in collector.spans] == ["part", "failed", METHOD]
     assert {part.span.parent_span_id, failed.span.parent_span_id} == {call.span.span_id}
     assert part.attributes == {"fractus.verdict.action": "deny"}
     assert failed.attributes == {"error.type": "OSError"}, "the text of an error may contain a position"
@@ -154,7 +154,7 @@ def test_sampler_of_the_environment_selects_traces(collector: Collector, monkeyp
         with tracing.server_span(METHOD, headers, grpc.aio.AbortError), tracing.child_span("part"):
             pass
     close()
-    assert [one.name for one in collector.spans] == ["part", METHOD], "a sampled trace of the caller continues"
+    assert [span.name for span in collector.spans] == ["part", METHOD], "a sampled trace of the caller continues"
 
 
 def test_call_continues_if_a_span_cannot_be_started(

@@ -40,16 +40,16 @@ def test_formation_beyond_last_port_is_refused():
 
 
 def test_pseudo_terminal_does_not_replace_file(tmp_path: Path):
-    kept = tmp_path / "kept"
-    kept.write_text("mine")
+    parameter_file = tmp_path / "kept"
+    parameter_file.write_text("mine")
     hub = Hub()
     with pytest.raises(LinkError, match="use another path"):
-        hub.open(LinkSpec.parse(f"pty:{kept}"), Craft(CONFIG), 0)
+        hub.open(LinkSpec.parse(f"pty:{parameter_file}"), Craft(CONFIG), 0)
     hub.close()
-    assert kept.read_text() == "mine"
+    assert parameter_file.read_text() == "mine"
 
 
-def test_values_that_do_not_fit_are_the_nearest_that_do():
+def test_parameter_values_out_of_range_are_limited():
     assert Parameters({"WPNAV_SPEED": 1e300})["WPNAV_SPEED"] == pytest.approx(3.4028234e38)
     assert Parameters({"MIS_RESTART": -math.inf})["MIS_RESTART"] == -128.0
     with pytest.raises(ParameterValueError, match="WPNAV_SPEED"):
@@ -57,7 +57,7 @@ def test_values_that_do_not_fit_are_the_nearest_that_do():
 
 
 @pytest.mark.parametrize("content", [b"a letter to someone\n", b"WPNAV_SPEED,fast\n", b"\xff\xfe"])
-def test_a_file_that_holds_no_parameters_is_neither_read_nor_replaced(content: bytes, tmp_path: Path):
+def test_file_without_parameters_is_neither_read_nor_replaced(content: bytes, tmp_path: Path):
     store = tmp_path / "store"
     store.write_bytes(content)
     with pytest.raises(ParameterValueError, match="NAME,VALUE"):
@@ -66,7 +66,7 @@ def test_a_file_that_holds_no_parameters_is_neither_read_nor_replaced(content: b
     assert Parameters(store=store)["WPNAV_SPEED"] == 700.0
 
 
-def test_every_vehicle_of_a_row_is_announced():
+def test_every_vehicle_of_a_formation_is_announced():
     options = ["--count", "3", "--listen", "udpout:127.0.0.1:26000", "--duration", "0.1", "--speedup", "0"]
     done = CliRunner().invoke(vehicle, options)
     assert done.stderr.splitlines() == [

@@ -20,8 +20,8 @@ def test_gcs_failsafe_returns_home_when_heartbeats_stop():
     pilot.go_to(30.0, 0.0, 10.0)
     pilot.fly_on(5.0)
     pilot.heartbeats = False
-    lost_s = pilot.wait(lambda: vehicle.mode == mavlink.COPTER_MODE_RTL, 10.0)
-    assert 3.9 < lost_s <= 5.2
+    elapsed_s = pilot.wait(lambda: vehicle.mode == mavlink.COPTER_MODE_RTL, 10.0)
+    assert 3.9 < elapsed_s <= 5.2
     assert pilot.texts[-1] == "GCS Failsafe"
     pilot.wait(lambda: not vehicle.armed, 90.0)
     assert distance_m(vehicle, 0.0, 0.0) < 1.0
@@ -103,7 +103,7 @@ def test_fence_breach_returns_vehicle():
         if vehicle.mode == mavlink.COPTER_MODE_RTL:
             break
     assert vehicle.mode == mavlink.COPTER_MODE_RTL
-    assert vehicle.body.north > 20.0, "it reacts only after crossing"
+    assert vehicle.body.north > 20.0, "the vehicle reacts only after it has crossed the fence"
     assert "Polygon fence breached" in pilot.texts
     assert vehicle.fence.breach_type == 3
     pilot.wait(lambda: not vehicle.armed, 90.0)

@@ -14,10 +14,10 @@ from vehicle_world import START, airborne, alone, distance_m, upload
 HOME = {"command": 16, "frame": 0, "x": START.lat_e7, "y": START.lon_e7, "z": 150.0}
 
 
-def _in_order(texts: list[str], *wanted: str) -> bool:
+def _in_order(texts: list[str], *prefixes: str) -> bool:
     """Return True if the texts were sent in this order, possibly with others in between."""
     rest = iter(texts)
-    return all(any(text.startswith(want) for text in rest) for want in wanted)
+    return all(any(text.startswith(prefix) for text in rest) for prefix in prefixes)
 
 
 def _waypoint(north_m: float, altitude_m: float = 10.0) -> dict[str, float]:
@@ -50,7 +50,7 @@ def test_gps_loss_lands_vehicle_after_pause(mode: int):
     )
     height_m = vehicle.height_m
     pilot.fly_on(3.5)
-    assert vehicle.height_m == pytest.approx(height_m, abs=1.0), "a failsafe's landing waits four seconds"
+    assert vehicle.height_m == pytest.approx(height_m, abs=1.0), "the landing of a failsafe starts after four seconds"
     pilot.wait(lambda: not vehicle.armed, 90.0)
     assert not vehicle.body.crashed
 
@@ -213,7 +213,7 @@ def test_thrust_loss_is_reported_before_ground_contact():
 
 def test_gust_is_compensated_without_mode_change():
     vehicle, pilot = airborne(15.0)
-    said = len(pilot.texts)
+    texts_before = len(pilot.texts)
     pilot.parameter("SIM_WIND_DIR", 0)
     pilot.parameter("SIM_WIND_SPD", 10)
     worst = lean = 0.0
@@ -226,7 +226,7 @@ def test_gust_is_compensated_without_mode_change():
     assert 0.3 < worst < 5.0
     assert lean > math.radians(5)
     assert distance_m(vehicle, 0.0, 0.0) < 0.8
-    assert (vehicle.mode, pilot.texts[said:]) == (mavlink.COPTER_MODE_GUIDED, [])
+    assert (vehicle.mode, pilot.texts[texts_before:]) == (mavlink.COPTER_MODE_GUIDED, [])
 
 
 def test_vehicle_blown_away_by_storm_returns():

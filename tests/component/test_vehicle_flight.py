@@ -72,7 +72,7 @@ def test_position_is_held_in_wind_and_gusts():
         pilot.step()
         worst = max(worst, distance_m(vehicle, *vehicle.control.target))
     assert worst < 2.5
-    assert abs(vehicle.est.roll) + abs(vehicle.est.pitch) > math.radians(3), "it must lean into the wind"
+    assert abs(vehicle.est.roll) + abs(vehicle.est.pitch) > math.radians(3), "the vehicle must lean into the wind"
 
 
 def test_arming_is_refused_with_reason_until_ready():
@@ -251,12 +251,12 @@ def test_changed_speed_is_kept_until_controller_changes():
     assert vehicle.body.vn == pytest.approx(2.0, abs=0.2)
     pilot.go_to(-60.0, 0.0, 10.0)
     pilot.fly_on(10.0)
-    assert vehicle.body.vn == pytest.approx(-2.0, abs=0.2), "the next position keeps it"
+    assert vehicle.body.vn == pytest.approx(-2.0, abs=0.2), "the next position target keeps the speed"
     _local(pilot, 1, 0xDC7, vx=0.0, vy=0.0, vz=0.0)
     pilot.fly_on(3.0)
     pilot.go_to(-60.0, 0.0, 10.0)
     pilot.fly_on(4.0)
-    assert vehicle.body.vn < -5.0, "a velocity in between ends it"
+    assert vehicle.body.vn < -5.0, "a velocity target in between resets the speed"
 
 
 def _at_speed(speed_mps: float, **parameters: float) -> tuple[VehicleState, Pilot]:
@@ -289,7 +289,7 @@ def test_zero_velocity_stopping_distance_matches_real_vehicle():
     _local(pilot, 1, 0xDC7, vx=0.0, vy=0.0, vz=0.0)
     assert _until_slow(vehicle, pilot) == pytest.approx(4.2, rel=0.1)
     pilot.fly_on(1.0)
-    assert vehicle.est.north - at == pytest.approx(20.2, rel=0.1), "19.6 and 20.7 m in two flights of the real one"
+    assert vehicle.est.north - at == pytest.approx(20.2, rel=0.1), "19.6 and 20.7 m in two flights of the real vehicle"
 
 
 @pytest.mark.parametrize(("timeout_s", "real_s"), [(3.0, 5.0), (1.0, 3.1)])
@@ -412,6 +412,6 @@ def test_battery_voltage_drops_with_charge_and_load():
     assert vehicle.battery.percent < before
     assert vehicle.battery.voltage_v < resting - 0.2
     assert isinstance(vehicle, VehicleState)
-    left = vehicle.battery.capacity_mah - vehicle.battery.used_mah
-    endurance_min = left / (vehicle.battery.used_mah / pilot.simulation.time_s) / 60.0
+    remaining_mah = vehicle.battery.capacity_mah - vehicle.battery.used_mah
+    endurance_min = remaining_mah / (vehicle.battery.used_mah / pilot.simulation.time_s) / 60.0
     assert 8.0 < endurance_min < 25.0

@@ -32,21 +32,21 @@ def test_gimbal_turns_at_its_rate_and_reports_attitude() -> None:
     def turned() -> bool:
         report = gimbal_device_attitude_status(vehicle)
         assert report is not None
-        found = attitude_of(message("GIMBAL_DEVICE_ATTITUDE_STATUS", **report), 0.0)
-        assert found is not None
-        angles.append(found.pitch_deg)
-        return found.pitch_deg < -89.0 and vehicle.gimbal.yaw_deg == 120.0
+        attitude = attitude_of(message("GIMBAL_DEVICE_ATTITUDE_STATUS", **report), 0.0)
+        assert attitude is not None
+        angles.append(attitude.pitch_deg)
+        return attitude.pitch_deg < -89.0 and vehicle.gimbal.yaw_deg == 120.0
 
     pilot.wait(turned, 5.0)
     assert 1.7 < vehicle.time_s - begun_s < 2.5, "120 degrees at 60 a second"
-    assert any(-60 < angle < -30 for angle in angles), "it passes what is between"
+    assert any(-60 < angle < -30 for angle in angles), "the gimbal passes intermediate angles"
 
 
-@pytest.mark.parametrize("wanted", [(-120.0, 0.0, -90.0), (60.0, 0.0, 20.0)])
-def test_gimbal_angles_are_limited(wanted: tuple[float, float, float]) -> None:
+@pytest.mark.parametrize("angles_deg", [(-120.0, 0.0, -90.0), (60.0, 0.0, 20.0)])
+def test_gimbal_angles_are_limited(angles_deg: tuple[float, float, float]) -> None:
     vehicle, pilot = alone(MNT1_TYPE=SIYI)
-    pilot.command(PITCHYAW, *wanted[:2], math.nan, math.nan)
-    pilot.wait(lambda: vehicle.gimbal.pitch_deg == wanted[2], 3.0)
+    pilot.command(PITCHYAW, *angles_deg[:2], math.nan, math.nan)
+    pilot.wait(lambda: vehicle.gimbal.pitch_deg == angles_deg[2], 3.0)
 
 
 def test_servo_gimbal_reports_its_target() -> None:

@@ -60,7 +60,7 @@ def test_mission_with_jump_and_return_is_flown():
             fastest_after_change = max(fastest_after_change, abs(vehicle.body.ve))
         if not vehicle.armed:
             break
-    assert reached == [1, 3, 4, 3, 4, 6], "of two items that end in one step the later one is told"
+    assert reached == [1, 3, 4, 3, 4, 6], "if two items end in one step, only the later one is reported"
     assert vehicle.mission.state(vehicle.mode) == 5
     assert fastest_after_change < 4.4
     assert not vehicle.armed
@@ -136,7 +136,7 @@ def test_stalled_upload_is_repeated_then_cancelled_without_changes():
 def test_invalid_item_aborts_upload(item: dict[str, float], result: int):
     vehicle, pilot = alone()
     assert upload(pilot, 0, [HOME, item]) == result
-    assert len(vehicle.mission.items) == 1, "what had arrived is left"
+    assert len(vehicle.mission.items) == 1, "the items received before are kept"
 
 
 def test_waypoint_heading_may_be_nan():
@@ -175,9 +175,12 @@ def test_jump_tag_selects_tagged_item():
     vehicle, pilot = alone()
     tag = {"command": 600, "param1": 7.0}
     jump = {"command": 601, "param1": 7.0, "param2": 1.0}
-    lost = {"command": 601, "param1": 8.0, "param2": -1.0}
+    missing_jump = {"command": 601, "param1": 8.0, "param2": -1.0}
     points = [_waypoint(north, 0.0, 10.0) for north in (1.0, 2.0, 3.0)]
-    assert upload(pilot, 0, [HOME, points[0], tag, points[1], jump, lost, points[2]]) == mavlink.MAV_MISSION_ACCEPTED
+    assert (
+        upload(pilot, 0, [HOME, points[0], tag, points[1], jump, missing_jump, points[2]])
+        == mavlink.MAV_MISSION_ACCEPTED
+    )
     mission = vehicle.mission
     at = 0
     order = []
@@ -186,7 +189,7 @@ def test_jump_tag_selects_tagged_item():
         order.append(at)
     assert order == [1, 2, 3, 2, 3]  # a jump to a missing tag ends the mission
     assert pilot.command(mavlink.MAV_CMD_DO_JUMP_TAG, 7.0) == mavlink.MAV_RESULT_ACCEPTED
-    assert mission.current == 3, "the first item after the tag that navigates"
+    assert mission.current == 3, "the first navigation item after the tag"
     assert pilot.command(mavlink.MAV_CMD_DO_JUMP_TAG, 9.0) == mavlink.MAV_RESULT_FAILED
 
 
@@ -198,7 +201,7 @@ def test_jump_loop_without_waypoint_terminates(times, following):
     points = [_waypoint(north, 0.0, 10.0) for north in (1.0, 2.0)]
     assert upload(pilot, 0, [HOME, points[0], tag, jump, points[1]]) == mavlink.MAV_MISSION_ACCEPTED
     assert vehicle.mission.peek_after(1) == following
-    assert vehicle.mission.peek_after(1) == following, "nothing was counted as done"
+    assert vehicle.mission.peek_after(1) == following, "the repetition counter has not changed"
 
 
 def test_upload_of_too_many_items_is_refused():
@@ -244,7 +247,7 @@ def test_mission_pause_continue_and_set_current():
     assert pilot.last["MISSION_CURRENT"].integer("seq") == 2
     pilot.wait(lambda: vehicle.mission.state(vehicle.mode) == 5, 60.0)
     pilot.fly_on(3.0)
-    assert vehicle.mode == mavlink.COPTER_MODE_AUTO, "it holds where the mission ended"
+    assert vehicle.mode == mavlink.COPTER_MODE_AUTO, "the vehicle holds its position at the end of the mission"
     assert distance_m(vehicle, 60.0, 30.0) < 3.0
 
 
@@ -270,19 +273,19 @@ def _fly_mission(
     vehicle, pilot = airborne(10.0, **parameters)
     assert upload(pilot, 0, [HOME, *items]) == mavlink.MAV_MISSION_ACCEPTED
     assert pilot.mode(mavlink.COPTER_MODE_AUTO) == mavlink.MAV_RESULT_ACCEPTED
-    way = []
+    track = []
     for _ in range(12_000):
         pilot.step()
         body = vehicle.body
-        way.append((body.north, body.east, -body.down, math.hypot(body.vn, body.ve), pilot.simulation.time_s))
+        track.append((body.north, body.east, -body.down, math.hypot(body.vn, body.ve), pilot.simulation.time_s))
         if vehicle.mission.state(vehicle.mode) == 5:
-            return vehicle, pilot, way
+            return vehicle, pilot, track
     raise AssertionError(pilot.texts[-5:])
 
 
 def test_mission_legs_are_straight_lines():
-    _, _, way = _fly_mission([_waypoint(60.0, 0.0, 30.0), _waypoint(60.0, 80.0, 12.0)])
-    for north, east, altitude, *_ in way:
+    _, _, track = _fly_mission([_waypoint(60.0, 0.0, 30.0), _waypoint(60.0, 80.0, 12.0)])
+    for north, east, altitude, *_ in track:
         if north < 55.0:
             assert altitude == pytest.approx(10.0 + 20.0 * max(north, 0.0) / 60.0, abs=1.5)
         elif 5.0 < east < 75.0:
@@ -292,32 +295,32 @@ def test_mission_legs_are_straight_lines():
 def test_spline_passes_its_points_without_stopping():
     points = ((40.0, 0.0), (70.0, 40.0), (40.0, 80.0), (0.0, 80.0))
     items = [_waypoint(north, east, 10.0, command=82) for north, east in points]
-    _, pilot, way = _fly_mission(items)
-    passed = [min(math.dist(at[:2], point) for at in way) for point in points]
+    _, pilot, track = _fly_mission(items)
+    passed = [min(math.dist(at[:2], point) for at in track) for point in points]
     assert max(passed) < 2.0
-    middle = [at[3] for at in way if 20.0 < at[1] < 75.0]
-    assert min(middle) > 1.5, "it slows down in the bends but does not stop"
-    assert max(at[0] for at in way) > 68.0
-    straight = max(abs(at[0] - 40.0 - 30.0 * at[1] / 40.0) for at in way if 5.0 < at[1] < 35.0)
-    assert straight > 2.0, "it is a curve"
+    middle = [at[3] for at in track if 20.0 < at[1] < 75.0]
+    assert min(middle) > 1.5, "the vehicle slows down in the bends but does not stop"
+    assert max(at[0] for at in track) > 68.0
+    straight = max(abs(at[0] - 40.0 - 30.0 * at[1] / 40.0) for at in track if 5.0 < at[1] < 35.0)
+    assert straight > 2.0, "the path is a curve"
     assert "Mission: 2 SplineWP" in pilot.texts
 
 
 def test_return_after_sharp_spline_starts_at_its_end():
     items = [_waypoint(25.0, 0.0, 12.0), _waypoint(25.0, 25.0, 12.0), _waypoint(0.0, 25.0, 12.0, command=82)]
-    vehicle, _, way = _fly_mission([*items, {"command": 20}])
-    assert max(math.hypot(north, east) for north, east, *_ in way) < 40.0
-    assert max(speed for _, _, _, speed, _ in way) < 11.0
+    vehicle, _, track = _fly_mission([*items, {"command": 20}])
+    assert max(math.hypot(north, east) for north, east, *_ in track) < 40.0
+    assert max(speed for _, _, _, speed, _ in track) < 11.0
     assert vehicle.landed
 
 
 def test_spline_waypoint_with_delay_stops():
     items = [_waypoint(40.0, 0.0, 10.0, command=82, param1=4.0), _waypoint(40.0, 40.0, 14.0, command=82)]
-    _, _, way = _fly_mission(items)
-    there = [at[3] for at in way if math.dist(at[:2], (40.0, 0.0)) < 2.0]
-    assert len(there) > 350
-    assert min(there) < 0.3
-    assert way[-1][2] == pytest.approx(14.0, abs=2.1)
+    _, _, track = _fly_mission(items)
+    near_waypoint = [at[3] for at in track if math.dist(at[:2], (40.0, 0.0)) < 2.0]
+    assert len(near_waypoint) > 350
+    assert min(near_waypoint) < 0.3
+    assert track[-1][2] == pytest.approx(14.0, abs=2.1)
 
 
 def test_mission_conditions_delay_commands_without_stopping_flight():
@@ -329,11 +332,11 @@ def test_mission_conditions_delay_commands_without_stopping_flight():
         {"command": 178, "param1": 1.0, "param2": 1.5},
         _waypoint(80.0, 0.0, 10.0),
     ]
-    _, pilot, way = _fly_mission(items)
-    begun = next(at[4] for at in way if at[0] > 6.0)
-    assert max(at[3] for at in way if at[4] < begun + 3.0) > 4.5, "it flies while the delay lasts"
-    assert max(at[3] for at in way if 55.0 < at[0] < 68.0) < 3.4
-    assert max(at[3] for at in way if 75.0 < at[0] < 77.0) < 2.2
+    _, pilot, track = _fly_mission(items)
+    begun = next(at[4] for at in track if at[0] > 6.0)
+    assert max(at[3] for at in track if at[4] < begun + 3.0) > 4.5, "the vehicle flies during the delay"
+    assert max(at[3] for at in track if 55.0 < at[0] < 68.0) < 3.4
+    assert max(at[3] for at in track if 75.0 < at[0] < 77.0) < 2.2
     assert [text for text in pilot.texts if "ChangeSpeed" in text] == [
         "Mission: 3 ChangeSpeed",
         "Mission: 5 ChangeSpeed",
@@ -395,9 +398,9 @@ def test_mission_reports_items_in_order_of_real_vehicle():
     before = len(pilot.texts)
     assert pilot.command(mavlink.MAV_CMD_MISSION_START) == mavlink.MAV_RESULT_ACCEPTED
     pilot.wait(lambda: not vehicle.armed, 120.0)
-    told = [text for text in pilot.texts[before:] if text.startswith(("Mission", "Reached"))]
+    mission_texts = [text for text in pilot.texts[before:] if text.startswith(("Mission", "Reached"))]
     start = ["Mission: 1 Takeoff", "Mission: 1 Takeoff"]
-    assert told == [*start, "Mission: 2 ChangeSpeed", "Mission: 3 WP", "Reached command #3", "Mission: 4 RTL"]
+    assert mission_texts == [*start, "Mission: 2 ChangeSpeed", "Mission: 3 WP", "Reached command #3", "Mission: 4 RTL"]
 
 
 def test_mission_legs_use_wpnav_jerk():
@@ -405,8 +408,8 @@ def test_mission_legs_use_wpnav_jerk():
     profile = Profile(25.0, 10.0, 2.5, 1.0)
     assert profile.duration_s == pytest.approx(4.0 * 12.5 ** (1.0 / 3.0))
     assert profile.at(0.0) == pytest.approx((0.0, 0.0, 0.0))
-    way, speed, _ = profile.at(0.5 * profile.duration_s)
-    assert way == pytest.approx(12.5)
+    distance_m, speed, _ = profile.at(0.5 * profile.duration_s)
+    assert distance_m == pytest.approx(12.5)
     assert speed == pytest.approx(profile.speed_mps)
     assert profile.at(profile.duration_s) == pytest.approx((25.0, 0.0, 0.0))
     long = Profile(300.0, 10.0, 2.5, 1.0)

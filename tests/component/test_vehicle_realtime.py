@@ -43,7 +43,7 @@ class Line(Hub):
         self.letters = {clock.now_s + at_s: data for at_s, data in letters.items()}
         self.channel: Channel = craft.open("line")
         self.parser = Parser()
-        self.heard: list[tuple[float, float, str]] = []
+        self.received: list[tuple[float, float, str]] = []
         self.flushes: list[float] = []
 
     def wait(self, timeout_s: float) -> bool:
@@ -61,7 +61,7 @@ class Line(Hub):
     def flush(self) -> None:
         self.flushes.append(self.clock.now_s)
         for message in self.parser.feed(self.channel.take()):
-            self.heard.append((self.clock.now_s - 1000.0, self.craft.vehicle.state.time_s, message.name))
+            self.received.append((self.clock.now_s - 1000.0, self.craft.vehicle.state.time_s, message.name))
 
 
 def _command(number: int, *parameters: float) -> bytes:
@@ -96,13 +96,13 @@ def test_loop_of_quiet_vehicle_wakes_rarely_and_keeps_time(monkeypatch: pytest.M
 
 
 def test_stream_messages_are_sent_in_their_due_step(monkeypatch: pytest.MonkeyPatch):
-    asks = b"".join(_command(511, number, us) for number, us in ((30, 70_000), (32, 110_000), (33, 250_000)))
-    line, _ = _ran(monkeypatch, {3.0: asks})
+    requests = b"".join(_command(511, number, us) for number, us in ((30, 70_000), (32, 110_000), (33, 250_000)))
+    line, _ = _ran(monkeypatch, {3.0: requests})
     for name, interval_s in (("ATTITUDE", 0.07), ("LOCAL_POSITION_NED", 0.11), ("GLOBAL_POSITION_INT", 0.25)):
-        left = [(wall_s, time_s) for wall_s, time_s, heard in line.heard if heard == name]
-        assert len(left) == pytest.approx(7.0 / interval_s, abs=2)
-        assert all(-1e-6 < wall_s - time_s < 0.001 for wall_s, time_s in left)
-        gaps = [after[1] - before[1] for before, after in itertools.pairwise(left)]
+        sent = [(wall_s, time_s) for wall_s, time_s, message_name in line.received if message_name == name]
+        assert len(sent) == pytest.approx(7.0 / interval_s, abs=2)
+        assert all(-1e-6 < wall_s - time_s < 0.001 for wall_s, time_s in sent)
+        gaps = [after[1] - before[1] for before, after in itertools.pairwise(sent)]
         # The first message is sent with the acknowledgement, one step after the request was received.
         assert gaps[1:] == pytest.approx([interval_s] * (len(gaps) - 1), abs=1e-6)
 
@@ -111,8 +111,8 @@ def test_stream_messages_are_sent_in_their_due_step(monkeypatch: pytest.MonkeyPa
 @pytest.mark.parametrize("at_s", [1.0, 1.0031, 1.0149, 1.0271, 1.0399])
 def test_response_is_sent_in_the_next_step(monkeypatch: pytest.MonkeyPatch, at_s: float, speedup: float):
     line, _ = _ran(monkeypatch, {at_s: _command(512, 148)}, speedup)
-    (answered,) = [wall_s for wall_s, _, name in line.heard if name == "COMMAND_ACK"]
-    assert 0.0 <= answered - at_s <= STEP_S / speedup + 0.0015
+    (acknowledged_s,) = [wall_s for wall_s, _, name in line.received if name == "COMMAND_ACK"]
+    assert 0.0 <= acknowledged_s - at_s <= STEP_S / speedup + 0.0015
 
 
 @pytest.mark.parametrize("step_takes_s", [0.002, 0.0075, 0.009])
@@ -127,15 +127,15 @@ def test_loop_on_busy_machine_keeps_up(monkeypatch: pytest.MonkeyPatch, step_tak
 def test_hub_wait_leaves_data_for_poll():
     hub = Hub()
     near, far = socket.socketpair()
-    heard: list[bytes] = []
-    hub.watch(near.fileno(), lambda: heard.append(near.recv(9)))
+    received: list[bytes] = []
+    hub.watch(near.fileno(), lambda: received.append(near.recv(9)))
     assert not hub.wait(0.002)
     assert not hub.wait(-1.0)
     far.send(b"x")
     assert hub.wait(20.0)
-    assert not heard
+    assert not received
     hub.poll()
-    assert heard == [b"x"]
+    assert received == [b"x"]
     hub.close()
     near.close()
     far.close()

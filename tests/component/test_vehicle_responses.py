@@ -9,7 +9,7 @@ from fractus_vehicle.shaping import wrap_pi
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from vehicle_world import START, airborne, alone, distance_m, upload
 
-HERE = {"target_system": 1, "target_component": 1}
+TARGET = {"target_system": 1, "target_component": 1}
 HOME = {"command": 16, "frame": 0}
 TAKEOFF = {"command": 22, "frame": 3, "z": 10.0}
 
@@ -121,12 +121,12 @@ def test_takeoff_accepts_relative_altitude_frame_only():
         assert pilot.command_int(mavlink.MAV_CMD_NAV_TAKEOFF, {"frame": frame, "z": 5.0}) is result
 
 
-@pytest.mark.parametrize(("direction", "way"), [(0, 1.0), (1, 1.0), (-1, -1.0)])
-def test_condition_yaw_turns_in_requested_direction(direction: int, way: float):
+@pytest.mark.parametrize(("direction", "sign"), [(0, 1.0), (1, 1.0), (-1, -1.0)])
+def test_condition_yaw_turns_in_requested_direction(direction: int, sign: float):
     vehicle, pilot = airborne(8.0)
     assert pilot.command(mavlink.MAV_CMD_CONDITION_YAW, 90, 30, direction, 0) == mavlink.MAV_RESULT_ACCEPTED
     pilot.fly_on(2.0)
-    assert vehicle.est.yaw == pytest.approx(way * math.radians(55.0), abs=math.radians(10.0))
+    assert vehicle.est.yaw == pytest.approx(sign * math.radians(55.0), abs=math.radians(10.0))
     pilot.fly_on(9.0)
     assert wrap_pi(vehicle.est.yaw - math.pi / 2) == pytest.approx(0.0, abs=0.05)
 
@@ -136,7 +136,7 @@ def test_yaw_in_body_frame_is_relative_to_the_nose():
     pilot.command(mavlink.MAV_CMD_CONDITION_YAW, 90, 0, 0, 0)
     pilot.fly_on(4.0)
     values = {"coordinate_frame": 9, "type_mask": 0x9F8, "yaw": 0.5}
-    pilot.send("SET_POSITION_TARGET_LOCAL_NED", HERE | values)
+    pilot.send("SET_POSITION_TARGET_LOCAL_NED", TARGET | values)
     pilot.fly_on(4.0)
     assert wrap_pi(vehicle.est.yaw - math.pi / 2 - 0.5) == pytest.approx(0.0, abs=0.05)
 
@@ -149,14 +149,14 @@ def test_reposition_requires_position_and_ignores_yaw():
         assert pilot.command_int(mavlink.MAV_CMD_DO_REPOSITION, target | bad) == mavlink.MAV_RESULT_DENIED
     assert pilot.command_int(mavlink.MAV_CMD_DO_REPOSITION, target | {"param4": 180.0}) == mavlink.MAV_RESULT_ACCEPTED
     pilot.fly_on(5.0)
-    assert vehicle.est.yaw == pytest.approx(math.pi / 2, abs=0.2), "along the way it flies"
+    assert vehicle.est.yaw == pytest.approx(math.pi / 2, abs=0.2), "along the direction of flight"
 
 
 def test_velocity_target_is_accepted_in_any_frame_if_position_is_ignored():
     vehicle, pilot = airborne(8.0)
     for _ in range(10):
         values = {"coordinate_frame": 99, "type_mask": 0xDC7, "vx": 2.0, "lat_int": 2_000_000_000}
-        pilot.send("SET_POSITION_TARGET_GLOBAL_INT", HERE | values)
+        pilot.send("SET_POSITION_TARGET_GLOBAL_INT", TARGET | values)
         pilot.fly_on(0.3)
     assert vehicle.body.vn == pytest.approx(2.0, abs=0.3)
     assert not any("Unknown mavlink" in text for text in pilot.texts)
@@ -166,9 +166,9 @@ def test_velocity_target_is_accepted_in_any_frame_if_position_is_ignored():
 def test_implausible_velocity_stops_vehicle(speed: float):
     vehicle, pilot = airborne(8.0)
     for _ in range(10):
-        pilot.send("SET_POSITION_TARGET_LOCAL_NED", HERE | {"coordinate_frame": 1, "type_mask": 0xDC7, "vx": 3.0})
+        pilot.send("SET_POSITION_TARGET_LOCAL_NED", TARGET | {"coordinate_frame": 1, "type_mask": 0xDC7, "vx": 3.0})
         pilot.fly_on(0.3)
-    pilot.send("SET_POSITION_TARGET_LOCAL_NED", HERE | {"coordinate_frame": 1, "type_mask": 0xDC7, "vx": speed})
+    pilot.send("SET_POSITION_TARGET_LOCAL_NED", TARGET | {"coordinate_frame": 1, "type_mask": 0xDC7, "vx": speed})
     pilot.fly_on(2.9)
     assert math.hypot(vehicle.body.vn, vehicle.body.ve) < 0.5
 
@@ -183,25 +183,25 @@ def test_position_targets_have_no_effect_in_guided_nogps():
 
 def test_repeated_mission_item_gets_invalid_sequence_and_upload_continues():
     vehicle, pilot = alone()
-    pilot.send("MISSION_COUNT", HERE | {"count": 2})
+    pilot.send("MISSION_COUNT", TARGET | {"count": 2})
     pilot.expect("MISSION_REQUEST")
     for _ in range(2):
-        pilot.send("MISSION_ITEM_INT", HERE | {"seq": 0} | HOME)
+        pilot.send("MISSION_ITEM_INT", TARGET | {"seq": 0} | HOME)
     assert pilot.expect("MISSION_ACK").integer("type") == mavlink.MAV_MISSION_INVALID_SEQUENCE
     pilot.read()
-    pilot.send("MISSION_ITEM_INT", HERE | {"seq": 1} | _waypoint(9.0))
+    pilot.send("MISSION_ITEM_INT", TARGET | {"seq": 1} | _waypoint(9.0))
     assert pilot.expect("MISSION_ACK").integer("type") == mavlink.MAV_MISSION_ACCEPTED
     assert len(vehicle.mission.items) == 2
 
 
 def test_fence_upload_during_mission_upload_is_accepted():
     vehicle, pilot = alone()
-    pilot.send("MISSION_COUNT", HERE | {"count": 2})
+    pilot.send("MISSION_COUNT", TARGET | {"count": 2})
     assert pilot.expect("MISSION_REQUEST").integer("mission_type") == 0
     circle = {"command": 5003, "frame": 0, "param1": 50.0, "x": START.lat_e7, "y": START.lon_e7}
     assert upload(pilot, 1, [circle]) == mavlink.MAV_MISSION_ACCEPTED
     for seq, item in enumerate((HOME, _waypoint(9.0))):
-        pilot.send("MISSION_ITEM_INT", HERE | {"seq": seq} | item)
+        pilot.send("MISSION_ITEM_INT", TARGET | {"seq": seq} | item)
         pilot.step()
     assert len(vehicle.mission.items) == 2
 
@@ -209,7 +209,7 @@ def test_fence_upload_during_mission_upload_is_accepted():
 @pytest.mark.parametrize(("kind", "text"), [(1, "Fence upload timeout"), (2, "Rally upload timeout")])
 def test_upload_timeout_text_names_the_list(kind: int, text: str):
     _, pilot = alone()
-    pilot.send("MISSION_COUNT", HERE | {"count": 1, "mission_type": kind})
+    pilot.send("MISSION_COUNT", TARGET | {"count": 1, "mission_type": kind})
     pilot.fly_on(9.0)
     assert text in pilot.texts
 
@@ -221,11 +221,11 @@ def test_current_mission_item_is_a_nav_command():
         assert pilot.command(mavlink.MAV_CMD_DO_SET_MISSION_CURRENT, chosen) == mavlink.MAV_RESULT_ACCEPTED
         assert vehicle.mission.current == current
     assert pilot.command(mavlink.MAV_CMD_DO_SET_MISSION_CURRENT, 4) == mavlink.MAV_RESULT_FAILED, (
-        "nothing navigates after it"
+        "no navigation item follows"
     )
     assert pilot.command(mavlink.MAV_CMD_DO_SET_MISSION_CURRENT, 5) == mavlink.MAV_RESULT_DENIED
-    pilot.send("MISSION_SET_CURRENT", HERE | {"seq": 2})
-    assert pilot.expect("MISSION_CURRENT").integer("seq") == 2, "the number that was sent is the answer"
+    pilot.send("MISSION_SET_CURRENT", TARGET | {"seq": 2})
+    assert pilot.expect("MISSION_CURRENT").integer("seq") == 2, "the response has the requested number"
 
 
 def test_mission_in_flight_is_not_cleared():
@@ -234,7 +234,7 @@ def test_mission_in_flight_is_not_cleared():
     pilot.mode(mavlink.COPTER_MODE_AUTO)
     pilot.fly_on(1.0)
     pilot.read()
-    pilot.send("MISSION_CLEAR_ALL", HERE)
+    pilot.send("MISSION_CLEAR_ALL", TARGET)
     assert pilot.expect("MISSION_ACK").integer("type") == mavlink.MAV_MISSION_ERROR
     assert len(vehicle.mission.items) == 3
 
@@ -261,7 +261,7 @@ def test_waypoint_stores_only_its_delay_parameter():
 def test_stream_all_sets_all_sr_parameters():
     vehicle, pilot = alone()
     pilot.channel.port = 0
-    pilot.send("REQUEST_DATA_STREAM", HERE | {"req_stream_id": 0, "req_message_rate": 4, "start_stop": 1})
+    pilot.send("REQUEST_DATA_STREAM", TARGET | {"req_stream_id": 0, "req_message_rate": 4, "start_stop": 1})
     rates = {name: value for name, value in vehicle.params.items() if name.startswith("SR0_")}
     assert {name for name, value in rates.items() if value != 4.0} == {"SR0_PARAMS"}
 

@@ -3,26 +3,26 @@
 from __future__ import annotations
 
 import pytest
-from vehicle_script import SimulatedLine, Step, agrees, compare, steps
+from vehicle_script import SimulatedConnection, Step, compare, matches, steps
 
 
 def test_every_script_step_is_played_or_has_a_reason():
     assert len({step.name for step in steps()}) == len(steps())
-    assert [step.name for step in steps() if not step.do and not step.note] == []
+    assert [step.name for step in steps() if not step.action and not step.note] == []
 
 
 def test_vehicle_responses_match_real_ardupilot():
     differing: list[str] = []
 
-    def report(step: Step, answer: str, verdict: str) -> None:
+    def report(step: Step, response: str, verdict: str) -> None:
         if verdict == "differs":
-            differing.append(f"{step.name}: real {step.real}, ours {answer}")
+            differing.append(f"{step.name}: recorded {step.recorded}, simulated {response}")
 
-    assert compare(SimulatedLine(), report, steps()) == 0, differing
+    assert compare(SimulatedConnection(), report, steps()) == 0, differing
 
 
 @pytest.mark.parametrize(
-    ("real", "ours", "same"),
+    ("recorded", "response", "expected"),
     [
         ("ACCEPTED -> 4", "ACCEPTED -> 4", True),
         ("ACCEPTED -> 4", "ACCEPTED -> 6", False),
@@ -33,5 +33,5 @@ def test_vehicle_responses_match_real_ardupilot():
         ("s=5.0~10%", "nothing", False),
     ],
 )
-def test_script_tolerances_apply_to_single_numbers(real: str, ours: str, same: bool):
-    assert agrees(real, ours) is same
+def test_script_tolerances_apply_to_single_numbers(recorded: str, response: str, expected: bool):
+    assert matches(recorded, response) is expected

@@ -18,29 +18,29 @@ from vehicle_pilot import Pilot
 from vehicle_world import CONFIG, START, airborne, alone, distance_m, upload
 
 
-def _heard(pilot: Pilot, number: int, name: str, duration_s: float) -> list[Message]:
+def _messages(pilot: Pilot, number: int, name: str, duration_s: float) -> list[Message]:
     assert pilot.command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, number, 20_000) == mavlink.MAV_RESULT_ACCEPTED
     return [m for _ in range(round(duration_s * 100)) for m in pilot.step() if m.name == name]
 
 
 def test_sensor_noise_is_normal_independent_and_repeatable():
-    one = [gaussian(1, tick, 0) for tick in range(4000)]
+    first = [gaussian(1, tick, 0) for tick in range(4000)]
     two = [gaussian(1, tick, 1) for tick in range(4000)]
-    assert statistics.fmean(one) == pytest.approx(0.0, abs=0.05)
-    assert statistics.stdev(one) == pytest.approx(1.0, abs=0.05)
-    assert abs(statistics.correlation(one, two)) < 0.05
-    assert abs(statistics.correlation(one[1:], one[:-1])) < 0.05
-    assert one[7] == gaussian(1, 7, 0) != gaussian(2, 7, 0)
+    assert statistics.fmean(first) == pytest.approx(0.0, abs=0.05)
+    assert statistics.stdev(first) == pytest.approx(1.0, abs=0.05)
+    assert abs(statistics.correlation(first, two)) < 0.05
+    assert abs(statistics.correlation(first[1:], first[:-1])) < 0.05
+    assert first[7] == gaussian(1, 7, 0) != gaussian(2, 7, 0)
 
 
 def test_imu_noise_increases_in_flight():
     still, pilot = alone(config=replace(CONFIG, seed=5))
     pilot.fly_on(3.0)
-    at_rest = [m.integer("xacc") for m in _heard(pilot, 27, "RAW_IMU", 4.0)]
+    at_rest = [m.integer("xacc") for m in _messages(pilot, 27, "RAW_IMU", 4.0)]
     _, flying = airborne(10.0)
-    in_flight = [m.integer("xacc") for m in _heard(flying, 27, "RAW_IMU", 4.0)]
+    in_flight = [m.integer("xacc") for m in _messages(flying, 27, "RAW_IMU", 4.0)]
     assert 0.0 < statistics.stdev(at_rest) < statistics.stdev(in_flight)
-    assert statistics.fmean(m.integer("zacc") for m in _heard(flying, 27, "RAW_IMU", 4.0)) == pytest.approx(
+    assert statistics.fmean(m.integer("zacc") for m in _messages(flying, 27, "RAW_IMU", 4.0)) == pytest.approx(
         -1000, abs=25
     )
     assert still.ticks > 0
@@ -114,8 +114,8 @@ def test_terrain_targets_require_terrain_data(known: int, altitude_m: float):
     pilot.fly_on(12.0)
     assert vehicle.altitude_m == pytest.approx(altitude_m, abs=0.5)
     values = {"frame": 11, "x": place.lat_e7, "y": place.lon_e7, "z": 12.0}
-    wanted = mavlink.MAV_RESULT_ACCEPTED if known else mavlink.MAV_RESULT_DENIED
-    assert pilot.command_int(mavlink.MAV_CMD_DO_REPOSITION, values) is wanted
+    expected = mavlink.MAV_RESULT_ACCEPTED if known else mavlink.MAV_RESULT_DENIED
+    assert pilot.command_int(mavlink.MAV_CMD_DO_REPOSITION, values) is expected
     assert send(vehicle, pilot.channel, "TERRAIN_REPORT") is bool(known)
 
 

@@ -47,7 +47,7 @@ def test_smart_rtl_points_are_spaced_and_limited():
     gaps = [math.dist(a, b) for a, b in zip(crumbs.path, crumbs.path[1:], strict=False)]
     assert min(gaps) >= 2.0
     assert not crumbs.add((0.0, 100.0, 0.0))
-    assert crumbs.add(crumbs.path[-1]), "a point that needs no room is no failure"
+    assert crumbs.add(crumbs.path[-1]), "adding a point at the end of a full path does not fail"
 
 
 def test_simplification_keeps_corners_of_path():
@@ -70,19 +70,23 @@ def test_loop_in_path_is_cut():
     points += [*_line((-30.0, 0.0, -10.0), (0.0, 0.0, -10.0)), *circle, *_line((0.0, 0.0, -10.0), (0.0, -40.0, -10.0))]
     path = _tidy(_crumbs(points))
     assert path[0] == (0.0, 0.0, 0.0)
-    assert all(point[1] < 1.0 and abs(point[0]) < 2.0 for point in path), "neither the circle nor the detour is left"
+    assert all(point[1] < 1.0 and abs(point[0]) < 2.0 for point in path), "circle and detour were removed"
 
 
 @pytest.mark.parametrize("seed", range(examples(5, 2)))
 def test_simplified_path_stays_within_accuracy_of_flown_path(seed: int):
     rng = random.Random(seed)
-    here = (0.0, 0.0, 0.0)
+    position = (0.0, 0.0, 0.0)
     heading = 0.0
     points = [(0.0, 0.0, 0.0)]
     for _ in range(350):
         heading += rng.gauss(0.0, 0.5)
-        here = (here[0] + 2.1 * math.cos(heading), here[1] + 2.1 * math.sin(heading), here[2] - rng.uniform(-0.4, 0.45))
-        points.append(here)
+        position = (
+            position[0] + 2.1 * math.cos(heading),
+            position[1] + 2.1 * math.sin(heading),
+            position[2] - rng.uniform(-0.4, 0.45),
+        )
+        points.append(position)
     crumbs = _crumbs(points)
     path = _tidy(crumbs)
     assert path[0] == points[0] and path[-1] == points[-1]
@@ -123,15 +127,15 @@ def _detour(**parameters: float) -> tuple[VehicleState, Pilot, list[Point]]:
 
 def _farthest_from_flown(vehicle: VehicleState, pilot: Pilot, flown: list[Point]) -> float:
     """Fly until disarmed and return the greatest distance from the outbound path."""
-    way = [(0.0, 0.0, 0.0), *flown[::20], flown[-1]]
+    path = [(0.0, 0.0, 0.0), *flown[::20], flown[-1]]
     worst = 0.0
     for at in range(20_000):
         pilot.step()
         if not vehicle.armed:
             return worst
         if at % 10 == 0:
-            here = (vehicle.body.north, vehicle.body.east, vehicle.body.down)
-            worst = max(worst, min(distance_to_segment(here, a, b) for a, b in itertools.pairwise(way)))
+            position = (vehicle.body.north, vehicle.body.east, vehicle.body.down)
+            worst = max(worst, min(distance_to_segment(position, a, b) for a, b in itertools.pairwise(path)))
     raise AssertionError("not landed")
 
 
@@ -244,7 +248,7 @@ def test_leaving_smart_rtl_midway_keeps_path():
     pilot.fly_on(8.0)
     assert pilot.mode(mavlink.COPTER_MODE_LOITER) == mavlink.MAV_RESULT_ACCEPTED
     nearest = min(math.dist(point[:2], (60.0, 0.0)) for point in vehicle.breadcrumbs.path)
-    assert nearest < 3.0, "the corner is there again"
+    assert nearest < 3.0, "the vehicle passes the corner again"
     pilot.fly_on(4.0)
     pilot.mode(mavlink.COPTER_MODE_SMART_RTL)
     pilot.wait(lambda: not vehicle.armed, 120.0)

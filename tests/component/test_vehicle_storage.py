@@ -55,9 +55,9 @@ def test_changed_parameters_are_stored_on_disk(tmp_path: Path):
     config = replace(CONFIG, store=store)
     _, pilot = alone(config=config)
     assert pilot.parameter("WPNAV_SPEED", 750.0) == 750.0
-    again, _ = alone(config=config)
-    assert again.params["WPNAV_SPEED"] == 750.0
-    assert again.control.limits.speed_mps == 7.5
+    rebooted, _ = alone(config=config)
+    assert rebooted.params["WPNAV_SPEED"] == 750.0
+    assert rebooted.control.limits.speed_mps == 7.5
     assert "WPNAV_SPEED,750" in store.read_text()
 
 

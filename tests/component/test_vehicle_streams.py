@@ -78,14 +78,14 @@ def test_default_streams_follow_sr_parameters():
 
 def test_client_that_does_not_read_has_bounded_queue():
     vehicle, pilot = alone()
-    deaf = pilot.craft.open("deaf")
+    blocked = pilot.craft.open("blocked")
     for name in BUILDERS:
-        deaf.set_interval(name, 0.01)
+        blocked.set_interval(name, 0.01)
     pilot.command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 30, 100_000)
-    seen = 0
+    received = 0
     for _ in range(3000):
-        seen += sum(m.name == "ATTITUDE" for m in pilot.step())
-    assert seen == pytest.approx(300, abs=2)
-    assert deaf.waiting <= OUTBOX_LIMIT
-    assert deaf.dropped > 1000
+        received += sum(m.name == "ATTITUDE" for m in pilot.step())
+    assert received == pytest.approx(300, abs=2)
+    assert blocked.waiting <= OUTBOX_LIMIT
+    assert blocked.dropped > 1000
     assert isinstance(vehicle.channels[1], Channel)

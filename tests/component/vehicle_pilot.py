@@ -82,12 +82,12 @@ class Pilot:
             PilotTimeoutError: No message arrived within `timeout_s`.
         """
         end = self.simulation.time_s + timeout_s
-        found = [message for message in self.read() if message.name == name]
-        while not found:
+        matching = [message for message in self.read() if message.name == name]
+        while not matching:
             if self.simulation.time_s > end:
                 raise PilotTimeoutError(f"no {name} within {timeout_s} s")
-            found = [message for message in self.step() if message.name == name]
-        return found[-1]
+            matching = [message for message in self.step() if message.name == name]
+        return matching[-1]
 
     def command(self, command: int, *params: float) -> int:
         """Send COMMAND_LONG and return the result."""
@@ -119,9 +119,9 @@ class Pilot:
             },
         )
         while True:
-            answer = self.expect("PARAM_VALUE")
-            if answer.text("param_id") == name:
-                return answer.real("param_value")
+            response = self.expect("PARAM_VALUE")
+            if response.text("param_id") == name:
+                return response.real("param_value")
 
     def take_off(self, altitude_m: float, timeout_s: float = 90.0) -> float:
         """Switch to GUIDED, arm and climb. Return the seconds from the takeoff command to 95 % of the altitude.

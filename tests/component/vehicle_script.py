@@ -49,47 +49,47 @@ _TAKEOFF: Row = (22, 3, None, 0.0, 12.0, ())
 _RTL: Row = (20, 3, None, 0.0, 0.0, ())
 
 
-def _way(north: float, east: float, command: int = 16, frame: int = 3, *params: float) -> Row:
+def _waypoint(north: float, east: float, command: int = 16, frame: int = 3, *params: float) -> Row:
     return (command, frame, north, east, 12.0, params)
 
 
 def _mission(third: Row) -> list[Row]:
-    return [_HOME_ROW, _TAKEOFF, third, _way(25.0, 25.0), _RTL]
+    return [_HOME_ROW, _TAKEOFF, third, _waypoint(25.0, 25.0), _RTL]
 
 
-def _ring(declared: tuple[float, ...]) -> list[Row]:
+def _fence_polygon(declared: tuple[float, ...]) -> list[Row]:
     corners = ((-60.0, -60.0), (-60.0, 60.0), (60.0, 60.0), (60.0, -60.0))
     return [(5001, 0, *corners[at % 4], 0.0, (count,)) for at, count in enumerate(declared)]
 
 
 LISTS: dict[str, list[Row]] = {
-    "good": _mission(_way(25.0, 0.0)),
-    "lat200": _mission(_way(math.inf, 0.0)),
-    "unknown_cmd": _mission(_way(25.0, 0.0, 4000)),
-    "unsupported_cmd": _mission(_way(25.0, 0.0, 189 + 3800)),
-    "bad_frame": _mission(_way(25.0, 0.0, 16, 99)),
-    "local_frame": _mission(_way(25.0, 0.0, 16, 1)),
-    "terrain": _mission(_way(25.0, 0.0, 16, 10)),
+    "good": _mission(_waypoint(25.0, 0.0)),
+    "lat200": _mission(_waypoint(math.inf, 0.0)),
+    "unknown_cmd": _mission(_waypoint(25.0, 0.0, 4000)),
+    "unsupported_cmd": _mission(_waypoint(25.0, 0.0, 189 + 3800)),
+    "bad_frame": _mission(_waypoint(25.0, 0.0, 16, 99)),
+    "local_frame": _mission(_waypoint(25.0, 0.0, 16, 1)),
+    "terrain": _mission(_waypoint(25.0, 0.0, 16, 10)),
     "frame_mission": _mission((178, 2, None, 0.0, 0.0, (1.0, 3.0))),
-    "spline": _mission(_way(25.0, 0.0, 82)),
-    "p1_300": _mission(_way(25.0, 0.0, 16, 3, 300.0, 300.0)),
-    "nan_p4": _mission(_way(25.0, 0.0, 16, 3, 0.0, 0.0, 0.0, math.nan)),
+    "spline": _mission(_waypoint(25.0, 0.0, 82)),
+    "p1_300": _mission(_waypoint(25.0, 0.0, 16, 3, 300.0, 300.0)),
+    "nan_p4": _mission(_waypoint(25.0, 0.0, 16, 3, 0.0, 0.0, 0.0, math.nan)),
     "tour": [
         *(_HOME_ROW, _TAKEOFF, (178, 3, None, 0.0, 0.0, (1.0, 4.0))),
-        *(_way(25.0, 0.0), _way(25.0, 25.0), _way(0.0, 25.0, 82), _RTL),
+        *(_waypoint(25.0, 0.0), _waypoint(25.0, 25.0), _waypoint(0.0, 25.0, 82), _RTL),
     ],
     "none": [],
-    "ring": _ring((4, 4, 4, 4)),
-    "two": _ring((2, 2)),
-    "short": _ring((5, 5, 5, 5)),
-    "mixed": _ring((4, 4, 4, 3)),
+    "ring": _fence_polygon((4, 4, 4, 4)),
+    "two": _fence_polygon((2, 2)),
+    "short": _fence_polygon((5, 5, 5, 5)),
+    "mixed": _fence_polygon((4, 4, 4, 3)),
     "circle": [(5003, 0, 0.0, 0.0, 0.0, (50.0,))],
     "circle_negative": [(5003, 0, 0.0, 0.0, 0.0, (-50.0,))],
     "circle_zero": [(5003, 0, 0.0, 0.0, 0.0, (0.0,))],
     "circle_nan": [(5003, 0, 0.0, 0.0, 0.0, (math.nan,))],
     "circle_lat200": [(5003, 0, math.inf, 0.0, 0.0, (50.0,))],
     "circle_frame3": [(5003, 3, 0.0, 0.0, 0.0, (50.0,))],
-    "ring_return": [*_ring((4, 4, 4, 4)), (5000, 0, 0.0, 0.0, 0.0, ())],
+    "ring_return": [*_fence_polygon((4, 4, 4, 4)), (5000, 0, 0.0, 0.0, 0.0, ())],
     "two_returns": [(5000, 0, 0.0, 0.0, 0.0, ()), (5000, 0, 1.0, 0.0, 0.0, ())],
     "rally": [(5100, 3, 10.0, 10.0, 20.0, ())],
 }
@@ -100,19 +100,19 @@ def mission_result(value: int) -> str:
     return enum_name("MAV_MISSION_RESULT", value).removeprefix("MAV_MISSION_")
 
 
-class Line(Protocol):
-    """A conversation with one autopilot."""
+class Connection(Protocol):
+    """Link to one autopilot."""
 
     now_s: float
 
     def send(self, name: str, values: dict[str, Value]) -> None:
         """Send a message."""
 
-    def hear(self) -> list[Message]:
+    def receive(self) -> list[Message]:
         """Return the messages received since the last call. Time advances by a small step."""
 
 
-class SimulatedLine:
+class SimulatedConnection:
     """The simulated vehicle after a cold start, in simulated time."""
 
     def __init__(self) -> None:
@@ -126,14 +126,14 @@ class SimulatedLine:
         """Send a message."""
         self._craft.receive(self._channel, self._endpoint.encode(name, values))
 
-    def hear(self) -> list[Message]:
+    def receive(self) -> list[Message]:
         """Advance by one control step."""
         self._simulation.step()
         self.now_s = self._simulation.time_s
         return self._endpoint.decode(self._channel.take())
 
 
-class TcpLine:
+class TcpConnection:
     """An autopilot behind a TCP link, in real time."""
 
     def __init__(self, address: str) -> None:
@@ -147,7 +147,7 @@ class TcpLine:
         """Send a message."""
         self._socket.sendall(self._endpoint.encode(name, values))
 
-    def hear(self) -> list[Message]:
+    def receive(self) -> list[Message]:
         """Wait briefly for bytes."""
         ready = select.select([self._socket], [], [], 0.02)[0]
         data = self._socket.recv(65536) if ready else b""
@@ -159,11 +159,11 @@ class TcpLine:
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """One row of the file."""
+    """One step of the script, a row of the file."""
 
     name: str
-    do: str
-    real: str
+    action: str
+    recorded: str
     note: str
 
 
@@ -173,19 +173,19 @@ def steps(path: Path = STEPS) -> list[Step]:
     return [Step(*row) for row in rows]
 
 
-def agrees(real: str, ours: str) -> bool:
+def matches(recorded: str, response: str) -> bool:
     """Return True if a response matches the recorded one. Numbers may have a tolerance."""
-    wanted = real.split()
-    got = ours.split()
-    return len(wanted) == len(got) and all(map(_same, wanted, got))
+    expected = recorded.split()
+    actual = response.split()
+    return len(expected) == len(actual) and all(map(_same, expected, actual))
 
 
-def _same(wanted: str, got: str) -> bool:
-    key, tilde, tolerance = wanted.partition("~")
+def _same(expected: str, actual: str) -> bool:
+    key, tilde, tolerance = expected.partition("~")
     if not tilde:
-        return wanted == got
+        return expected == actual
     name, _, number = key.rpartition("=")
-    got_name, _, got_number = got.rpartition("=")
+    got_name, _, got_number = actual.rpartition("=")
     slack = abs(float(number)) * float(tolerance[:-1]) / 100.0 if tolerance.endswith("%") else float(tolerance)
     try:
         return name == got_name and abs(float(got_number) - float(number)) <= slack
@@ -196,8 +196,8 @@ def _same(wanted: str, got: str) -> bool:
 class Player:
     """Plays steps on a connection and returns the responses."""
 
-    def __init__(self, line: Line) -> None:
-        self.line = line
+    def __init__(self, connection: Connection) -> None:
+        self.connection = connection
         self.last: dict[str, Message] = {}
         self.texts: list[str] = []
         self.home = HOME
@@ -206,15 +206,15 @@ class Player:
 
     # -- communication -----------------------------------------------------------------------------------------
 
-    def _hear(self) -> list[Message]:
-        if self.line.now_s >= self._next_beat_s:
-            self._next_beat_s = self.line.now_s + 1.0
-            self.line.send("HEARTBEAT", {"type": mavlink.MAV_TYPE_GCS, "autopilot": 8, "mavlink_version": 3})
-        messages = self.line.hear()
+    def _receive(self) -> list[Message]:
+        if self.connection.now_s >= self._next_beat_s:
+            self._next_beat_s = self.connection.now_s + 1.0
+            self.connection.send("HEARTBEAT", {"type": mavlink.MAV_TYPE_GCS, "autopilot": 8, "mavlink_version": 3})
+        messages = self.connection.receive()
         for message in messages:
             self.last[message.name] = message
             if message.name == "GLOBAL_POSITION_INT":
-                self._settle(Place(message.integer("lat"), message.integer("lon"), 0.0))
+                self._set_home(Place(message.integer("lat"), message.integer("lon"), 0.0))
             if message.name == "STATUSTEXT":
                 self._chunks += message.text("text")
                 if not message.integer("id") or len(message.text("text")) < 50:
@@ -222,10 +222,10 @@ class Player:
                     self._chunks = ""
         return messages
 
-    def _settle(self, here: Place) -> None:
+    def _set_home(self, position: Place) -> None:
         """Convert to an offset from the vehicle, if it is not at the recorded position."""
-        if here.lat_e7 and math.hypot(*self.home.vector_to(here)[:2]) > ELSEWHERE_M:
-            self.home = here
+        if position.lat_e7 and math.hypot(*self.home.vector_to(position)[:2]) > ELSEWHERE_M:
+            self.home = position
 
     def _datum_m(self, frame: int) -> float:
         """Return the height of home above the zero level of a frame. Two frames refer to mean sea level."""
@@ -233,29 +233,29 @@ class Player:
         return (at.integer("alt") - at.integer("relative_alt")) / 1000.0 if frame in {0, 5} else 0.0
 
     def _stream(self, duration_s: float) -> Iterator[Message]:
-        end = self.line.now_s + duration_s
-        while self.line.now_s < end:
-            yield from self._hear()
+        end = self.connection.now_s + duration_s
+        while self.connection.now_s < end:
+            yield from self._receive()
 
     def _until(self, name: str, timeout_s: float, fits: Callable[[Message], bool] = lambda _m: True) -> Message | None:
         return next((m for m in self._stream(timeout_s) if m.name == name and fits(m)), None)
 
-    def _said(self, before: int) -> str:
+    def _statustexts_since(self, before: int) -> str:
         """Return the STATUSTEXTs received since the last call, except unsolicited ones."""
         for _ in self._stream(TEXTS_S):
             pass
-        said = [t for t in self.texts[before:] if not t[4:].startswith(SPONTANEOUS)]
-        return "".join(f" | {'; '.join(said)}" for _ in said[:1])
+        texts = [t for t in self.texts[before:] if not t[4:].startswith(SPONTANEOUS)]
+        return "".join(f" | {'; '.join(texts)}" for _ in texts[:1])
 
     def _ack(self, command: int) -> str:
         ack = self._until("COMMAND_ACK", 3.0, lambda m: m.integer("command") == command)
         return "no ack" if ack is None else enum_name("MAV_RESULT", ack.integer("result"))
 
-    def _ordered(self, command: int, params: list[float], component: int = 1) -> str:
+    def _send_command(self, command: int, params: list[float], component: int = 1) -> str:
         before = len(self.texts)
         values: dict[str, Value] = {f"param{at}": value for at, value in enumerate(params, start=1)}
-        self.line.send("COMMAND_LONG", values | TARGET | {"target_component": component, "command": command})
-        return self._ack(command) + self._said(before)
+        self.connection.send("COMMAND_LONG", values | TARGET | {"target_component": component, "command": command})
+        return self._ack(command) + self._statustexts_since(before)
 
     def _mode(self) -> int:
         beat = self._until("HEARTBEAT", 3.0)
@@ -263,7 +263,7 @@ class Player:
 
     def _set(self, name: str, value: float) -> Message | None:
         values = {"param_id": name.encode("ascii"), "param_value": value, "param_type": 9}
-        self.line.send("PARAM_SET", TARGET | values)
+        self.connection.send("PARAM_SET", TARGET | values)
         return self._until("PARAM_VALUE", 1.5, lambda m: m.text("param_id") == name)
 
     @staticmethod
@@ -284,9 +284,9 @@ class Player:
 
     # -- step types --------------------------------------------------------------------------------------------
 
-    def play(self, do: str) -> str:
+    def play(self, action: str) -> str:
         """Execute one step and return the response."""
-        verb, *words = do.split()
+        verb, *words = action.split()
         method: Callable[..., str] = getattr(self, f"do_{verb}")
         return method(*words)
 
@@ -296,10 +296,10 @@ class Player:
         assert beat is not None
         return " ".join(f"{short}={beat.integer(name)}" for name, short in (*names, ("system_status", "status")))
 
-    def do_hear(self, duration: str) -> str:
+    def do_receive(self, duration: str) -> str:
         return " ".join(sorted({m.name for m in self._stream(float(duration))} | set(self.last)))
 
-    def do_told(self) -> str:
+    def do_texts(self) -> str:
         return "; ".join(self.texts)
 
     def do_wait(self, duration: str) -> str:
@@ -309,56 +309,56 @@ class Player:
 
     def do_command(self, command: str, *params: str) -> str:
         component = next((int(p[1:]) for p in params if p[0] == "@"), 1)
-        return self._ordered(int(command), [float(p) for p in params if p[0] != "@"], component)
+        return self._send_command(int(command), [float(p) for p in params if p[0] != "@"], component)
 
     def do_prearm(self) -> str:
         before = len(self.texts)
-        self.line.send("COMMAND_LONG", TARGET | {"command": mavlink.MAV_CMD_RUN_PREARM_CHECKS})
+        self.connection.send("COMMAND_LONG", TARGET | {"command": mavlink.MAV_CMD_RUN_PREARM_CHECKS})
         result = self._ack(mavlink.MAV_CMD_RUN_PREARM_CHECKS)
-        self._said(before)
+        self._statustexts_since(before)
         return f"{result} | {'; '.join(t for t in self.texts[before:] if t[4:].startswith('PreArm'))}"
 
     def do_int(self, command: str, frame: str, north: str, east: str, alt: str, *params: str) -> str:
         before = len(self.texts)
         place = self.home.offset(float(north), float(east))
         values: dict[str, Value] = {f"param{at}": float(p) for at, p in enumerate(params, start=1)}
-        where: dict[str, Value] = {"x": place.lat_e7, "y": place.lon_e7, "z": float(alt), "frame": int(frame)}
-        self.line.send("COMMAND_INT", values | where | TARGET | {"command": int(command)})
-        return self._ack(int(command)) + self._said(before)
+        target: dict[str, Value] = {"x": place.lat_e7, "y": place.lon_e7, "z": float(alt), "frame": int(frame)}
+        self.connection.send("COMMAND_INT", values | target | TARGET | {"command": int(command)})
+        return self._ack(int(command)) + self._statustexts_since(before)
 
     def do_mode(self, number: str) -> str:
-        answer = self._ordered(mavlink.MAV_CMD_DO_SET_MODE, [1.0, float(number)])
-        return f"{answer} -> {self._mode()}"
+        response = self._send_command(mavlink.MAV_CMD_DO_SET_MODE, [1.0, float(number)])
+        return f"{response} -> {self._mode()}"
 
     def do_arm(self, number: str) -> str:
-        self._ordered(mavlink.MAV_CMD_DO_SET_MODE, [1.0, float(number)])
+        self._send_command(mavlink.MAV_CMD_DO_SET_MODE, [1.0, float(number)])
         mode = self._mode()
-        answer = self._ordered(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, [1.0])
-        if answer.startswith("ACCEPTED"):
-            self._ordered(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, [0.0])
-        return f"mode={mode} {answer}"
+        response = self._send_command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, [1.0])
+        if response.startswith("ACCEPTED"):
+            self._send_command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, [0.0])
+        return f"mode={mode} {response}"
 
     def do_list(self) -> str:
-        self.line.send("PARAM_REQUEST_LIST", TARGET)
-        seen: set[int] = set()
+        self.connection.send("PARAM_REQUEST_LIST", TARGET)
+        indexes: set[int] = set()
         for message in self._stream(4.0):
             if message.name == "PARAM_VALUE" and message.integer("param_index") < 65535:
-                seen.add(message.integer("param_index"))
-        return f"count={self.last['PARAM_VALUE'].integer('param_count')} got={len(seen)}"
+                indexes.add(message.integer("param_index"))
+        return f"count={self.last['PARAM_VALUE'].integer('param_count')} got={len(indexes)}"
 
     def do_read(self, name: str) -> str:
-        self.line.send("PARAM_REQUEST_READ", TARGET | {"param_id": name.encode("ascii"), "param_index": -1})
+        self.connection.send("PARAM_REQUEST_READ", TARGET | {"param_id": name.encode("ascii"), "param_index": -1})
         return self._shown(self._until("PARAM_VALUE", 1.5, lambda m: m.text("param_id") == name))
 
     def do_index(self, index: str) -> str:
-        self.line.send("PARAM_REQUEST_READ", TARGET | {"param_index": int(index)})
+        self.connection.send("PARAM_REQUEST_READ", TARGET | {"param_index": int(index)})
         return self._shown(self._until("PARAM_VALUE", 1.5, lambda m: m.integer("param_index") == int(index)))
 
     def do_set(self, name: str, value: str) -> str:
         return self._shown(self._set(name, float(value)))
 
     def do_request(self, name: str) -> str:
-        self.line.send(
+        self.connection.send(
             "COMMAND_LONG", TARGET | {"command": mavlink.MAV_CMD_REQUEST_MESSAGE, "param1": message_id(name)}
         )
         messages = list(self._stream(1.0))
@@ -367,17 +367,17 @@ class Player:
         return f"{result} sent={'yes' if any(m.name == name for m in messages) else 'no'}"
 
     def do_fields(self, name: str, *fields: str) -> str:
-        self.line.send(
+        self.connection.send(
             "COMMAND_LONG", TARGET | {"command": mavlink.MAV_CMD_REQUEST_MESSAGE, "param1": message_id(name)}
         )
         message = self._until(name, 2.0)
         return "none" if message is None else " ".join(f"{field}={message.integer(field):#x}" for field in fields)
 
     def do_interval(self, number: str, interval_us: str) -> str:
-        return self._ordered(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, [float(number), float(interval_us)])
+        return self._send_command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, [float(number), float(interval_us)])
 
     def do_rate(self, number: str, interval_us: str) -> str:
-        result = self._ordered(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, [float(number), float(interval_us)])
+        result = self._send_command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, [float(number), float(interval_us)])
         layout = mavlink.mavlink_map.get(int(number))
         duration_s = 3.0
         assert layout is not None
@@ -386,15 +386,15 @@ class Player:
 
     def do_streams(self, rate: str) -> str:
         values = {"req_stream_id": 0, "req_message_rate": int(rate), "start_stop": 1}
-        self.line.send("REQUEST_DATA_STREAM", TARGET | values)
+        self.connection.send("REQUEST_DATA_STREAM", TARGET | values)
         ignored = {"STATUSTEXT", "PARAM_VALUE", "COMMAND_ACK", "TIMESYNC"}
         return " ".join(sorted({m.name for m in self._stream(3.0)} - ignored))
 
     def do_ready(self) -> str:
         """Wait in an automatic mode until the checks pass. Return the EKF flags before and after."""
-        self._ordered(mavlink.MAV_CMD_DO_SET_MODE, [1.0, GUIDED])
+        self._send_command(mavlink.MAV_CMD_DO_SET_MODE, [1.0, GUIDED])
         for number in (1, 193):
-            self._ordered(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, [float(number), 250_000.0])
+            self._send_command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, [float(number), 250_000.0])
         bit = mavlink.MAV_SYS_STATUS_PREARM_CHECK
         healthy = self._until("SYS_STATUS", 120.0, lambda m: bool(m.integer("onboard_control_sensors_health") & bit))
         flags = self._until("EKF_STATUS_REPORT", 2.0)
@@ -421,54 +421,54 @@ class Player:
             x = place.lat_e7
             y = place.lon_e7
         values: dict[str, Value] = {f"param{at}": float(p) for at, p in enumerate(params, start=1)}
-        where: dict[str, Value] = {"seq": seq, "frame": frame, "command": command, "x": x, "y": y, "z": alt}
-        return values | where | TARGET | {"autocontinue": 1, "mission_type": kind}
+        target: dict[str, Value] = {"seq": seq, "frame": frame, "command": command, "x": x, "y": y, "z": alt}
+        return values | target | TARGET | {"autocontinue": 1, "mission_type": kind}
 
     def do_upload(self, kind_name: str, name: str, old: str = "") -> str:
         before = len(self.texts)
         kind = KINDS[kind_name]
         rows = LISTS[name]
-        self.line.send("MISSION_COUNT", TARGET | {"count": len(rows), "mission_type": kind})
-        asked = 0
-        end = self.line.now_s + 6.0
-        while self.line.now_s < end:
-            for message in self._hear():
+        self.connection.send("MISSION_COUNT", TARGET | {"count": len(rows), "mission_type": kind})
+        requested = 0
+        end = self.connection.now_s + 6.0
+        while self.connection.now_s < end:
+            for message in self._receive():
                 if message.name in ("MISSION_REQUEST", "MISSION_REQUEST_INT"):
-                    asked += 1
+                    requested += 1
                     seq = message.integer("seq")
                     item = self._item(kind, seq, rows[seq])
                     if old:
                         item |= {"x": float(str(item["x"])) * 1e-7, "y": float(str(item["y"])) * 1e-7}
-                    self.line.send("MISSION_ITEM" if old else "MISSION_ITEM_INT", item)
+                    self.connection.send("MISSION_ITEM" if old else "MISSION_ITEM_INT", item)
                 elif message.name == "MISSION_ACK":
                     result = mission_result(message.integer("type"))
-                    return f"{result} mt={message.integer('mission_type')} after {asked}{self._said(before)}"
-        return f"no ack after {asked} requests"
+                    return f"{result} mt={message.integer('mission_type')} after {requested}{self._statustexts_since(before)}"
+        return f"no ack after {requested} requests"
 
     def do_count(self, kind_name: str, count: str) -> str:
         before = len(self.texts)
-        self.line.send("MISSION_COUNT", TARGET | {"count": int(count), "mission_type": KINDS[kind_name]})
+        self.connection.send("MISSION_COUNT", TARGET | {"count": int(count), "mission_type": KINDS[kind_name]})
         ack = self._until("MISSION_ACK", 2.0)
         result = "no ack" if ack is None else mission_result(ack.integer("type"))
-        return f"{result}{self._said(before)}"
+        return f"{result}{self._statustexts_since(before)}"
 
     def do_clear(self, kind: str) -> str:
-        self.line.send("MISSION_CLEAR_ALL", TARGET | {"mission_type": int(kind)})
+        self.connection.send("MISSION_CLEAR_ALL", TARGET | {"mission_type": int(kind)})
         ack = self._until("MISSION_ACK", 2.0)
         assert ack is not None
         return f"{mission_result(ack.integer('type'))} mt={ack.integer('mission_type')}"
 
-    def do_left(self, kind_name: str, bad: str = "") -> str:
+    def do_stored(self, kind_name: str, bad: str = "") -> str:
         """Return the number of stored items, after a failed upload only if the step names one."""
         if bad:
             self.do_upload(kind_name, "good")
             self.do_upload(kind_name, bad)
-        self.line.send("MISSION_REQUEST_LIST", TARGET | {"mission_type": KINDS[kind_name]})
+        self.connection.send("MISSION_REQUEST_LIST", TARGET | {"mission_type": KINDS[kind_name]})
         count = self._until("MISSION_COUNT", 2.0)
         return f"count={-1 if count is None else count.integer('count')}"
 
     def do_item(self, kind_name: str, seq: str, *fields: str) -> str:
-        self.line.send("MISSION_REQUEST_INT", TARGET | {"seq": int(seq), "mission_type": KINDS[kind_name]})
+        self.connection.send("MISSION_REQUEST_INT", TARGET | {"seq": int(seq), "mission_type": KINDS[kind_name]})
         names = ("MISSION_ITEM_INT", "MISSION_ACK")
         message = next((m for m in self._stream(2.0) if m.name in names), None)
         assert message is not None
@@ -479,19 +479,19 @@ class Player:
 
     def do_fly(self, altitude: str) -> str:
         """Arm in GUIDED, climb and hover."""
-        self._ordered(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, [33.0, 100_000.0])
+        self._send_command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, [33.0, 100_000.0])
         self.do_ready()
-        armed = self._ordered(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, [1.0])
+        armed = self._send_command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, [1.0])
         up_m = float(altitude)
-        begun_s = self.line.now_s
-        taken = self._ordered(mavlink.MAV_CMD_NAV_TAKEOFF, [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, up_m])
-        while self.line.now_s < begun_s + 40.0 and self._position()[2] < up_m - 0.5:
+        begun_s = self.connection.now_s
+        taken = self._send_command(mavlink.MAV_CMD_NAV_TAKEOFF, [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, up_m])
+        while self.connection.now_s < begun_s + 40.0 and self._position()[2] < up_m - 0.5:
             pass
-        reached_s = self.line.now_s - begun_s
+        reached_s = self.connection.now_s - begun_s
         self.do_wait("4")
         return f"arm={armed.split(' ')[0]} takeoff={taken.split(' ')[0]} reached_s={reached_s:.1f}"
 
-    def _fast(self) -> tuple[float, float]:
+    def _speed_and_latitude(self) -> tuple[float, float]:
         at = self._until("GLOBAL_POSITION_INT", 3.0)
         if at is None:
             raise TimeoutError("no GLOBAL_POSITION_INT")
@@ -504,16 +504,16 @@ class Player:
         place = self.home.offset(n0 + float(north), e0 + float(east))
         alt_m = self._datum_m(int(frame)) + u0 + float(up)
         values: dict[str, Value] = {"coordinate_frame": int(frame), "type_mask": 0xDF8, "alt": alt_m}
-        self.line.send(
+        self.connection.send(
             "SET_POSITION_TARGET_GLOBAL_INT", TARGET | values | {"lat_int": place.lat_e7, "lon_int": place.lon_e7}
         )
         peak = 0.0
-        end = self.line.now_s + 6.0
-        while self.line.now_s < end:
-            peak = max(peak, self._fast()[0])
+        end = self.connection.now_s + 6.0
+        while self.connection.now_s < end:
+            peak = max(peak, self._speed_and_latitude()[0])
         n1, e1, u1 = self._position()
-        said = self._said(before)
-        return f"E={e1 - e0:.1f} N={n1 - n0:.1f} U={u1 - u0:.1f} vmax={peak:.1f}{said}"
+        texts = self._statustexts_since(before)
+        return f"E={e1 - e0:.1f} N={n1 - n0:.1f} U={u1 - u0:.1f} vmax={peak:.1f}{texts}"
 
     def do_target(self, frame: str, duration: str, *fields: str) -> str:
         """Send a target five times a second. Return the distance (F and R: forward and right), highest speed and
@@ -522,14 +522,14 @@ class Player:
         `x` is metres north of the vehicle, or ahead in body frames. All other fields are those of the message. Missing
         fields are zero.
         """
-        asked = {name: float(value) for name, _, value in (field.partition("=") for field in fields)}
+        fields_by_name = {name: float(value) for name, _, value in (field.partition("=") for field in fields)}
         (n0, e0, u0) = self._position()
         number = int(frame)
         before = len(self.texts)
         heading = math.radians(self.last["GLOBAL_POSITION_INT"].integer("hdg") / 100.0)
-        x = asked.pop("x", 0.0)
-        values: dict[str, Value] = TARGET | {"coordinate_frame": number, **asked}
-        values |= {name: int(asked[name]) for name in ("type_mask", "target_system") if name in asked}
+        x = fields_by_name.pop("x", 0.0)
+        values: dict[str, Value] = TARGET | {"coordinate_frame": number, **fields_by_name}
+        values |= {name: int(fields_by_name[name]) for name in ("type_mask", "target_system") if name in fields_by_name}
         if number in LOCAL_FRAMES:
             name = "SET_POSITION_TARGET_LOCAL_NED"
             values |= {"x": x + n0, "y": e0, "z": -u0} if number == 1 else {"x": x}
@@ -537,64 +537,70 @@ class Player:
             place = self.home.offset(n0 + x, e0)
             name = "SET_POSITION_TARGET_GLOBAL_INT"
             values |= {"lat_int": place.lat_e7, "lon_int": place.lon_e7, "alt": self._datum_m(number) + u0}
-            values |= {"lat_int": int(asked["lat_int"])} if "lat_int" in asked else {}
+            values |= {"lat_int": int(fields_by_name["lat_int"])} if "lat_int" in fields_by_name else {}
         peak = 0.0
-        end = self.line.now_s + float(duration)
-        once = "x" in {f.partition("=")[0] for f in fields}
-        self.line.send(name, values)
-        while self.line.now_s < end:
-            again = min(self.line.now_s + 0.2, end)
-            while self.line.now_s < again:
-                peak = max(peak, self._fast()[0])
-            if not once:
-                self.line.send(name, values)
+        end = self.connection.now_s + float(duration)
+        has_position = "x" in {f.partition("=")[0] for f in fields}
+        self.connection.send(name, values)
+        while self.connection.now_s < end:
+            next_send_s = min(self.connection.now_s + 0.2, end)
+            while self.connection.now_s < next_send_s:
+                peak = max(peak, self._speed_and_latitude()[0])
+            if not has_position:
+                self.connection.send(name, values)
         n1, e1, u1 = self._position()
-        faces = self.last["GLOBAL_POSITION_INT"].integer("hdg") / 100.0
-        turned = (faces - math.degrees(heading) + 180.0) % 360.0 - 180.0
+        heading_deg = self.last["GLOBAL_POSITION_INT"].integer("hdg") / 100.0
+        turned = (heading_deg - math.degrees(heading) + 180.0) % 360.0 - 180.0
         north = n1 - n0
         east = e1 - e0
         ahead = north * math.cos(heading) + east * math.sin(heading)
         right = east * math.cos(heading) - north * math.sin(heading)
-        way = f"F={ahead:.1f} R={right:.1f}" if number in BODY_FRAMES else f"E={east:.1f} N={north:.1f}"
-        said = self._said(before)
+        distance = f"F={ahead:.1f} R={right:.1f}" if number in BODY_FRAMES else f"E={east:.1f} N={north:.1f}"
+        texts = self._statustexts_since(before)
         self._until_still()
-        yaw = f" turned={turned:.0f}" if "yaw_rate" in asked else f" hdg={faces:.0f}" if "yaw" in asked else ""
-        return f"{way} U={u1 - u0:.1f} vmax={peak:.1f}{yaw}{said}"
+        yaw = (
+            f" turned={turned:.0f}"
+            if "yaw_rate" in fields_by_name
+            else f" hdg={heading_deg:.0f}"
+            if "yaw" in fields_by_name
+            else ""
+        )
+        return f"{distance} U={u1 - u0:.1f} vmax={peak:.1f}{yaw}{texts}"
 
     def _until_still(self) -> None:
-        self.line.send("SET_POSITION_TARGET_LOCAL_NED", TARGET | {"coordinate_frame": 1, "type_mask": 0xDC7})
+        self.connection.send("SET_POSITION_TARGET_LOCAL_NED", TARGET | {"coordinate_frame": 1, "type_mask": 0xDC7})
         self._stopped(0.2)
 
     def _run(self, speed: float, duration_s: float = 8.0) -> None:
-        end = self.line.now_s + duration_s
-        while self.line.now_s < end:
+        end = self.connection.now_s + duration_s
+        while self.connection.now_s < end:
             values: dict[str, Value] = {"coordinate_frame": 1, "type_mask": 0xDC7, "vx": speed}
-            self.line.send("SET_POSITION_TARGET_LOCAL_NED", TARGET | values)
+            self.connection.send("SET_POSITION_TARGET_LOCAL_NED", TARGET | values)
             self.do_wait("0.2")
 
     def _stopped(self, slow_mps: float) -> tuple[float, float]:
         """Return the seconds until the vehicle stops, and the distance."""
-        begun_s = self.line.now_s
+        begun_s = self.connection.now_s
         (n0, e0, _) = self._position()
-        while self.line.now_s < begun_s + 15.0 and self._fast()[0] > slow_mps:
+        while self.connection.now_s < begun_s + 15.0 and self._speed_and_latitude()[0] > slow_mps:
             pass
-        stood_s = self.line.now_s - begun_s
+        stop_s = self.connection.now_s - begun_s
         self.do_wait("2")
         n1, e1, _ = self._position()
-        return stood_s, math.hypot(n1 - n0, e1 - e0)
+        return stop_s, math.hypot(n1 - n0, e1 - e0)
 
     def do_brake(self, speed: str) -> str:
         self._run(float(speed))
-        self.line.send("SET_MODE", {"target_system": 1, "base_mode": 1, "custom_mode": BRAKE})
-        stop_s, way_m = self._stopped(0.5)
-        self._ordered(mavlink.MAV_CMD_DO_SET_MODE, [1.0, GUIDED])
-        return f"stop_s={stop_s:.2f} dist={way_m:.1f}"
+        self.connection.send("SET_MODE", {"target_system": 1, "base_mode": 1, "custom_mode": BRAKE})
+        stop_s, distance_m = self._stopped(0.5)
+        self._send_command(mavlink.MAV_CMD_DO_SET_MODE, [1.0, GUIDED])
+        return f"stop_s={stop_s:.2f} dist={distance_m:.1f}"
 
     def do_stop(self, speed: str) -> str:
         self._run(float(speed))
-        self.line.send("SET_POSITION_TARGET_LOCAL_NED", TARGET | {"coordinate_frame": 1, "type_mask": 0xDC7})
-        stop_s, way_m = self._stopped(0.5)
-        return f"stop_s={stop_s:.2f} dist={way_m:.1f}"
+        self.connection.send("SET_POSITION_TARGET_LOCAL_NED", TARGET | {"coordinate_frame": 1, "type_mask": 0xDC7})
+        stop_s, distance_m = self._stopped(0.5)
+        return f"stop_s={stop_s:.2f} dist={distance_m:.1f}"
 
     def do_timeout(self, timeout: str) -> str:
         self._set("GUID_TIMEOUT", float(timeout))
@@ -605,89 +611,91 @@ class Player:
         """Fly north with a velocity until the fence acts. Return the farthest distance from home."""
         before = len(self.texts)
         farthest = 0.0
-        end = self.line.now_s + 40.0
-        while self.line.now_s < end and self._mode() == GUIDED:
+        end = self.connection.now_s + 40.0
+        while self.connection.now_s < end and self._mode() == GUIDED:
             self._run(float(speed), 0.6)
             farthest = max(farthest, self._position()[0])
         for _ in range(20):
             farthest = max(farthest, self._position()[0])
-        return f"N={farthest:.0f} mode={self._mode()}{self._said(before)}"
+        return f"N={farthest:.0f} mode={self._mode()}{self._statustexts_since(before)}"
 
     def do_home(self) -> str:
         """Fly RTL and return the seconds until the motors stop."""
-        begun_s = self.line.now_s
-        self._ordered(mavlink.MAV_CMD_DO_SET_MODE, [1.0, RTL])
+        begun_s = self.connection.now_s
+        self._send_command(mavlink.MAV_CMD_DO_SET_MODE, [1.0, RTL])
         self._until("HEARTBEAT", 150.0, lambda m: not m.integer("base_mode") & 128)
-        return f"s={self.line.now_s - begun_s:.0f}"
+        return f"s={self.connection.now_s - begun_s:.0f}"
 
     def do_tour(self, last: str) -> str:
         """Arm in GUIDED and fly the stored mission to its last item. Return reached items and STATUSTEXTs in order."""
-        self._ordered(mavlink.MAV_CMD_DO_SET_MODE, [1.0, GUIDED])
-        self._ordered(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, [1.0])
+        self._send_command(mavlink.MAV_CMD_DO_SET_MODE, [1.0, GUIDED])
+        self._send_command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, [1.0])
         before = len(self.texts)
-        seen = {"MISSION_ITEM_REACHED": [""], "MISSION_CURRENT": [""]}
-        self._ordered(mavlink.MAV_CMD_MISSION_START, [])
+        sequences = {"MISSION_ITEM_REACHED": [""], "MISSION_CURRENT": [""]}
+        self._send_command(mavlink.MAV_CMD_MISSION_START, [])
         for message in self._stream(150.0):
-            if message.name in seen and seen[message.name][-1] != str(message.integer("seq")):
-                seen[message.name].append(str(message.integer("seq")))
-            if seen["MISSION_CURRENT"][-1] == last:
+            if message.name in sequences and sequences[message.name][-1] != str(message.integer("seq")):
+                sequences[message.name].append(str(message.integer("seq")))
+            if sequences["MISSION_CURRENT"][-1] == last:
                 break
-        told = [t for t in self.texts[before:] if t[4:].startswith(("Mission", "Reached"))]
-        once = [text for at, text in enumerate(told) if text not in told[at - 1 : at]]
-        return f"reached={','.join(seen['MISSION_ITEM_REACHED'][1:])} | {'; '.join(once)}"
+        mission_texts = [t for t in self.texts[before:] if t[4:].startswith(("Mission", "Reached"))]
+        distinct = [text for at, text in enumerate(mission_texts) if text not in mission_texts[at - 1 : at]]
+        return f"reached={','.join(sequences['MISSION_ITEM_REACHED'][1:])} | {'; '.join(distinct)}"
 
     def do_until(self, timeout: str, *words: str) -> str:
         """Wait for a STATUSTEXT. Return the elapsed seconds and the mode."""
-        begun_s = self.line.now_s
+        begun_s = self.connection.now_s
         before = len(self.texts)
-        wanted = " ".join(words)
-        while self.line.now_s < begun_s + float(timeout) and not any(wanted in t for t in self.texts[before:]):
-            self._hear()
-        waited_s = self.line.now_s - begun_s
+        text = " ".join(words)
+        while self.connection.now_s < begun_s + float(timeout) and not any(text in t for t in self.texts[before:]):
+            self._receive()
+        waited_s = self.connection.now_s - begun_s
         return f"s={waited_s:.1f} mode={self._mode()}"
 
 
-def compare(line: Line, report: Callable[[Step, str, str], None], script: Sequence[Step]) -> int:
-    """Play and report all steps (`same`, `differs`, `meant` or `not played`). Return the number of differences."""
-    player = Player(line)
+def compare(connection: Connection, report: Callable[[Step, str, str], None], script: Sequence[Step]) -> int:
+    """Play and report all steps (`same`, `differs`, `intended` or `not played`). Return the number of differences."""
+    player = Player(connection)
     wrong = 0
     for step in script:
-        if not step.do:
+        if not step.action:
             report(step, "", "not played")
             continue
         try:
-            answer = player.play(step.do)
+            response = player.play(step.action)
         except (TimeoutError, AssertionError) as error:
-            answer = f"no answer ({error})"
-        verdict = "same" if agrees(step.real, answer) else "meant" if step.note else "differs"
+            response = f"no response ({error})"
+        verdict = "same" if matches(step.recorded, response) else "intended" if step.note else "differs"
         wrong += verdict == "differs"
-        report(step, answer, verdict)
+        report(step, response, verdict)
     return wrong
 
 
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description="Compare an autopilot with a real ArduCopter 4.6.3.")
-    parser.add_argument("--autopilot", help="tcp:HOST:PORT, freshly booted; without it the simulated vehicle is asked")
-    parser.add_argument("--all", action="store_true", help="print also what is the same and what is not played")
-    parser.add_argument("--steps", type=Path, default=STEPS, help="another script of this form")
+    parser.add_argument("--autopilot", help="tcp:HOST:PORT, freshly booted; default: the simulated vehicle")
+    parser.add_argument(
+        "--all", action="store_true", help="also print steps without differences and steps that are not played"
+    )
+    parser.add_argument("--steps", type=Path, default=STEPS, help="another script in the same format")
     options = parser.parse_args()
-    line: Line = TcpLine(options.autopilot) if options.autopilot else SimulatedLine()
+    connection: Connection = TcpConnection(options.autopilot) if options.autopilot else SimulatedConnection()
 
     script = steps(options.steps)
     begun_s = time.monotonic()
     played = 0
 
-    def report(step: Step, answer: str, verdict: str) -> None:
+    def report(step: Step, response: str, verdict: str) -> None:
         nonlocal played
         played += 1
-        if options.all or verdict in ("differs", "meant"):
-            print(f"{verdict:10} | {step.name} | {step.real} | {answer} | {step.note}", flush=True)
+        if options.all or verdict in ("differs", "intended"):
+            print(f"{verdict:10} | {step.name} | {step.recorded} | {response} | {step.note}", flush=True)
         progress = f"{played} of {len(script)} steps, {time.monotonic() - begun_s:.0f} s"
         print(progress, end="\r" if sys.stderr.isatty() else "\n", file=sys.stderr, flush=True)
 
-    wrong = compare(line, report, script)
-    print(f"{wrong} of {len(script)} steps differ without being meant to")
+    wrong = compare(connection, report, script)
+    print(f"{wrong} of {len(script)} steps differ unintentionally")
     sys.exit(1 if wrong else 0)
 
 

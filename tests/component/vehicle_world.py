@@ -15,7 +15,7 @@ CONFIG = VehicleConfig(start=START, ready_after_s=2.0, position_noise_m=0.05)
 
 
 def alone(*, config: VehicleConfig = CONFIG, **parameters: float) -> tuple[VehicleState, Pilot]:
-    """One vehicle and its pilot."""
+    """Return one vehicle and its pilot."""
     simulation = Simulation([replace(config, parameters={**config.parameters, **parameters})])
     craft = simulation.crafts[0]
     return craft.vehicle.state, Pilot(simulation, craft)

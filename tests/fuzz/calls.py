@@ -26,30 +26,32 @@ def wire(message: bytes) -> Call:
     return proto_conversion.call_of(mobility_pb2.CheckCallRequest.FromString(message))
 
 
-def numbers(given: atheris.FuzzedDataProvider) -> Call:
+def numbers(data_provider: atheris.FuzzedDataProvider) -> Call:
     """Return a call with arbitrary numbers, NaN and infinity included."""
-    which = given.ConsumeIntInRange(0, 2)
-    if which == 0:
-        request = mobility_pb2.GotoRequest(acceptance_radius_m=number(given, 10), speed_mps=number(given, 20))
-        request.target.altitude_reference = given.ConsumeIntInRange(0, 5)
-        request.target.latitude_deg = HOME.lat + number(given, 0.002)
-        request.target.longitude_deg = HOME.lon + number(given, 0.002)
-        request.target.altitude_m = number(given, 100)
-        if given.ConsumeBool():
-            request.yaw_deg = number(given, 360)
+    kind = data_provider.ConsumeIntInRange(0, 2)
+    if kind == 0:
+        request = mobility_pb2.GotoRequest(
+            acceptance_radius_m=number(data_provider, 10), speed_mps=number(data_provider, 20)
+        )
+        request.target.altitude_reference = data_provider.ConsumeIntInRange(0, 5)
+        request.target.latitude_deg = HOME.lat + number(data_provider, 0.002)
+        request.target.longitude_deg = HOME.lon + number(data_provider, 0.002)
+        request.target.altitude_m = number(data_provider, 100)
+        if data_provider.ConsumeBool():
+            request.yaw_deg = number(data_provider, 360)
         return Call("Goto", proto_conversion.goto_args(request))
-    if which == 1:
-        velocity = mobility_pb2.SetVelocityRequest(hold_s=number(given, 2))
-        velocity.velocity.north_mps = number(given, 20)
-        velocity.velocity.east_mps = number(given, 20)
-        velocity.velocity.down_mps = number(given, 5)
+    if kind == 1:
+        velocity = mobility_pb2.SetVelocityRequest(hold_s=number(data_provider, 2))
+        velocity.velocity.north_mps = number(data_provider, 20)
+        velocity.velocity.east_mps = number(data_provider, 20)
+        velocity.velocity.down_mps = number(data_provider, 5)
         return Call("SetVelocity", proto_conversion.velocity_args(velocity))
     check = mobility_pb2.CheckCallRequest()
-    check.takeoff.altitude_m = number(given, 100)
+    check.takeoff.altitude_m = number(data_provider, 100)
     return proto_conversion.call_of(check)
 
 
-def one(data: bytes) -> None:
+def fuzz_one(data: bytes) -> None:
     """Judge one request, decoded from the bytes or built from numbers that they select."""
     try:
         call = wire(data[1:]) if data[:1] < b"\x40" else numbers(atheris.FuzzedDataProvider(data[1:]))
@@ -63,5 +65,5 @@ def one(data: bytes) -> None:
 
 
 if __name__ == "__main__":
-    atheris.Setup(sys.argv, one)
+    atheris.Setup(sys.argv, fuzz_one)
     atheris.Fuzz()

@@ -1,7 +1,7 @@
-"""Sequences of calls, as any components may make them, through the handlers of the camera service.
+"""Fuzz sequences of calls of any callers to the camera service.
 
-Whatever is called, by any caller: no handler fails, no picture is taken in the private zone, none is returned to anyone but its
-owner, and no other file is read or removed.
+No handler fails. No picture is taken in the private zone. Pictures are returned only to their owner, and no other file is read or
+removed.
 """
 
 from __future__ import annotations
@@ -48,14 +48,14 @@ NAMES = sorted(TYPES)
 FIRST = active_grant()
 SECOND = active_grant(private("blurFaces"), uid="u2", instance="app-viewer")
 PLACES_M = [80.0, 0.0, 21.0]
-"""North of home; the private zone reaches 20 m."""
+"""Positions in metres north of home. The private zone extends to 20 m."""
 PATHS = ["../../other.jpg", "../other.json", "/etc/passwd", "20260601120000000-0000.jpg/..", "a" * 20_000, "\0", ".jpg"]
 logging.disable(logging.CRITICAL)
 os.fsync = os.fdatasync = lambda _file: None  # durability is not tested
 
 
 class Shutter:
-    """A camera that returns a grey picture at once, or fails."""
+    """Fake camera that returns a grey picture at once, or fails."""
 
     latency_s = 0.0
 
@@ -71,7 +71,7 @@ class Shutter:
 
 
 class Service:
-    """A camera service with two components, on a drone at a position that the fuzzer sets."""
+    """Camera service with two components, on a drone at a position set by the fuzzer."""
 
     def __init__(self) -> None:
         self.drone = Drone()
@@ -104,28 +104,32 @@ def of(identity: str, days: int = 36500) -> bytes:
     return certificate(identity, days=days)
 
 
-async def calls(given: atheris.FuzzedDataProvider) -> None:
+async def calls(data_provider: atheris.FuzzedDataProvider) -> None:
     """Make up to twelve calls, in sequence or in parallel."""
     service = Service()
     chains = [(of(FIRST.identity),), (of(SECOND.identity),), *STRANGE, (of(FIRST.identity, 1),)]
     running: list[asyncio.Task[None]] = []
     for _ in range(12):
-        if not given.remaining_bytes():
+        if not data_provider.remaining_bytes():
             break
         if not running:
-            service.drone.y = given.PickValueInList(PLACES_M)
-            service.shutter.broken = not given.ConsumeIntInRange(0, 9)
-        which = given.ConsumeIntInRange(0, 3 * len(chains) - 1)
+            service.drone.y = data_provider.PickValueInList(PLACES_M)
+            service.shutter.broken = not data_provider.ConsumeIntInRange(0, 9)
+        which = data_provider.ConsumeIntInRange(0, 3 * len(chains) - 1)
         chain = chains[which if which < len(chains) else which % 2]
-        name = given.PickValueInList(NAMES)
-        body = _named(given, service, name) if given.ConsumeBool() else request(given, TYPES[name])
-        deadline_s = given.PickValueInList(DEADLINES_S) if not given.ConsumeIntInRange(0, 7) else DEADLINES_S[0]
+        name = data_provider.PickValueInList(NAMES)
+        body = (
+            _named(data_provider, service, name) if data_provider.ConsumeBool() else request(data_provider, TYPES[name])
+        )
+        deadline_s = (
+            data_provider.PickValueInList(DEADLINES_S) if not data_provider.ConsumeIntInRange(0, 7) else DEADLINES_S[0]
+        )
         caller = {chains[0]: FIRST, chains[1]: SECOND}.get(chain)
-        call = asyncio.ensure_future(one_call(service, name, body, Context(chain, deadline_s), caller))
+        call = asyncio.ensure_future(checked_call(service, name, body, Context(chain, deadline_s), caller))
         running.append(call)
-        if not given.ConsumeIntInRange(0, 7):
+        if not data_provider.ConsumeIntInRange(0, 7):
             call.cancel()
-        if given.ConsumeBool():
+        if data_provider.ConsumeBool():
             await _ended(running)
     await _ended(running)
     assert OTHERS.read_bytes() == b"other"
@@ -138,47 +142,51 @@ async def _ended(running: list[asyncio.Task[None]]) -> None:
     running.clear()
 
 
-def _named(given: atheris.FuzzedDataProvider, service: Service, name: str) -> bytes:
+def _named(data_provider: atheris.FuzzedDataProvider, service: Service, name: str) -> bytes:
     """Return a request for a valid size or an existing picture, of the caller or of the other component."""
     if name == "CaptureImage":
         sizes = [0, 16, 48, 64, 2**32 - 1]
         return bytes(
             camera_pb2.CaptureImageRequest(
-                width=given.PickValueInList(sizes), height=given.PickValueInList(sizes)
+                width=data_provider.PickValueInList(sizes), height=data_provider.PickValueInList(sizes)
             ).SerializeToString()
         )
     message = TYPES[name]()
     if hasattr(message, "name"):
         known = [name for names in service.names.values() for name in names]
-        message.name = given.PickValueInList(known or PATHS) if given.ConsumeBool() else given.PickValueInList(PATHS)
+        message.name = (
+            data_provider.PickValueInList(known or PATHS)
+            if data_provider.ConsumeBool()
+            else data_provider.PickValueInList(PATHS)
+        )
     return bytes(message.SerializeToString())
 
 
-async def one_call(service: Service, name: str, body: bytes, context: Context, caller: ActiveGrant | None) -> None:
+async def checked_call(service: Service, name: str, body: bytes, context: Context, caller: ActiveGrant | None) -> None:
     """Make a call and check its reply."""
     answer = await called(service.handlers[name], body, context)
     if answer is None and not context.written:
         assert context.code is not None, f"{name} has no reply"
         return
     assert caller is not None, f"{name} of a caller without Grant is allowed"
-    own = service.names.setdefault(caller.identity, [])
+    own_names = service.names.setdefault(caller.identity, [])
     if name == "CaptureImage":
-        private_here = abs(service.drone.y) < 20
-        assert not (private_here and caller is FIRST), "a picture of the private zone"
-        own.append(answer.image.name)
+        in_private_zone = abs(service.drone.y) < 20
+        assert not (in_private_zone and caller is FIRST), "a picture of the private zone"
+        own_names.append(answer.image.name)
     elif name == "RetrieveImage":
-        assert context.written[0].image.name in own, context.written[0].image.name
+        assert context.written[0].image.name in own_names, context.written[0].image.name
         assert b"".join(part.data for part in context.written)[:2] == b"\xff\xd8"
     elif name == "ListImages":
-        assert {image.name for image in answer.images} <= set(own)
+        assert {image.name for image in answer.images} <= set(own_names)
 
 
-def one(data: bytes) -> None:
+def fuzz_one(data: bytes) -> None:
     """Run one sequence of calls."""
     OTHERS.write_bytes(b"other")
     fly(lambda: calls(atheris.FuzzedDataProvider(data)))
 
 
 if __name__ == "__main__":
-    atheris.Setup(sys.argv, one)
+    atheris.Setup(sys.argv, fuzz_one)
     atheris.Fuzz()

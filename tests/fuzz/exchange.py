@@ -21,7 +21,7 @@ logging.disable(logging.CRITICAL)
 
 
 class Context:
-    """gRPC's context of one call."""
+    """Fake gRPC context of one call."""
 
     def __init__(self, metadata: tuple[tuple[str, str | bytes], ...]) -> None:
         self._metadata = metadata
@@ -36,17 +36,17 @@ class Context:
 
 
 class Peer:
-    """A component that replies, and counts the requests it has executed."""
+    """Fake component that replies and counts executed requests."""
 
-    def __init__(self, given: atheris.FuzzedDataProvider) -> None:
-        self._given = given
+    def __init__(self, data_provider: atheris.FuzzedDataProvider) -> None:
+        self._data_provider = data_provider
         self.done: Counter[tuple[str, bytes]] = Counter()
 
     async def handle(self, request: Request) -> bytes:
         """Execute a request, or refuse it temporarily or permanently."""
         assert request.attempt >= 0
         await asyncio.sleep(0.1)
-        how = self._given.ConsumeIntInRange(0, 7)
+        how = self._data_provider.ConsumeIntInRange(0, 7)
         if how == 0:
             raise ValueError("refused")
         if how == 1:
@@ -55,9 +55,9 @@ class Peer:
         return request.body + b"!"
 
 
-async def requests(given: atheris.FuzzedDataProvider) -> None:
+async def requests(data_provider: atheris.FuzzedDataProvider) -> None:
     """Send up to twelve requests with few ids."""
-    peer = Peer(given)
+    peer = Peer(data_provider)
     method = Responder({}, 0)._method("M", peer.handle).unary_unary
 
     async def call(body: bytes, context: Context) -> None:
@@ -69,35 +69,45 @@ async def requests(given: atheris.FuzzedDataProvider) -> None:
             assert answer == body + b"!"
 
     running: list[asyncio.Task[Any]] = []
-    for _ in range(given.ConsumeIntInRange(1, 12)):
+    for _ in range(data_provider.ConsumeIntInRange(1, 12)):
         metadata: list[tuple[str, str | bytes]] = []
-        if given.ConsumeIntInRange(0, 7):
+        if data_provider.ConsumeIntInRange(0, 7):
             metadata.append(
-                (ID_HEADER, given.PickValueInList(IDS) if given.ConsumeBool() else given.ConsumeUnicodeNoSurrogates(80))
+                (
+                    ID_HEADER,
+                    data_provider.PickValueInList(IDS)
+                    if data_provider.ConsumeBool()
+                    else data_provider.ConsumeUnicodeNoSurrogates(80),
+                )
             )
-        if given.ConsumeIntInRange(0, 3):
-            metadata.append((ATTEMPT_HEADER, given.PickValueInList(ATTEMPTS)))
-        if not given.ConsumeIntInRange(0, 7):
-            metadata.append((given.PickValueInList([ID_HEADER, ATTEMPT_HEADER]), given.ConsumeUnicodeNoSurrogates(10)))
-        task = asyncio.ensure_future(call(given.PickValueInList([b"", b"x", b"y"]), Context(tuple(metadata))))
+        if data_provider.ConsumeIntInRange(0, 3):
+            metadata.append((ATTEMPT_HEADER, data_provider.PickValueInList(ATTEMPTS)))
+        if not data_provider.ConsumeIntInRange(0, 7):
+            metadata.append(
+                (
+                    data_provider.PickValueInList([ID_HEADER, ATTEMPT_HEADER]),
+                    data_provider.ConsumeUnicodeNoSurrogates(10),
+                )
+            )
+        task = asyncio.ensure_future(call(data_provider.PickValueInList([b"", b"x", b"y"]), Context(tuple(metadata))))
         running.append(task)
-        if given.ConsumeBool():
+        if data_provider.ConsumeBool():
             await asyncio.sleep(0.05)
-        if not given.ConsumeIntInRange(0, 7):
+        if not data_provider.ConsumeIntInRange(0, 7):
             task.cancel()
     for outcome in await asyncio.gather(*running, return_exceptions=True):
         if isinstance(outcome, Exception):
             raise outcome
     await asyncio.sleep(1)
     assert all(count == 1 for count in peer.done.values()), peer.done
-    assert len({name for name, _ in peer.done}) == len(peer.done), "one id, two bodies"
+    assert len({name for name, _ in peer.done}) == len(peer.done), "one id was executed with two bodies"
 
 
-def one(data: bytes) -> None:
+def fuzz_one(data: bytes) -> None:
     """Run one conversation."""
     fly(lambda: requests(atheris.FuzzedDataProvider(data)))
 
 
 if __name__ == "__main__":
-    atheris.Setup(sys.argv, one)
+    atheris.Setup(sys.argv, fuzz_one)
     atheris.Fuzz()

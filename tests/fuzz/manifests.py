@@ -57,7 +57,7 @@ Place = tuple[Any, Any]
 
 
 def places(inside: Any) -> Iterator[Place]:
-    """Return the places of all values in some objects, except kind and API version."""
+    """Return the positions of all values in some objects, except kind and API version."""
     for key, value in inside.items() if isinstance(inside, dict) else enumerate(inside):
         if key not in {"apiVersion", "kind"}:
             yield inside, key
@@ -77,54 +77,56 @@ def move(inside: Any, lat: float, lon: float) -> None:
         inside["lon"] = (east + 180.0) % 360.0 - 180.0
 
 
-def changed(given: atheris.FuzzedDataProvider) -> list[Any]:
+def changed(data_provider: atheris.FuzzedDataProvider) -> list[Any]:
     """Return the example with a few changed values."""
     objects = copy.deepcopy(OBJECTS)
-    if not given.ConsumeIntInRange(0, 3):
-        move(objects, *given.PickValueInList(ELSEWHERE_DEG))
-    for _ in range(given.ConsumeIntInRange(0, 6)):
-        if not (there := list(places(objects))):
+    if not data_provider.ConsumeIntInRange(0, 3):
+        move(objects, *data_provider.PickValueInList(ELSEWHERE_DEG))
+    for _ in range(data_provider.ConsumeIntInRange(0, 6)):
+        if not (places_ := list(places(objects))):
             break
-        inside, key = there[given.ConsumeIntInRange(0, len(there) - 1)]
-        how = given.ConsumeIntInRange(0, 9)
+        inside, key = places_[data_provider.ConsumeIntInRange(0, len(places_) - 1)]
+        how = data_provider.ConsumeIntInRange(0, 9)
         if how == 0:
             del inside[key]
         elif how == 1 and isinstance(inside, list):
             inside.append(copy.deepcopy(inside[key]))
         elif how <= 3:
-            other, there_key = there[given.ConsumeIntInRange(0, len(there) - 1)]
-            inside[key] = copy.deepcopy(other[there_key])
+            other, other_key = places_[data_provider.ConsumeIntInRange(0, len(places_) - 1)]
+            inside[key] = copy.deepcopy(other[other_key])
         else:
-            inside[key] = value(given, inside[key])
+            inside[key] = value(data_provider, inside[key])
     return objects
 
 
-def value(given: atheris.FuzzedDataProvider, before: Any) -> Any:
+def value(data_provider: atheris.FuzzedDataProvider, before: Any) -> Any:
     """Return another value, often of the same type."""
     if isinstance(before, bool):
         return not before
-    if isinstance(before, int | float) and given.ConsumeBool():
-        if isinstance(before, float) and given.ConsumeBool():
-            return before + given.ConsumeFloatInRange(-NEAR_DEG, NEAR_DEG)
-        return given.PickValueInList([0, -1, 1, 89.9999, -90, 180, -180, 1e-9, 1e9, 1e300, 2**63, before * 10, -before])
-    if isinstance(before, str) and given.ConsumeBool():
-        return given.ConsumeUnicodeNoSurrogates(20)
-    return given.PickValueInList(
+    if isinstance(before, int | float) and data_provider.ConsumeBool():
+        if isinstance(before, float) and data_provider.ConsumeBool():
+            return before + data_provider.ConsumeFloatInRange(-NEAR_DEG, NEAR_DEG)
+        return data_provider.PickValueInList(
+            [0, -1, 1, 89.9999, -90, 180, -180, 1e-9, 1e9, 1e300, 2**63, before * 10, -before]
+        )
+    if isinstance(before, str) and data_provider.ConsumeBool():
+        return data_provider.ConsumeUnicodeNoSurrogates(20)
+    return data_provider.PickValueInList(
         [None, "", "x" * 300, 0, 1.5, True, [], {}, [[]], {"": {}}, "é\n", "1e3", "5m", "-1", math.nan, math.inf]
     )
 
 
-def respelt(given: atheris.FuzzedDataProvider) -> str:
+def respelt(data_provider: atheris.FuzzedDataProvider) -> str:
     """Return the changed example with unusual YAML spellings, sometimes after a document with nested aliases."""
-    text = dump_documents(changed(given))
+    text = dump_documents(changed(data_provider))
     lines = text.splitlines()
-    for _ in range(given.ConsumeIntInRange(0, 4)):
-        at = given.ConsumeIntInRange(0, len(lines) - 1)
+    for _ in range(data_provider.ConsumeIntInRange(0, 4)):
+        at = data_provider.ConsumeIntInRange(0, len(lines) - 1)
         name, colon, rest = lines[at].partition(": ")
-        put = given.PickValueInList(SPELLINGS)
-        lines[at] = f"{name}{colon}{put} {rest if given.ConsumeBool() else ''}"
-    if not given.ConsumeIntInRange(0, 3):
-        return bomb(given.ConsumeIntInRange(1, 40), given.ConsumeIntInRange(1, 40)) + "\n".join(lines)
+        put = data_provider.PickValueInList(SPELLINGS)
+        lines[at] = f"{name}{colon}{put} {rest if data_provider.ConsumeBool() else ''}"
+    if not data_provider.ConsumeIntInRange(0, 3):
+        return bomb(data_provider.ConsumeIntInRange(1, 40), data_provider.ConsumeIntInRange(1, 40)) + "\n".join(lines)
     return "\n".join(lines)
 
 
@@ -152,15 +154,15 @@ def planned(file: Path) -> None:
         assert "\n" not in str(error).strip(), error
 
 
-def one(data: bytes) -> None:
+def fuzz_one(data: bytes) -> None:
     """Read and plan one file."""
     if data[:1] >= b"\x80":  # never the beginning of UTF-8 text
-        given = atheris.FuzzedDataProvider(data[1:])
+        data_provider = atheris.FuzzedDataProvider(data[1:])
         if data[0] % 2:
-            JSON.write_text(json.dumps({"kind": "List", "items": changed(given)}))
+            JSON.write_text(json.dumps({"kind": "List", "items": changed(data_provider)}))
             planned(JSON)
         else:
-            YAML.write_text(respelt(given), errors="surrogatepass")
+            YAML.write_text(respelt(data_provider), errors="surrogatepass")
             planned(YAML)
         return
     YAML.write_bytes(data)
@@ -170,5 +172,5 @@ def one(data: bytes) -> None:
 
 
 if __name__ == "__main__":
-    atheris.Setup(sys.argv, one)
+    atheris.Setup(sys.argv, fuzz_one)
     atheris.Fuzz()

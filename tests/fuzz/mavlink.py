@@ -1,4 +1,4 @@
-"""Fuzz the MAVLink parser: the same messages however the bytes are cut, and no exception on any of them.
+"""Fuzz the MAVLink parser: no exception, and the same messages for every division of the bytes.
 
 Also checks that no changed frame is accepted on a signed link.
 """
@@ -18,7 +18,7 @@ MARKERS = bytes((mavlink.PROTOCOL_MARKER_V1, mavlink.PROTOCOL_MARKER_V2))
 KEY = bytes(range(32))
 
 
-def one(data: bytes) -> None:
+def fuzz_one(data: bytes) -> None:
     """Check one input as a stream and as the payload of intact frames."""
     parsed(data)
     if len(data) > 3:
@@ -58,7 +58,7 @@ def check_unsigned(frame: bytes, kind: MessageClass) -> None:
 
 
 def parsed(data: bytes) -> list[Message]:
-    """Return the messages of a stream, which must not depend on the way it is cut."""
+    """Return the messages of a stream. They must not depend on the division of the stream."""
     half = len(data) // 2
     outcomes = []
     reported = []
@@ -78,8 +78,8 @@ def parsed(data: bytes) -> list[Message]:
 
 def check_encoded_again(message: Message) -> None:
     """Check that a received message can be sent and is received as the same."""
-    (again,) = Parser().feed(Endpoint(1, 1).encode(message.name, message.values))
-    assert repr(again.values) == repr(message.values)
+    (decoded,) = Parser().feed(Endpoint(1, 1).encode(message.name, message.values))
+    assert repr(decoded.values) == repr(message.values)
 
 
 def check_signed(kind: MessageClass, payload: bytes, data: bytes) -> None:
@@ -101,5 +101,5 @@ def check_signed(kind: MessageClass, payload: bytes, data: bytes) -> None:
 
 
 if __name__ == "__main__":
-    atheris.Setup(sys.argv, one)
+    atheris.Setup(sys.argv, fuzz_one)
     atheris.Fuzz()

@@ -53,7 +53,7 @@ VEHICLE_MESSAGES = [
     "HEARTBEAT", "GLOBAL_POSITION_INT", "EXTENDED_SYS_STATE", "SYS_STATUS", "HOME_POSITION", "ATTITUDE", "GPS_RAW_INT",
     "EKF_STATUS_REPORT", "STATUSTEXT", "COMMAND_ACK", "PARAM_VALUE", "TIMESYNC", "MISSION_REQUEST_INT", "MISSION_ACK",
 ]  # fmt: skip
-OTHERS = [(255, 190), (1, 154), (1, 191), (2, 1), (244, 191), (0, 0)]
+OTHER_SENDERS = [(255, 190), (1, 154), (1, 191), (2, 1), (244, 191), (0, 0)]
 """Other senders on the link: ground station, gimbal, companion computer, another vehicle, the service's own address, and none."""
 logging.disable(logging.CRITICAL)
 
@@ -67,32 +67,32 @@ def of(identity: str, days: int = 36500) -> bytes:
 class Flight:
     """A vehicle, its service and the callers."""
 
-    def __init__(self, given: atheris.FuzzedDataProvider) -> None:
-        self._given = given
+    def __init__(self, data_provider: atheris.FuzzedDataProvider) -> None:
+        self._data_provider = data_provider
         self._running: list[asyncio.Task[Any]] = []
         self._driven = False
 
     async def fly(self) -> None:
         """Make the calls, and then check the flight."""
-        given = self._given
+        data_provider = self._data_provider
         # Most flights are short, because long flights take a hundred times longer.
-        waits_s = WAITS_S if not given.ConsumeIntInRange(0, 7) else WAITS_S[:1]
+        waits_s = WAITS_S if not data_provider.ConsumeIntInRange(0, 7) else WAITS_S[:1]
         async with World(FOLDER, step_s=0.2) as world:
             active = world.grants.put(DRIVER)
             known = [active, world.grants.put(PASSENGER, "m2")]
-            toured = not given.ConsumeIntInRange(0, 7)
+            toured = not data_provider.ConsumeIntInRange(0, 7)
             if toured:
                 known.append(world.grants.put(TOURIST, "m3"))
-            chains = [(of(one.identity),) for one in known]
+            chains = [(of(grant.identity),) for grant in known]
             node = (of(node_identity(NODE)),)
             chains += [*STRANGE, (of(active.identity, 1),), node]
             handlers = MobilityHandlers(
                 world.service, world.control, world.streams, grants=world.grants, node=NODE, clock=time.time,  # type: ignore[arg-type]
-                on_passenger=world.tours.passenger_called,
+                on_passenger=world.poi_missions.passenger_called,
             )  # fmt: skip
             registry = Registry(handlers.admission)
             mobility_pb2_grpc.add_MobilityServiceServicer_to_server(handlers, registry)
-            in_flight = not given.ConsumeIntInRange(0, 7)
+            in_flight = not data_provider.ConsumeIntInRange(0, 7)
             if in_flight:
                 self._driven = True
                 await world.up(active, 3.0)
@@ -116,45 +116,49 @@ class Flight:
         self, world: World, registry: Registry, chains: list[tuple[bytes, ...]], waits_s: list[float]
     ) -> bool:
         """Make up to twelve calls. Return True if arbitrary messages were sent in the vehicle's name."""
-        given = self._given
+        data_provider = self._data_provider
         spoofed = False
         for _ in range(12):
-            if not given.remaining_bytes():
+            if not data_provider.remaining_bytes():
                 break
-            if not given.ConsumeIntInRange(0, 9):
+            if not data_provider.ConsumeIntInRange(0, 9):
                 spoofed = self._send_noise(world) or spoofed
                 continue
-            if not given.ConsumeIntInRange(0, 15) and world.grants.active:
-                world.grants.remove(given.PickValueInList(list(world.grants.active.values())))
+            if not data_provider.ConsumeIntInRange(0, 15) and world.grants.active:
+                world.grants.remove(data_provider.PickValueInList(list(world.grants.active.values())))
                 continue
-            name = given.PickValueInList(NAMES)
-            which = given.ConsumeIntInRange(0, 4 * len(chains) - 1)
+            name = data_provider.PickValueInList(NAMES)
+            which = data_provider.ConsumeIntInRange(0, 4 * len(chains) - 1)
             chain = chains[which if which < len(chains) else 0]
             self._driven = self._driven or chain == chains[0]
-            deadline_s = given.PickValueInList(DEADLINES_S) if given.ConsumeBool() else DEADLINES_S[0]
+            deadline_s = data_provider.PickValueInList(DEADLINES_S) if data_provider.ConsumeBool() else DEADLINES_S[0]
             context = Context(chain, deadline_s)
             call = _checked_call(
-                registry.handlers[name], request(given, TYPES[name]), context, of_node=chain == chains[-1]
+                registry.handlers[name], request(data_provider, TYPES[name]), context, of_node=chain == chains[-1]
             )
             self._running.append(asyncio.ensure_future(call))
-            await asyncio.sleep(given.PickValueInList(waits_s))
+            await asyncio.sleep(data_provider.PickValueInList(waits_s))
         return spoofed
 
     def _send_noise(self, world: World) -> bool:
         """Put arbitrary bytes on the link. Return True if they can be a message of the vehicle."""
-        given = self._given
-        if not given.ConsumeIntInRange(0, 7):
-            world.plane._received(given.ConsumeBytes(given.ConsumeIntInRange(0, 300)))
+        data_provider = self._data_provider
+        if not data_provider.ConsumeIntInRange(0, 7):
+            world.plane._received(data_provider.ConsumeBytes(data_provider.ConsumeIntInRange(0, 300)))
             return True
         kind = (
-            message_class(given.PickValueInList(VEHICLE_MESSAGES))
-            if given.ConsumeBool()
-            else given.PickValueInList(MESSAGE_CLASSES)
+            message_class(data_provider.PickValueInList(VEHICLE_MESSAGES))
+            if data_provider.ConsumeBool()
+            else data_provider.PickValueInList(MESSAGE_CLASSES)
         )
-        source = given.PickValueInList(OTHERS) if given.ConsumeBool() else world.plane.target or (1, 1)
-        payload = given.ConsumeBytes(kind.unpacker.size)
+        source = (
+            data_provider.PickValueInList(OTHER_SENDERS)
+            if data_provider.ConsumeBool()
+            else world.plane.target or (1, 1)
+        )
+        payload = data_provider.ConsumeBytes(kind.unpacker.size)
         world.plane._received(frame_v2(kind, payload or b"\0", source=source))
-        return source not in OTHERS
+        return source not in OTHER_SENDERS
 
 
 async def _checked_call(handler: grpc.RpcMethodHandler, body: bytes, context: Context, *, of_node: bool) -> None:
@@ -164,11 +168,11 @@ async def _checked_call(handler: grpc.RpcMethodHandler, body: bytes, context: Co
         assert of_node or not getattr(message, "missions", None), "the reply contains another component's mission"
 
 
-def one(data: bytes) -> None:
+def fuzz_one(data: bytes) -> None:
     """Run one flight."""
     fly(Flight(atheris.FuzzedDataProvider(data)).fly)
 
 
 if __name__ == "__main__":
-    atheris.Setup(sys.argv, one)
+    atheris.Setup(sys.argv, fuzz_one)
     atheris.Fuzz()

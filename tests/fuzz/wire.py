@@ -48,39 +48,47 @@ STRANGE = (
 """Certificate chains without a Grant."""
 
 
-def number(given: atheris.FuzzedDataProvider, bound: float) -> float:
+def number(data_provider: atheris.FuzzedDataProvider, bound: float) -> float:
     """Return a number of a realistic size, or any number, NaN and infinity included."""
-    return given.ConsumeFloatInRange(-bound, bound) if given.ConsumeBool() else given.ConsumeFloat()
+    return (
+        data_provider.ConsumeFloatInRange(-bound, bound)
+        if data_provider.ConsumeBool()
+        else data_provider.ConsumeFloat()
+    )
 
 
-def fill(given: atheris.FuzzedDataProvider, message: Any) -> None:
+def fill(data_provider: atheris.FuzzedDataProvider, message: Any) -> None:
     """Set some fields of a message to values of their type."""
     for field in message.DESCRIPTOR.fields:
-        if field.is_repeated or not given.ConsumeIntInRange(0, 3):
+        if field.is_repeated or not data_provider.ConsumeIntInRange(0, 3):
             continue
         if field.type == FieldDescriptor.TYPE_MESSAGE:
             getattr(message, field.name).SetInParent()
-            fill(given, getattr(message, field.name))
+            fill(data_provider, getattr(message, field.name))
         elif field.type in {FieldDescriptor.TYPE_DOUBLE, FieldDescriptor.TYPE_FLOAT}:
             centre = CENTRE.get(field.name)
-            value = number(given, 120.0) if centre is None else centre + number(given, 0.002)
+            value = number(data_provider, 120.0) if centre is None else centre + number(data_provider, 0.002)
             setattr(message, field.name, value)
         elif field.type == FieldDescriptor.TYPE_STRING:
-            setattr(message, field.name, given.ConsumeUnicodeNoSurrogates(40))
+            setattr(message, field.name, data_provider.ConsumeUnicodeNoSurrogates(40))
         elif field.type == FieldDescriptor.TYPE_BOOL:
-            setattr(message, field.name, given.ConsumeBool())
+            setattr(message, field.name, data_provider.ConsumeBool())
         elif field.type == FieldDescriptor.TYPE_ENUM:
-            setattr(message, field.name, given.ConsumeIntInRange(0, 7))
+            setattr(message, field.name, data_provider.ConsumeIntInRange(0, 7))
         else:
-            setattr(message, field.name, given.ConsumeIntInRange(0, 100 if given.ConsumeBool() else 2**32 - 1))
+            setattr(
+                message,
+                field.name,
+                data_provider.ConsumeIntInRange(0, 100 if data_provider.ConsumeBool() else 2**32 - 1),
+            )
 
 
-def request(given: atheris.FuzzedDataProvider, kind: Any) -> bytes:
+def request(data_provider: atheris.FuzzedDataProvider, kind: Any) -> bytes:
     """Return an encoded request for a method with this message type."""
-    if not given.ConsumeIntInRange(0, 3):
-        return given.ConsumeBytes(given.ConsumeIntInRange(0, 64))
+    if not data_provider.ConsumeIntInRange(0, 3):
+        return data_provider.ConsumeBytes(data_provider.ConsumeIntInRange(0, 64))
     message = kind()
-    fill(given, message)
+    fill(data_provider, message)
     return bytes(message.SerializeToString())
 
 

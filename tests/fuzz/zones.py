@@ -29,7 +29,7 @@ HELD = {
     },
 }  # fmt: skip
 TEXTS = [write([*ZONES, Zone.from_body(HELD)]).text for write in WRITERS]
-"""The example's zones in each format."""
+"""Zones of the example in each format."""
 
 SPLICES = [
     "", "0", "-", "1e999", "NaN", "null", "true", "[]", "{}", '""', "180", "-180", "90", "9" * 20, "<", "&amp;", "&x;",
@@ -38,34 +38,38 @@ SPLICES = [
 logging.disable(logging.CRITICAL)
 
 
-def text_of(given: atheris.FuzzedDataProvider, which: int) -> str:
+def text_of(data_provider: atheris.FuzzedDataProvider, format_index: int) -> str:
     """Return an example with some places changed, or arbitrary text."""
-    if not given.ConsumeIntInRange(0, 7):
-        return given.ConsumeUnicodeNoSurrogates(given.remaining_bytes())
-    text = TEXTS[which]
-    for _ in range(given.ConsumeIntInRange(0, 6)):
-        begin = given.ConsumeIntInRange(0, max(len(text) - 1, 0))
-        end = begin + given.ConsumeIntInRange(0, 12)
-        put = given.PickValueInList(SPLICES) if given.ConsumeBool() else given.ConsumeUnicodeNoSurrogates(6)
-        if not given.ConsumeIntInRange(0, 3):
-            put = text[begin : begin + given.ConsumeIntInRange(0, 200)] + put
+    if not data_provider.ConsumeIntInRange(0, 7):
+        return data_provider.ConsumeUnicodeNoSurrogates(data_provider.remaining_bytes())
+    text = TEXTS[format_index]
+    for _ in range(data_provider.ConsumeIntInRange(0, 6)):
+        begin = data_provider.ConsumeIntInRange(0, max(len(text) - 1, 0))
+        end = begin + data_provider.ConsumeIntInRange(0, 12)
+        inserted = (
+            data_provider.PickValueInList(SPLICES)
+            if data_provider.ConsumeBool()
+            else data_provider.ConsumeUnicodeNoSurrogates(6)
+        )
+        if not data_provider.ConsumeIntInRange(0, 3):
+            inserted = text[begin : begin + data_provider.ConsumeIntInRange(0, 200)] + inserted
             end = begin
-        text = text[:begin] + put + text[end:]
+        text = text[:begin] + inserted + text[end:]
     return text
 
 
-def one(data: bytes) -> None:
+def fuzz_one(data: bytes) -> None:
     """Read one file, and write and read its zones again."""
-    given = atheris.FuzzedDataProvider(data)
-    which = given.ConsumeIntInRange(0, len(READERS) - 1)
+    data_provider = atheris.FuzzedDataProvider(data)
+    format_index = data_provider.ConsumeIntInRange(0, len(READERS) - 1)
     try:
-        found = READERS[which](text_of(given, which))
-        for zone in found.zones:
+        imported = READERS[format_index](text_of(data_provider, format_index))
+        for zone in imported.zones:
             check_zone(zone)
     except InvalidObject as error:
         assert str(error)
         return
-    for zone in found.zones:
+    for zone in imported.zones:
         body = zone.to_dict()
         body["spec"] = {key: part for key, part in body["spec"].items() if part not in ("", [])}
         (read,) = parse_documents(dump_documents([body]).encode(), "zone").values
@@ -73,7 +77,7 @@ def one(data: bytes) -> None:
         json.dumps(read)
     for write in WRITERS:
         try:
-            exported = write(found.zones)
+            exported = write(imported.zones)
         except InvalidObject as error:
             assert str(error)
             continue
@@ -81,5 +85,5 @@ def one(data: bytes) -> None:
 
 
 if __name__ == "__main__":
-    atheris.Setup(sys.argv, one)
+    atheris.Setup(sys.argv, fuzz_one)
     atheris.Fuzz()

@@ -149,9 +149,9 @@ async def test_invalid_grant_is_removed_and_reported_as_failed(
     synchronizer.apply(grant_list(manifest(spec={"newRestriction": True})))
     assert on_disk(tmp_path) == set()
     await synchronizer.report_once()
-    (found,) = store.reports[-1].values()
-    assert (found.name, found.uid, found.phase) == ("g1", "u1", "Failed")
-    assert "spec.newRestriction" in found.message
+    (reported,) = store.reports[-1].values()
+    assert (reported.name, reported.uid, reported.phase) == ("g1", "u1", "Failed")
+    assert "spec.newRestriction" in reported.message
 
 
 async def test_phases_are_reported_once_and_after_outages(synchronizer: GrantSynchronizer, store: FakeStore) -> None:
@@ -361,9 +361,9 @@ async def test_grant_with_bad_signature_is_not_stored_and_removes_the_previous_o
     verifying.apply(grant_list(manifest(spec={"control": "full"})))
     assert on_disk(tmp_path) == set()
     await verifying.report_once()
-    found = store.reports[-1]["g1"]
-    assert found.phase == "Pending", "the operator will sign it again"
-    assert "changed after" in found.message
+    reported = store.reports[-1]["g1"]
+    assert reported.phase == "Pending", "the operator will sign it again"
+    assert "changed after" in reported.message
     verifier.error = None
     verifying.apply(grant_list(manifest()))
     await verifying.report_once()
@@ -376,7 +376,7 @@ async def test_change_of_authorities_keeps_stored_grants(
 ) -> None:
     verifying.apply(grant_list(manifest()))
     await verifying.report_once()
-    verifier.error = UnknownAuthority("it is of an authority that is not in ca.crt")
+    verifier.error = UnknownAuthority("the authority is not in ca.crt")
     verifying.apply(grant_list(manifest(spec={"control": "full"}), reported=[report("Active")]))
     await verifying.report_once()
     assert "control" not in json.loads((tmp_path / "g1.json").read_text())["spec"]
@@ -391,7 +391,7 @@ def test_stored_grant_is_removed_if_the_authority_of_its_replacement_stays_unkno
     verifying: GrantSynchronizer, verifier: FakeVerifier, tmp_path: Path
 ) -> None:
     verifying.apply(grant_list(manifest()))
-    verifier.error = UnknownAuthority("it is of an authority that is not in ca.crt")
+    verifier.error = UnknownAuthority("the authority is not in ca.crt")
     verifying.apply(grant_list(manifest(spec={"control": "full"})))
     verifier.now_s = UNVERIFIED_TIMEOUT_S
     verifying.expire_unverified()
@@ -409,14 +409,14 @@ async def test_stored_grant_survives_unknown_authority_and_agent_restart(
     verifying: GrantSynchronizer, verifier: FakeVerifier, store: FakeStore, tmp_path: Path
 ) -> None:
     verifying.apply(grant_list(manifest()))
-    verifier.error = UnknownAuthority("it is of an authority that is not in ca.crt")
-    again = GrantSynchronizer(
+    verifier.error = UnknownAuthority("the authority is not in ca.crt")
+    resigned = GrantSynchronizer(
         store, GrantDirectory(tmp_path), "drone-1", verifier.check, monotonic=lambda: verifier.now_s
     )
-    again.apply(grant_list(manifest()))
+    resigned.apply(grant_list(manifest()))
     verifier.now_s = UNVERIFIED_TIMEOUT_S * 2
-    again.expire_unverified()
-    await again.report_once()
+    resigned.expire_unverified()
+    await resigned.report_once()
     assert on_disk(tmp_path) == {"g1.json"}
     assert store.phases()[-1] == "Active"
 
@@ -426,7 +426,7 @@ async def test_grants_stay_stored_while_the_api_server_is_unreachable_for_a_mont
 ) -> None:
     verifying.apply(grant_list(manifest("g1"), manifest("g2")))
     store.down = True
-    verifier.error = UnknownAuthority("there is no ca.crt any more")
+    verifier.error = UnknownAuthority("ca.crt is missing")
     for _ in range(30):
         verifier.now_s += 86_400
         verifying.set_missions({KEY: Outcome(OutcomeKind.FAILED, f"{verifier.now_s}")})
@@ -473,8 +473,8 @@ async def test_reported_final_phase_is_kept_for_unusable_grant(
 async def test_report_has_the_current_generation(synchronizer: GrantSynchronizer, store: FakeStore) -> None:
     """Sign a Grant again, which changes its annotations but not its generation."""
     synchronizer.apply(grant_list(manifest(), reported=[report("Active")]))
-    again = manifest(metadata={"annotations": {"fractus.dev/signature": "again"}})
-    synchronizer.apply(grant_list(again, generation=2, reported=[report("Active")]))
+    resigned = manifest(metadata={"annotations": {"fractus.dev/signature": "again"}})
+    synchronizer.apply(grant_list(resigned, generation=2, reported=[report("Active")]))
     await synchronizer.report_once()
     assert (store.generation, store.phases()) == (2, ["Active"])
 
@@ -483,7 +483,7 @@ def test_unchanged_grants_are_not_verified_again(
     verifying: GrantSynchronizer, verifier: FakeVerifier, tmp_path: Path
 ) -> None:
     verifying.apply(grant_list(manifest("g1"), manifest("g2")))
-    verifier.error = BadSignature("it is verified again")
+    verifier.error = BadSignature("an unchanged Grant is verified again")
     verifying.apply(grant_list(manifest("g1"), manifest("g2", spec={"control": "full"})))
     assert on_disk(tmp_path) == {"g1.json"}
     verifier.error = None
@@ -502,12 +502,12 @@ async def test_new_agent_keeps_reported_final_phase(synchronizer: GrantSynchroni
 
 
 def test_serialized_grant_does_not_depend_on_status() -> None:
-    one = Grant.from_body(manifest(version="1"))
-    two = Grant.from_body(manifest(version="2", status={"phase": "Active"}))
-    assert serialize_grant(one) == serialize_grant(two)
-    stored = json.loads(serialize_grant(one))
+    first = Grant.from_body(manifest(version="1"))
+    second = Grant.from_body(manifest(version="2", status={"phase": "Active"}))
+    assert serialize_grant(first) == serialize_grant(second)
+    stored = json.loads(serialize_grant(first))
     assert stored["metadata"]["uid"] == "u1"
-    assert Grant.from_body(stored).spec == one.spec
+    assert Grant.from_body(stored).spec == first.spec
     assert "policies" not in stored["spec"], "unused fields are left out for services of an earlier release"
 
 
@@ -544,7 +544,9 @@ async def test_invalid_status_of_node_grants_does_not_block_grants() -> None:
         "spec": {"count": 1, "packed": pack([manifest()])},
         "status": {"observedGeneration": 2, "grants": reports},
     }
-    found = await anext(Store(cast(Any, FakeClient(body)), "drone-1").grants())
-    assert found.grants is not None
-    assert [grant["metadata"]["name"] for grant in found.grants] == ["g1"]
-    assert (found.generation, found.reported, found.reported_generation) == (3, {}, 0), "everything is reported again"
+    reported = await anext(Store(cast(Any, FakeClient(body)), "drone-1").grants())
+    assert reported.grants is not None
+    assert [grant["metadata"]["name"] for grant in reported.grants] == ["g1"]
+    assert (reported.generation, reported.reported, reported.reported_generation) == (3, {}, 0), (
+        "everything is reported again"
+    )

@@ -1,4 +1,4 @@
-"""Registration: the object is created once, the owner's edits stay, a changed description is applied."""
+"""Registration of a node: creation of its object, edits of the owner, and changed descriptions."""
 
 import copy
 from pathlib import Path
@@ -214,11 +214,11 @@ def test_invalid_description_is_rejected(text: str, message: str) -> None:
 
 def test_description_hash_ignores_comments_and_layout() -> None:
     first = parse_node_description(yaml.safe_dump(MANIFEST), "drone-1")
-    again = parse_node_description(
+    same_content = parse_node_description(
         "# x\n" + yaml.safe_dump(MANIFEST, sort_keys=False, default_flow_style=True), "drone-1"
     )
     other = parse_node_description(edited(depot="x"), "drone-1")
-    assert description_hash(first) == description_hash(again) != description_hash(other)
+    assert description_hash(first) == description_hash(same_content) != description_hash(other)
 
 
 CAMERA = {"methods": ["CaptureImage"], "horizontalFieldOfView": 62.2, "mount": {"pitch": -60}}

@@ -145,7 +145,7 @@ def test_flight_state_is_unknown_without_telemetry_and_position_is_kept(blind: d
         assert report_intervals("Drone", status) is FLIGHT_INTERVALS
         assert status["conditions"][0]["status"] == "False"
     assert "controller" not in node_status(observed(snapshot=None), status, 1, NOW), (
-        "the control authority is unknown, too"
+        "the control authority is unknown too"
     )
 
 
@@ -232,7 +232,7 @@ async def test_reporter_waits_for_the_first_telemetry_after_start() -> None:
         bench.seconds += 1.0
         bench.observed = observed(snapshot=None)
         await bench.reporter.step()
-    assert not bench.store.writes, "no unknown flight state while an agent is replaced"
+    assert not bench.store.writes, "a new agent writes no unknown flight state"
     await bench.second(telemetry())
     assert bench.store.writes[0]["flightState"] == "flying"
     silent = ReporterBench()

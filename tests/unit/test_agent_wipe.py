@@ -53,7 +53,7 @@ def test_wipe_reports_files_that_cannot_be_removed(
 @pytest.fixture
 def unprivileged(state: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Run without root privileges, as the pod does."""
-    monkeypatch.chdir(tmp_path)  # no other user reaches it from the root
+    monkeypatch.chdir(tmp_path)  # other users cannot access the path from the root
     (state / "tls").chmod(0o700)
     if os.geteuid() != 0:
         yield

@@ -266,14 +266,14 @@ def test_volumes_are_converted_to_pod_volumes():
         {"name": "key", "mountPath": "/key", "secret": "key"},
     ]
     app = application(STORE | {"container": {"image": "x", "volumes": volumes}})
-    found = app.spec.components[0].container.volumes
-    assert [v.pod_volume() for v in found] == [
+    volumes = app.spec.components[0].container.volumes
+    assert [v.pod_volume() for v in volumes] == [
         {"name": "scratch", "emptyDir": {"sizeLimit": "64Mi", "medium": "Memory"}},
         {"name": "models", "persistentVolumeClaim": {"claimName": "models"}},
         {"name": "config", "configMap": {"name": "settings"}},
         {"name": "key", "secret": {"secretName": "key", "defaultMode": 0o440}},
     ]
-    assert [v.mount()["readOnly"] for v in found] == [False, True, True, True]
+    assert [v.mount()["readOnly"] for v in volumes] == [False, True, True, True]
 
 
 def unix(text):

@@ -78,8 +78,8 @@ async def test_audit_log_of_two_writers_has_one_chain(tmp_path: Path) -> None:
     assert not second.failure
     lines = read(path)
     assert not verify(lines).problem
-    found = [(entry["by"], entry["n"]) for entry in map(json.loads, lines)]
-    assert found == [("first", n) for n in range(3)] + [("second", n) for n in range(4)]
+    written = [(entry["by"], entry["n"]) for entry in map(json.loads, lines)]
+    assert written == [("first", n) for n in range(3)] + [("second", n) for n in range(4)]
 
 
 @pytest.mark.parametrize("which", ["change", "remove", "insert", "swap", "reformat", "rehash", "cut head"])
@@ -133,7 +133,7 @@ async def test_audit_log_keeps_entries_until_a_full_disk_has_space(tmp_path: Pat
     folder = tmp_path / "log"
     path = folder / "audit.jsonl"
     log = AuditLog(path, lambda: 0.0)
-    shutil.rmtree(folder)  # any write fails now
+    shutil.rmtree(folder)  # every write fails now
     log.append("call", {"n": 0})
     await until(lambda: log.failure)
     assert "cannot be written" in log.failure
@@ -204,17 +204,17 @@ async def test_audit_log_reports_a_hanging_disk_and_bounds_its_queue(
     monkeypatch.setattr("fractus_runtime.audit.HANG_TIMEOUT_S", 0.02)
     real = os.fsync
     answers = threading.Event()
-    asked = threading.Event()
+    sync_requested = threading.Event()
 
     def fsync(file: int) -> None:
-        asked.set()
+        sync_requested.set()
         answers.wait(10)
         real(file)
 
     monkeypatch.setattr("fractus_runtime.audit.os.fsync", fsync)
     log = AuditLog(tmp_path / "audit.jsonl", lambda: 0.0)
     log.append("call", {"n": 0})
-    await until(asked.is_set)
+    await until(sync_requested.is_set)
     await until(lambda: "no response of the disk" in log.failure)
     for n in range(1, 25):
         log.append("call", {"n": n})

@@ -45,16 +45,16 @@ async def test_audit_chain_continues_through_segments_and_restarts(tmp_path: Pat
     every = [line for file in files if file.exists() for line in read(file)]
     assert [json.loads(line)["seq"] for line in every] == list(range(1, 12))
     assert all(file.stat().st_size < 900 for file in files if file.exists())
-    code, said = verified(tmp_path)
+    code, output = verified(tmp_path)
     assert code == 0
-    assert "11 entries, chain sound" in said
+    assert "11 entries, chain sound" in output
     assert verified(files[0])[1].endswith("earlier and later entries were not verified")
 
 
 async def test_audit_chain_continues_after_a_segment_was_just_closed(tmp_path: Path) -> None:
     path = tmp_path / "audit.jsonl"
     await filled(path, 3, segment_bytes=1)
-    assert path.read_bytes() == b"", "it begins at once, so that it is known when it is missing"
+    assert path.read_bytes() == b"", "the new segment is created at once, so that its loss is detected"
     await filled(path, 1)
     assert [json.loads(line)["seq"] for line in read(path)] == [4]
     assert verified(path)[0] == 0
@@ -74,9 +74,9 @@ def node_files(directory: Path, authority: Authority) -> Path:
 async def checkpoint(path: Path, count: int, tls: Path, **bounds: int) -> Path:
     """Return a copy of the last checkpoint of a log, to which entries are then added."""
     await filled(path, count, tls=tls, **bounds)
-    kept = path.parent.parent / f"kept-{len(list(path.parent.parent.iterdir()))}"
-    kept.write_bytes(path.with_suffix(".checkpoint").read_bytes())
-    return kept
+    checkpoint_file = path.parent.parent / f"kept-{len(list(path.parent.parent.iterdir()))}"
+    checkpoint_file.write_bytes(path.with_suffix(".checkpoint").read_bytes())
+    return checkpoint_file
 
 
 async def test_pruned_segments_are_accepted_only_with_a_checkpoint(tmp_path: Path, tls: Path) -> None:
@@ -84,71 +84,71 @@ async def test_pruned_segments_are_accepted_only_with_a_checkpoint(tmp_path: Pat
     old = await checkpoint(path, 5, tls, segment_bytes=500, keep=2)
     await filled(path, 30, segment_bytes=500, keep=2)
     recent = await checkpoint(path, 1, tls, segment_bytes=500, keep=2)
-    code, said = verified(path)
+    code, output = verified(path)
     assert code == 1
-    assert "to free space, which only an earlier checkpoint can prove; specify it with --since" in said
-    code, said = verified(path, "--since", recent)
-    assert code == 0, said
-    assert "entries were removed to free space" in said
+    assert "to free space, which only an earlier checkpoint can prove; specify it with --since" in output
+    code, output = verified(path, "--since", recent)
+    assert code == 0, output
+    assert "entries were removed to free space" in output
     assert re.search(
-        r"complete since entry \d+ \(checkpoint signed by spiffe://fractus.dev/node/drone-1; its cert", said
+        r"complete since entry \d+ \(checkpoint signed by spiffe://fractus.dev/node/drone-1; its cert", output
     )
     assert "--ca" not in verified(path, "--since", recent, "--ca", tls / "ca.crt")[1]
-    code, said = verified(path, "--since", old)
+    code, output = verified(path, "--since", old)
     assert code == 1
-    assert "entries since the checkpoint, number 5, are missing" in said
+    assert "entries since the checkpoint, number 5, are missing" in output
     segments(path)[0].unlink()
-    code, said = verified(path, "--since", recent)
+    code, output = verified(path, "--since", recent)
     assert code == 1
-    assert "earlier entries were removed, and no entry records the removal" in said
+    assert "earlier entries were removed, and no entry records the removal" in output
 
 
 async def test_checkpoint_detects_a_forged_record_of_pruning(tmp_path: Path, tls: Path) -> None:
     path = tmp_path / "audit" / "audit.jsonl"
-    kept = await checkpoint(path, 12, tls, segment_bytes=500)
+    checkpoint_file = await checkpoint(path, 12, tls, segment_bytes=500)
     await filled(path, 6)
-    gone = segments(path)[:2]
-    end = last_entry(gone[-1])
+    pruned = segments(path)[:2]
+    end = last_entry(pruned[-1])
     assert end is not None
     log = AuditLog(path, lambda: 0.0)
     log.append("pruned", {"first": 1, "last": end.sequence, "last_hash": end.hash})
     await log.close()
-    for segment in gone:
+    for segment in pruned:
         segment.unlink()
     assert verified(path)[0] == 1
-    assert verified(path, "--since", kept)[0] == 0, "what the checkpoint stands for is there"
+    assert verified(path, "--since", checkpoint_file)[0] == 0, "the entries since the checkpoint exist"
     for segment in segments(path):
         segment.unlink()
-    code, said = verified(path.parent, "--since", kept)
-    assert (code, "and those since the checkpoint" in said or "no entry records" in said) == (1, True)
+    code, output = verified(path.parent, "--since", checkpoint_file)
+    assert (code, "and those since the checkpoint" in output or "no entry records" in output) == (1, True)
 
 
 @pytest.mark.parametrize("which", ["end", "rewritten", "emptied", "missing", "log"])
 async def test_checkpoint_detects_changes_that_the_chain_does_not(tmp_path: Path, tls: Path, which: str) -> None:
     path = tmp_path / "audit" / "audit.jsonl"
-    kept = await checkpoint(path, 4, tls)
+    checkpoint_file = await checkpoint(path, 4, tls)
     if which == "end":
         path.write_bytes(b"".join(read(path)[:3]))
-        why = "is the last entry, number 3, but the checkpoint is number 4: entries are missing"
+        message = "is the last entry, number 3, but the checkpoint is number 4: entries are missing"
     elif which == "rewritten":
         path.unlink()
         await filled(path, 3)
         await filled(path, 3)
-        why = "differs from the checkpoint: this entry and all entries before it were rewritten"
+        message = "differs from the checkpoint: this entry and all entries before it were rewritten"
     elif which == "emptied":
         path.write_bytes(b"")
-        why = "is the last entry, number 0"
+        message = "is the last entry, number 0"
     elif which == "missing":
         path.rename(path.with_name("audit.000000000001.jsonl"))
-        why = "audit.jsonl: segment is missing; the log is incomplete without it"
+        message = "audit.jsonl: segment is missing; the log is incomplete without it"
     else:
         path.rename(path.with_name("other.jsonl"))
         path.with_suffix(".checkpoint").unlink()
-        why = "--since: the checkpoint belongs to audit.jsonl; add that log or its directory to PATHS"
+        message = "--since: the checkpoint belongs to audit.jsonl; add that log or its directory to PATHS"
     if which not in {"missing", "log"}:
         assert verified(path.parent)[0] == 0
-    code, said = verified(path.parent, "--since", kept)
-    assert (code, why in said) == (1, True), said
+    code, output = verified(path.parent, "--since", checkpoint_file)
+    assert (code, message in output) == (1, True), output
 
 
 async def test_checkpoint_of_a_node_status_is_accepted(tmp_path: Path, tls: Path) -> None:
@@ -160,14 +160,14 @@ async def test_checkpoint_of_a_node_status_is_accepted(tmp_path: Path, tls: Path
     (path.parent / "odd.checkpoint").write_bytes(b"{")
     (path.parent / "other.checkpoint").write_text(json.dumps({"log": "a b", "seq": 1, "hash": "0" * 64}))
     assert read_audit_heads(path.parent) == [head]
-    code, said = verified(path, "--since", head)
-    assert (code, "complete since entry 4" in said, "signed" in said) == (0, True, False)
+    code, output = verified(path, "--since", head)
+    assert (code, "complete since entry 4" in output, "signed" in output) == (0, True, False)
     path.write_bytes(b"".join(read(path)[:3]))
-    code, said = verified(path, "--since", head)
+    code, output = verified(path, "--since", head)
     assert code == 1
-    assert "entries are missing" in said
-    code, said = verified(path, "--since", "audit:4:nonsense")
-    assert (code, "No such file" in said) == (1, True)
+    assert "entries are missing" in output
+    code, output = verified(path, "--since", "audit:4:nonsense")
+    assert (code, "No such file" in output) == (1, True)
 
 
 async def test_removed_log_is_detected_by_its_checkpoint(tmp_path: Path, tls: Path) -> None:
@@ -175,38 +175,38 @@ async def test_removed_log_is_detected_by_its_checkpoint(tmp_path: Path, tls: Pa
         await filled(tmp_path / "audit" / f"{name}.jsonl", 2, tls=tls)
     assert verified(tmp_path / "audit")[0] == 0
     (tmp_path / "audit" / "camera.jsonl").unlink()
-    code, said = verified(tmp_path / "audit")
+    code, output = verified(tmp_path / "audit")
     assert code == 1
-    assert "camera.jsonl: segment is missing" in said
+    assert "camera.jsonl: segment is missing" in output
 
 
 @pytest.mark.parametrize("which", ["changed", "other", "component", "nonsense", "twice"])
 async def test_invalid_checkpoint_is_rejected(tmp_path: Path, tls: Path, which: str) -> None:
     path = tmp_path / "audit" / "audit.jsonl"
-    kept = await checkpoint(path, 4, tls)
+    checkpoint_file = await checkpoint(path, 4, tls)
     more = list[Path]()
     if which == "changed":
-        kept.write_bytes(kept.read_bytes().replace(b'"seq":4', b'"seq":3'))
-        why = "was changed after it was signed"
+        checkpoint_file.write_bytes(checkpoint_file.read_bytes().replace(b'"seq":4', b'"seq":3'))
+        message = "was changed after it was signed"
     elif which == "other":
-        kept = await checkpoint(path, 1, node_files(tls, Authority.generate(EPOCH)))
+        checkpoint_file = await checkpoint(path, 1, node_files(tls, Authority.generate(EPOCH)))
         (tls / "ca.crt").write_bytes(AUTHORITY.certificate_pem)
-        why = "is signed with a certificate of another authority"
+        message = "is signed with a certificate of another authority"
     elif which == "component":
         issued = AUTHORITY.issue_component("spiffe://fractus.dev/ns/a/app/b/component/c/instance/d", EPOCH)
         for name, content in issued.items():
             (tls / name).write_bytes(base64.b64decode(content))
-        kept = await checkpoint(path, 1, tls)
-        why = "is not signed by a node"
+        checkpoint_file = await checkpoint(path, 1, tls)
+        message = "is not signed by a node"
     elif which == "nonsense":
-        kept.write_bytes(b"[" * 9_000)
-        why = "is not a checkpoint"
+        checkpoint_file.write_bytes(b"[" * 9_000)
+        message = "is not a checkpoint"
     else:
         more = [await checkpoint(path, 1, tls)]
-        why = "second checkpoint of audit.jsonl"
-    options = [word for file in (kept, *more) for word in ("--since", file)]
-    code, said = verified(path, *options, "--ca", tls / "ca.crt")
-    assert (code, why in said) == (1, True), said
+        message = "second checkpoint of audit.jsonl"
+    options = [word for file in (checkpoint_file, *more) for word in ("--since", file)]
+    code, output = verified(path, *options, "--ca", tls / "ca.crt")
+    assert (code, message in output) == (1, True), output
 
 
 async def test_checkpoint_is_not_written_without_a_certificate(
@@ -227,16 +227,16 @@ async def test_checkpoint_covers_the_last_entries_without_further_ones(
 ) -> None:
     monkeypatch.setattr("fractus_runtime.audit.CHECKPOINT_INTERVAL_S", 0.2)
     path = tmp_path / "audit.jsonl"
-    found = path.with_suffix(".checkpoint")
+    checkpoint_path = path.with_suffix(".checkpoint")
     log = AuditLog(path, lambda: 0.0, tls=tls)
     log.append("call", {"n": 0})
-    await until(found.exists)
+    await until(checkpoint_path.exists)
     log.append("call", {"n": 1})
-    await until(lambda: json.loads(found.read_bytes())["seq"] == 2)
-    before = found.read_bytes()
+    await until(lambda: json.loads(checkpoint_path.read_bytes())["seq"] == 2)
+    before = checkpoint_path.read_bytes()
     await asyncio.sleep(0.5)
     await log.close()
-    assert found.read_bytes() == before, "nothing new, nothing signed"
+    assert checkpoint_path.read_bytes() == before, "no checkpoint is signed without a new entry"
 
 
 async def test_checkpoint_retries_until_a_certificate_exists(
@@ -306,30 +306,30 @@ async def test_audit_verification_detects_changed_segments(tmp_path: Path, which
         second.write_bytes(second.read_bytes().replace(b'"kind":"call"', b'"kind":"cool"', 1))
     else:
         second.write_bytes(second.read_bytes()[:-5])
-    code, said = verified(tmp_path)
+    code, output = verified(tmp_path)
     assert code == 1
-    assert f"{second}: line" in said
+    assert f"{second}: line" in output
 
 
 async def test_audit_verify_command_checks_several_logs(tmp_path: Path) -> None:
     for name in ("mobility", "camera"):
         await filled(tmp_path / f"{name}.jsonl", 2)
-    code, said = verified(tmp_path)
-    assert (code, said.count("2 entries, chain sound")) == (0, 2)
-    code, said = verified(tmp_path / "mobility.jsonl", tmp_path / "camera.jsonl")
-    assert (code, said.count("2 entries, chain sound")) == (0, 2)
+    code, output = verified(tmp_path)
+    assert (code, output.count("2 entries, chain sound")) == (0, 2)
+    code, output = verified(tmp_path / "mobility.jsonl", tmp_path / "camera.jsonl")
+    assert (code, output.count("2 entries, chain sound")) == (0, 2)
     assert verified(tmp_path.parent / tmp_path.name)[0] == 0
 
 
 async def test_checkpoint_of_another_log_with_the_same_name_is_rejected(tmp_path: Path, tls: Path) -> None:
-    kept = await checkpoint(tmp_path / "one" / "audit.jsonl", 3, tls)
+    checkpoint_file = await checkpoint(tmp_path / "one" / "audit.jsonl", 3, tls)
     await filled(tmp_path / "two" / "audit.jsonl", 3)
-    code, said = verified(tmp_path / "one", tmp_path / "two", "--since", kept)
+    code, output = verified(tmp_path / "one", tmp_path / "two", "--since", checkpoint_file)
     assert code == 1
-    assert "--since: several logs match the checkpoint of audit.jsonl" in said
-    assert str(tmp_path / "two" / "audit.jsonl") in said
+    assert "--since: several logs match the checkpoint of audit.jsonl" in output
+    assert str(tmp_path / "two" / "audit.jsonl") in output
     assert verified(tmp_path / "one", tmp_path / "two")[0] == 0
-    assert verified(tmp_path / "one", "--since", kept)[0] == 0
+    assert verified(tmp_path / "one", "--since", checkpoint_file)[0] == 0
 
 
 async def test_audit_log_continues_if_a_segment_cannot_be_closed(

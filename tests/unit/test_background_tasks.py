@@ -37,9 +37,9 @@ def test_background_attempt_logs_autopilot_error_and_raises_others(
 
     async def scene() -> None:
         background = Background()
-        await background.attempt(fail, AutopilotError("no answer to command 176"))
+        await background.attempt(fail, AutopilotError("no acknowledgement of command 176"))
         with pytest.raises(ValueError, match="ours"):
             await background.attempt(fail, ValueError("ours"))
 
     asyncio.run(scene())
-    assert "no answer to command 176" in caplog.text
+    assert "no acknowledgement of command 176" in caplog.text

@@ -31,14 +31,14 @@ class Aborted(Exception):
         """Return the first status detail of the given type, or None."""
         for detail in self.details.details:
             if detail.Is(kind.DESCRIPTOR):
-                found = kind()
-                cast("any_pb2.Any", detail).Unpack(found)
-                return found
+                unpacked = kind()
+                cast("any_pb2.Any", detail).Unpack(unpacked)
+                return unpacked
         return None
 
 
 class Context:
-    """A call of one caller."""
+    """Fake call of one caller."""
 
     def __init__(self, remaining_s: float | None = 5.0) -> None:
         self.remaining_s = remaining_s

@@ -26,7 +26,7 @@ LENS = Lens(40.0, 30.0, pitch_deg=-60.0, error_deg=0.0)
 
 
 class Drone:
-    """Telemetry sent by a test, on a clock set by the test."""
+    """Fake subscription to telemetry with a clock and messages set by the test."""
 
     def __init__(self) -> None:
         self.now_s = 100.0
@@ -120,7 +120,7 @@ def test_pose_is_unknown_when_telemetry_is_missing(drone: Drone) -> None:
     assert drone.poses.situation(1.0).lat is None
     assert [now.lat for now in drone.poses_since(100.0)] == [None]
     drone.send(100.0)
-    assert drone.poses_since(99.9)[0].lat is None, "no telemetry at the begin"
+    assert drone.poses_since(99.9)[0].lat is None, "no telemetry at the beginning"
     assert drone.poses_since(100.0)[0].lat is not None
     drone.send(101.1)
     assert drone.poses_since(100.0)[0].lat is None, "no telemetry for more than a second"

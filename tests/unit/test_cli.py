@@ -154,8 +154,8 @@ def test_unknown_autopilot_link_type_is_reported_in_one_line(
 ) -> None:
     for name in ("grants", "tls", "state"):
         (tmp_path / name).mkdir()
-    given = [f"--{name}={tmp_path / name}" for name in ("grants", "tls", "state")]
-    argv = ["mobility", "serve", *given, f"--audit={tmp_path}/audit.jsonl", f"--description={tmp_path}/none.yaml"]
+    directories = [f"--{name}={tmp_path / name}" for name in ("grants", "tls", "state")]
+    argv = ["mobility", "serve", *directories, f"--audit={tmp_path}/audit.jsonl", f"--description={tmp_path}/none.yaml"]
     assert cli.run([*argv, f"--node-object={tmp_path}/none.json", "--autopilot", "bluetooth:x"]) == EXIT_BAD_INPUT
     lines = capsys.readouterr().err.splitlines()
     assert "bluetooth" in lines[-1] and lines[-1].startswith("fractus: ")

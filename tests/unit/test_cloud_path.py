@@ -12,19 +12,19 @@ from fractus_core.api.nodes import Drone
 
 def monitor(*responses_s: float, requests_s: range) -> ReachabilityMonitor:
     """Return a monitor with one request per second, and an immediate response in the given seconds."""
-    found = ReachabilityMonitor()
+    path = ReachabilityMonitor()
     for now_s in requests_s:
-        found.on_request(now_s)
+        path.on_request(now_s)
         if now_s in responses_s:
-            found.on_response(now_s)
-    return found
+            path.on_response(now_s)
+    return path
 
 
 def test_path_without_responses_becomes_unreachable() -> None:
     assert ReachabilityMonitor().is_reachable(0.0), "before the first request"
-    found = monitor(0, requests_s=range(3))
-    assert found.is_reachable(SILENT_S + 0.9)
-    assert not found.is_reachable(SILENT_S + 1.0)
+    path = monitor(0, requests_s=range(3))
+    assert path.is_reachable(SILENT_S + 0.9)
+    assert not path.is_reachable(SILENT_S + 1.0)
 
 
 def test_path_without_requests_stays_reachable() -> None:
@@ -32,21 +32,21 @@ def test_path_without_requests_stays_reachable() -> None:
 
 
 def test_unreachable_path_recovers_after_steady_responses() -> None:
-    found = monitor(0, *range(20, 30), requests_s=range(25))
-    assert not found.is_reachable(24.0)
-    found.on_request(25.0)
-    found.on_response(20.0 + STEADY_S)
-    assert found.is_reachable(25.0)
+    path = monitor(0, *range(20, 30), requests_s=range(25))
+    assert not path.is_reachable(24.0)
+    path.on_request(25.0)
+    path.on_response(20.0 + STEADY_S)
+    assert path.is_reachable(25.0)
 
 
 def test_flapping_path_stays_unreachable() -> None:
-    found = ReachabilityMonitor()
+    path = ReachabilityMonitor()
     reachable = []
     for now_s in range(1, 200):
-        found.on_request(now_s)
+        path.on_request(now_s)
         if now_s % 8 < 2:
-            found.on_response(now_s + 0.1)
-        reachable.append(found.is_reachable(now_s + 0.2))
+            path.on_response(now_s + 0.1)
+        reachable.append(path.is_reachable(now_s + 0.2))
     assert not any(reachable[10:])
 
 

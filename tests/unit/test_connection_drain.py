@@ -46,7 +46,7 @@ async def test_link_is_in_use_until_its_connections_are_drained() -> None:
     ended = asyncio.Event()
     drain = ConnectionDrain(cast(Redirector, redirector), ended.set)
     await drain.begin({LOADER: DIRECT})
-    assert redirector.redirects == {LOADER: DIRECT}, "new connections take the link at once"
+    assert redirector.redirects == {LOADER: DIRECT}, "new connections use the link at once"
     assert not drain.on_link, "the drained connections are on the cloud path"
     await drain.begin({LOADER: None})
     assert drain.on_link
@@ -110,7 +110,7 @@ def test_connections_on_the_cloud_path_survive_removal_of_their_service() -> Non
     redirector = Redirector(cast(NftMaps, kernel), cast(Conntrack, kernel), cast(PodNamespaces, kernel))
     redirector.set_services([LOADER, ASKER])
     redirector.set_targets({ASKER: DIRECT})
-    left = list(kernel.deleted)
+    deleted_before = list(kernel.deleted)
     redirector.set_services([])
-    assert len(kernel.deleted) == len(left) + 1, "only the connections on the link are deleted"
+    assert len(kernel.deleted) == len(deleted_before) + 1, "only the connections on the link are deleted"
     assert redirector.redirects == {}

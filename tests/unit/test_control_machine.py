@@ -70,7 +70,7 @@ EVENTS: tuple[events.Event, ...] = (
 LATE_S = 60.0
 """Time at which every deadline has expired, in seconds."""
 
-FOUND = transition(ControlState(vehicle=GROUND), events.VehicleFound(), 0.0)[0]
+FOUND_ON_GROUND = transition(ControlState(vehicle=GROUND), events.VehicleFound(), 0.0)[0]
 
 
 def normalized(state: ControlState, now: float) -> ControlState:
@@ -99,20 +99,20 @@ def key_of(state: ControlState) -> tuple[Any, ...]:
 def after(state: ControlState, event: events.Event) -> tuple[ControlState, tuple[Action, ...], ControlState]:
     """Apply an event, check the transition, and return the new state, the actions and the normalized state."""
     now = LATE_S if isinstance(event, events.Tick) else 0.0
-    made, actions = transition(state, event, now)
-    check(state, event, made, actions)
-    return made, actions, normalized(made, now)
+    after_state, actions = transition(state, event, now)
+    check(state, event, after_state, actions)
+    return after_state, actions, normalized(after_state, now)
 
 
 # Invariants
 
 
-class Where(tuple[Any, ...]):
+class TransitionText(tuple[Any, ...]):
     """Description of a transition. It is formatted only if an assertion fails."""
 
     __slots__ = ()
 
-    def __new__(cls, *parts: object) -> Where:
+    def __new__(cls, *parts: object) -> TransitionText:
         return super().__new__(cls, parts)
 
     def __str__(self) -> str:
@@ -123,53 +123,65 @@ class Where(tuple[Any, ...]):
 
 def check(before: ControlState, event: events.Event, now: ControlState, actions: tuple[Action, ...]) -> None:
     """Check all invariants of a transition."""
-    where = Where(before, event, now, actions)
+    transition_text = TransitionText(before, event, now, actions)
     if now.granted:
-        assert now.authority is Authority.DRIVER, f"a lease is granted without driver authority{where}"
+        assert now.authority is Authority.DRIVER, f"a lease is granted without driver authority{transition_text}"
     if now.authority is Authority.DRIVER:
-        assert now.lease is not None, f"a driver commands without a lease{where}"
+        assert now.lease is not None, f"a driver commands without a lease{transition_text}"
     if before.authority is Authority.PILOT and now.authority is not Authority.PILOT:
-        assert isinstance(event, events.Heartbeat), f"a pilot was overruled{where}"
+        assert isinstance(event, events.Heartbeat), f"a pilot was overruled{transition_text}"
     if isinstance(event, events.Tick) and now.decided:
-        assert now.attended, f"an armed vehicle is unattended{where}"
+        assert now.attended, f"an armed vehicle is unattended{transition_text}"
     if isinstance(event, events.TakeoverDemanded):
-        assert now.authority is not Authority.DRIVER, f"a takeover left the driver in command{where}"
-    check_tasks(before, event, now, actions, where)
-    check_missions(before, now, actions, where)
-    check_notifications(before, event, now, actions, where)
+        assert now.authority is not Authority.DRIVER, f"a takeover left the driver in command{transition_text}"
+    check_tasks(before, event, now, actions, transition_text)
+    check_missions(before, now, actions, transition_text)
+    check_notifications(before, event, now, actions, transition_text)
 
 
 def check_tasks(
-    before: ControlState, event: events.Event, now: ControlState, actions: tuple[Action, ...], where: Where
+    before: ControlState,
+    event: events.Event,
+    now: ControlState,
+    actions: tuple[Action, ...],
+    transition_text: TransitionText,
 ) -> None:
     started = [action.task for action in actions if isinstance(action, StartSystemTask)]
-    assert len(started) <= 1, f"two tasks fly at once{where}"
+    assert len(started) <= 1, f"two tasks fly at once{transition_text}"
     if started:
-        assert now.task == started[0], f"the started task is not the current task{where}"
-        assert now.authority is Authority.SYSTEM, f"the system flies without authority{where}"
+        assert now.task == started[0], f"the started task is not the current task{transition_text}"
+        assert now.authority is Authority.SYSTEM, f"the system flies without authority{transition_text}"
     elif now.task is not None and now.task != before.task:
-        assert isinstance(event, events.TourBegan), f"a task became current without being started{where}"
+        assert isinstance(event, events.TourBegan), f"a task became current without being started{transition_text}"
     if now.authority is Authority.PILOT:
-        assert now.task is None, f"a system task runs under pilot authority{where}"
+        assert now.task is None, f"a system task runs under pilot authority{transition_text}"
 
 
-def check_missions(before: ControlState, now: ControlState, actions: tuple[Action, ...], where: Where) -> None:
+def check_missions(
+    before: ControlState, now: ControlState, actions: tuple[Action, ...], transition_text: TransitionText
+) -> None:
     if now.lease is not None:
         mission = now.missions.get(now.lease.key)
-        assert mission is None or mission.outcome is None, f"a lease exists for an ended mission{where}"
+        assert mission is None or mission.outcome is None, f"a lease exists for an ended mission{transition_text}"
     for key, mission in before.missions.items():
         if mission.outcome is not None:
-            assert now.missions[key].outcome == mission.outcome, f"an ended mission was continued{where}"
+            assert now.missions[key].outcome == mission.outcome, f"an ended mission was continued{transition_text}"
     ended = {
         k for k, m in now.missions.items() if m.outcome and (k not in before.missions or not before.missions[k].outcome)
     }
-    assert not ended or SaveJournal() in actions, f"a mission end is not saved to the journal{where}"
+    assert not ended or SaveJournal() in actions, f"a mission end is not saved to the journal{transition_text}"
     if now.grace is not None and now.grace != before.grace:
-        assert now.missions[now.grace.key].outcome is None, f"a grace period is running for an ended mission{where}"
+        assert now.missions[now.grace.key].outcome is None, (
+            f"a grace period is running for an ended mission{transition_text}"
+        )
 
 
 def check_notifications(
-    before: ControlState, event: events.Event, now: ControlState, actions: tuple[Action, ...], where: Where
+    before: ControlState,
+    event: events.Event,
+    now: ControlState,
+    actions: tuple[Action, ...],
+    transition_text: TransitionText,
 ) -> None:
     """Check that streams and motions are notified of their end."""
     lease = before.lease
@@ -180,12 +192,14 @@ def check_notifications(
             for action in actions
             if isinstance(action, EndStream | SendEvent) and action.lease_id == lease.lease_id
         )
-        assert notified or event == events.StreamClosed(lease.lease_id), f"a stream was not notified of its end{where}"
+        assert notified or event == events.StreamClosed(lease.lease_id), (
+            f"a stream was not notified of its end{transition_text}"
+        )
     if motion is not None and (now.motion is None or now.motion.motion_id != motion.motion_id):
         stopped = any(isinstance(action, StopMotion) and action.motion_id == motion.motion_id for action in actions)
         over = event in {events.MotionFinished(motion.motion_id), events.MotionFailed(motion.motion_id)}
         replaced = isinstance(event, events.MotionBegan)
-        assert stopped or over or replaced, f"a motion was not stopped{where}"
+        assert stopped or over or replaced, f"a motion was not stopped{transition_text}"
 
 
 # Reachable states
@@ -196,17 +210,19 @@ def reached(depth: int, every: int = 1) -> Iterator[ControlState]:
 
     The last step expands only one of `every` states.
     """
-    flying = replace(FOUND, vehicle=FLYING, armed_seen=True, missions={"a": Mission("a", "A", flown=True)}, active="a")
-    frontier = [FOUND, replace(flying, grants=frozenset({"a"})), ControlState(vehicle=FLYING)]
-    seen = {key_of(state) for state in frontier}
+    flying = replace(
+        FOUND_ON_GROUND, vehicle=FLYING, armed_seen=True, missions={"a": Mission("a", "A", flown=True)}, active="a"
+    )
+    frontier = [FOUND_ON_GROUND, replace(flying, grants=frozenset({"a"})), ControlState(vehicle=FLYING)]
+    visited = {key_of(state) for state in frontier}
     for step in range(depth):
         following = []
         for state in frontier[:: every if step == depth - 1 else 1]:
             for event in EVENTS:
-                _, _, made = after(state, event)
-                if (key := key_of(made)) not in seen:
-                    seen.add(key)
-                    following.append(made)
+                _, _, after_state = after(state, event)
+                if (key := key_of(after_state)) not in visited:
+                    visited.add(key)
+                    following.append(after_state)
         yield from frontier
         frontier = following
     yield from frontier
@@ -223,7 +239,7 @@ def test_control_invariants_hold_in_all_states_within_few_events() -> None:
 
 @given(st.lists(st.tuples(st.sampled_from(EVENTS), st.sampled_from((0.0, 0.1, 1.0, LATE_S))), max_size=60))
 def test_control_invariants_hold_in_long_histories(history: list[tuple[events.Event, float]]) -> None:
-    state = FOUND
+    state = FOUND_ON_GROUND
     now = 0.0
     for event, passed_s in history:
         now += passed_s
@@ -237,7 +253,7 @@ def test_control_invariants_hold_in_long_histories(history: list[tuple[events.Ev
 
 @given(st.lists(st.sampled_from(EVENTS), max_size=40))
 def test_flying_vehicle_returns_home_without_further_events(history: list[events.Event]) -> None:
-    state = FOUND
+    state = FOUND_ON_GROUND
     now = 0.0
     for event in history:
         state, _ = transition(state, event, now)

@@ -26,10 +26,12 @@ from fractus_core.control.state import (
     ended_refusal,
 )
 from fractus_core.control.vehicle_events import UNCONFIRMED_S
-from test_control_machine import ARMED, DRIVER, FLYING, FOUND, GROUND, GUIDED, LAND, LATE_S, LOITER, RTL
+from test_control_machine import ARMED, DRIVER, FLYING, FOUND_ON_GROUND, GROUND, GUIDED, LAND, LATE_S, LOITER, RTL
 
 
-def apply_events(*history: events.Event, state: ControlState = FOUND) -> tuple[ControlState, tuple[Action, ...]]:
+def apply_events(
+    *history: events.Event, state: ControlState = FOUND_ON_GROUND
+) -> tuple[ControlState, tuple[Action, ...]]:
     """Apply events at time 0. Return the state and the actions of the last event."""
     actions: tuple[Action, ...] = ()
     for event in history:
@@ -147,14 +149,14 @@ def test_grace_is_unchanged_by_waiting_driver_of_other_mission() -> None:
     landed = (events.VehicleObserved(GROUND), events.Heartbeat(), events.StreamClosed(1))
     waiting, _ = apply_events(*FLY, *landed, *waits)
     assert (waiting.lease is not None, waiting.deadline) == (True, 5.0)
-    gone, _ = transition(waiting, events.GrantChanged(other, None), 1.0)
-    assert (gone.lease, gone.deadline) == (None, 5.0)
+    after_removal, _ = transition(waiting, events.GrantChanged(other, None), 1.0)
+    assert (after_removal.lease, after_removal.deadline) == (None, 5.0)
 
 
 def test_grace_is_paused_during_transit_and_ends_when_control_is_granted() -> None:
     state, _ = apply_events(*FLY, events.StreamClosed(1))
-    asks = (events.StreamOpened(2, "a", "A"), events.TransitRequested(2), events.TransitBegan(9, "a", "A"))
-    flying, _ = apply_events(*asks, state=state)
+    transit_events = (events.StreamOpened(2, "a", "A"), events.TransitRequested(2), events.TransitBegan(9, "a", "A"))
+    flying, _ = apply_events(*transit_events, state=state)
     assert flying.deadline is None
     later, _ = transition(flying, events.Tick(), 50.0)
     assert later.missions["a"].outcome is None
@@ -212,8 +214,8 @@ def test_cancelled_motion_hovers_if_driver_is_still_connected() -> None:
     state, _ = apply_events(*FLY, events.MotionBegan(7, "Land"), events.MotionCancelled(7))
     assert state.motion == ActiveMotion(7, "Land", hover_at=0.3)
     assert not transition(state, events.Tick(), 0.2)[1]
-    gone, _ = transition(state, events.StreamClosed(1), 0.2)
-    assert gone.motion is None
+    after_removal, _ = transition(state, events.StreamClosed(1), 0.2)
+    assert after_removal.motion is None
     _, actions = transition(state, events.Tick(), 0.3)
     assert [type(action).__name__ for action in actions] == ["StopMotion", "HoldPosition"]
 
@@ -227,13 +229,13 @@ def test_vehicle_handed_back_by_pilot_hovers_during_driver_grace() -> None:
 
 
 def test_unrequested_mode_change_gives_authority_to_pilot() -> None:
-    asked = events.VehicleObserved(replace(FLYING, mode=RTL))
+    mode_observed = events.VehicleObserved(replace(FLYING, mode=RTL))
     system_state, _ = apply_events(
-        *FLY, events.ModeChangeBegan(RTL), asked, events.Heartbeat(), events.ModeChangeEnded(RTL, GUIDED, True)
+        *FLY, events.ModeChangeBegan(RTL), mode_observed, events.Heartbeat(), events.ModeChangeEnded(RTL, GUIDED, True)
     )
     assert system_state.authority is Authority.DRIVER
     assert apply_events(events.Heartbeat(), state=system_state)[0].authority is Authority.DRIVER
-    foreign, _ = apply_events(*FLY, asked, events.Heartbeat())
+    foreign, _ = apply_events(*FLY, mode_observed, events.Heartbeat())
     assert foreign.authority is Authority.PILOT
     failsafe, _ = apply_events(
         *FLY, events.VehicleObserved(replace(FLYING, mode=RTL, failsafe=True)), events.Heartbeat()
@@ -268,8 +270,8 @@ def test_vehicle_found_in_brake_mode_returns_home_if_failsafe_is_active() -> Non
 
 
 def test_requested_arming_belongs_to_driver_if_seen_late() -> None:
-    late = (*ARM[:2], ARM[3], events.Heartbeat())
-    state, _ = apply_events(*REQUEST_CONTROL, *late)
+    late_arming = (*ARM[:2], ARM[3], events.Heartbeat())
+    state, _ = apply_events(*REQUEST_CONTROL, *late_arming)
     assert (state.authority, state.armed_by_others) == (Authority.DRIVER, False)
     others, _ = apply_events(*REQUEST_CONTROL, events.VehicleObserved(ARMED), events.Heartbeat())
     assert (others.authority, others.armed_by_others) == (Authority.PILOT, True)
@@ -299,45 +301,45 @@ def test_unconfirmed_arming_belongs_to_driver_for_limited_time(
 def test_unconfirmed_mode_change_belongs_to_system_for_limited_time() -> None:
     flies = replace(FLYING, mode=RTL)
     system_state, _ = apply_events(*FLY, events.VehicleObserved(replace(flies, failsafe=True)), events.Heartbeat())
-    given_up, _ = apply_events(
+    abandoned, _ = apply_events(
         events.ModeChangeBegan(GUIDED), events.ModeChangeEnded(GUIDED, RTL, done=False), state=system_state
     )
     shown = (events.VehicleObserved(FLYING), events.Heartbeat())
-    obeyed, _ = apply_events(*shown, state=given_up)
+    obeyed, _ = apply_events(*shown, state=abandoned)
     assert (obeyed.authority, obeyed.task, obeyed.returning) == (Authority.SYSTEM, system_state.task, True)
-    other, _ = apply_events(events.VehicleObserved(replace(FLYING, mode=LOITER)), events.Heartbeat(), state=given_up)
+    other, _ = apply_events(events.VehicleObserved(replace(FLYING, mode=LOITER)), events.Heartbeat(), state=abandoned)
     assert other.authority is Authority.PILOT
-    observed, _ = apply_events(shown[0], state=given_up)
+    observed, _ = apply_events(shown[0], state=abandoned)
     assert transition(observed, shown[1], LATE_S)[0].authority is Authority.PILOT, (
         "too late to be a change of the system"
     )
 
 
 def test_late_mode_change_belongs_to_system_while_next_one_is_pending() -> None:
-    given_up = (events.ModeChangeBegan(LAND), events.ModeChangeEnded(LAND, GUIDED, done=False))
+    abandoned = (events.ModeChangeBegan(LAND), events.ModeChangeEnded(LAND, GUIDED, done=False))
     shows = {
         mode: (events.VehicleObserved(replace(FLYING, mode=mode)), events.Heartbeat())
         for mode in (LAND, GUIDED, LOITER)
     }
-    next_one = (events.ModeChangeBegan(GUIDED), *shows[LAND])
+    next_change = (events.ModeChangeBegan(GUIDED), *shows[LAND])
     done = (*shows[GUIDED], events.ModeChangeEnded(GUIDED, LAND, done=True), events.Heartbeat())
-    system_state, _ = apply_events(*FLY, *given_up, *next_one, *done)
+    system_state, _ = apply_events(*FLY, *abandoned, *next_change, *done)
     assert system_state.authority is Authority.DRIVER
-    pilots, _ = apply_events(*FLY, *given_up, *next_one, *shows[LOITER])
+    pilots, _ = apply_events(*FLY, *abandoned, *next_change, *shows[LOITER])
     assert pilots.authority is Authority.PILOT
-    state, _ = apply_events(*FLY, *given_up)
-    for event in next_one:
+    state, _ = apply_events(*FLY, *abandoned)
+    for event in next_change:
         state, _ = transition(state, event, UNCONFIRMED_S + 0.1)
     assert state.authority is Authority.PILOT, "too late to be a change of the system"
 
 
 def test_late_mode_change_requested_before_failsafe_belongs_to_system() -> None:
     returns = (events.VehicleObserved(replace(FLYING, mode=RTL, failsafe=True)), events.Heartbeat())
-    asked = (events.ModeChangeBegan(LAND), *returns, events.ModeChangeEnded(LAND, GUIDED, done=False))
+    mode_requests = (events.ModeChangeBegan(LAND), *returns, events.ModeChangeEnded(LAND, GUIDED, done=False))
     lands = (events.VehicleObserved(replace(FLYING, mode=LAND, failsafe=True)), events.Heartbeat())
-    system_state, _ = apply_events(*FLY, *asked, *lands)
+    system_state, _ = apply_events(*FLY, *mode_requests, *lands)
     assert system_state.authority is Authority.SYSTEM
-    refused = (*asked[:-1], events.ModeChangeEnded(LAND, GUIDED, done=False, refused=True))
+    refused = (*mode_requests[:-1], events.ModeChangeEnded(LAND, GUIDED, done=False, refused=True))
     assert apply_events(*FLY, *refused, *lands)[0].authority is Authority.PILOT
 
 
@@ -354,12 +356,16 @@ def test_refused_mode_change_does_not_belong_to_system() -> None:
 
 
 def test_late_return_mode_is_supervised_by_system_without_driver() -> None:
-    given_up = (events.ModeChangeBegan(RTL), events.ModeChangeEnded(RTL, GUIDED, done=False))
+    abandoned = (events.ModeChangeBegan(RTL), events.ModeChangeEnded(RTL, GUIDED, done=False))
     shown = (events.VehicleObserved(replace(FLYING, mode=RTL)), events.Heartbeat())
-    alone, _ = apply_events(*FLY, *given_up, events.StreamClosed(1), *shown)
-    assert (alone.task, alone.returning, alone.deadline) == (SystemTask(2, TaskKind.RETURN), True, 5.0)
-    driven, _ = apply_events(*FLY, *given_up, *shown)
-    assert (driven.authority, driven.task) == (Authority.DRIVER, None)
+    without_driver, _ = apply_events(*FLY, *abandoned, events.StreamClosed(1), *shown)
+    assert (without_driver.task, without_driver.returning, without_driver.deadline) == (
+        SystemTask(2, TaskKind.RETURN),
+        True,
+        5.0,
+    )
+    with_driver, _ = apply_events(*FLY, *abandoned, *shown)
+    assert (with_driver.authority, with_driver.task) == (Authority.DRIVER, None)
 
 
 @pytest.mark.parametrize("mode", [GUIDED, RTL])
@@ -370,15 +376,15 @@ def test_driver_lost_during_return_can_resume_control(mode: FlightMode) -> None:
         events.Heartbeat(),
         events.ModeChangeEnded(mode, GUIDED, True),
     )
-    lost, _ = apply_events(*FLY, *homeward, *turns, events.StreamClosed(1))
-    assert (lost.task, lost.returning, lost.deadline) == (SystemTask(1, TaskKind.RETURN), True, 5.0)
-    back, _ = apply_events(events.StreamOpened(2, "a", "A"), events.GrantControl(2), state=lost)
-    assert (back.drives, back.returning, back.task, back.grace) == (True, False, None, None)
-    late, actions = transition(lost, events.Tick(), 5.0)
-    assert late.missions["a"].outcome == Outcome(OutcomeKind.FAILED, "driver lost")
+    after_loss, _ = apply_events(*FLY, *homeward, *turns, events.StreamClosed(1))
+    assert (after_loss.task, after_loss.returning, after_loss.deadline) == (SystemTask(1, TaskKind.RETURN), True, 5.0)
+    resumed, _ = apply_events(events.StreamOpened(2, "a", "A"), events.GrantControl(2), state=after_loss)
+    assert (resumed.drives, resumed.returning, resumed.task, resumed.grace) == (True, False, None, None)
+    expired, actions = transition(after_loss, events.Tick(), 5.0)
+    assert expired.missions["a"].outcome == Outcome(OutcomeKind.FAILED, "driver lost")
     assert not any(isinstance(action, StartSystemTask) for action in actions), "the return is already running"
-    assert apply_events(events.StreamOpened(2, "a", "A"), state=late)[1][0] == RefuseStream(
-        2, *ended_refusal(late.outcomes["a"])
+    assert apply_events(events.StreamOpened(2, "a", "A"), state=expired)[1][0] == RefuseStream(
+        2, *ended_refusal(expired.outcomes["a"])
     )
 
 

@@ -1,4 +1,4 @@
-"""Greedy coverage against plain greedy on sets, and samples against exact areas."""
+"""Lazy greedy coverage compared with the plain greedy algorithm, and samples compared with exact areas."""
 
 import numpy as np
 import pytest
@@ -48,20 +48,20 @@ def test_coverage_samples_of_long_narrow_path_measure_area():
 
 
 def plain_greedy(points, discs, share, unfit):
-    """Return the picks of the textbook algorithm: every candidate in every round, the first among equals."""
+    """Return the choices of the textbook algorithm, which tries every candidate in every round. Ties go to the first."""
     reached = {
         name: {i for i, p in enumerate(points) if (p[0] - x) ** 2 + (p[1] - y) ** 2 <= r * r}
         for name, (x, y, r) in discs.items()
     }
     covered = set()
     picks = []
-    left = list(discs)
-    while left and len(covered) < share * len(points):
-        gains = [len(reached[name] - covered) for name in left]
+    remaining = list(discs)
+    while remaining and len(covered) < share * len(points):
+        gains = [len(reached[name] - covered) for name in remaining]
         best = max(gains)
         if best == 0:
             break
-        name = left.pop(gains.index(best))
+        name = remaining.pop(gains.index(best))
         if name in unfit:
             continue
         covered |= reached[name]
@@ -76,15 +76,15 @@ discs = st.lists(
 
 @given(paths, discs, st.sets(st.integers(0, 13), max_size=4), st.sampled_from([0.3, 0.95, 1.0]))
 @settings(max_examples=examples(80), deadline=None)
-def test_lazy_greedy_coverage_equals_plain_greedy(path, found, unfit, share):
+def test_lazy_greedy_coverage_equals_plain_greedy(path, candidates, unfit, share):
     samples = Samples(corridor(path, width=25))
-    named = {f"n{i:02d}": disc for i, disc in enumerate(found)}
+    named = {f"n{i:02d}": disc for i, disc in enumerate(candidates)}
     refused = {f"n{i:02d}" for i in unfit}
-    xy = np.array([d[:2] for d in found], dtype=float).reshape(-1, 2)
-    scene = CoverScene(samples, list(named), xy, np.array([d[2] for d in found], dtype=float), share)
+    xy = np.array([d[:2] for d in candidates], dtype=float).reshape(-1, 2)
+    scene = CoverScene(samples, list(named), xy, np.array([d[2] for d in candidates], dtype=float), share)
     picks = greedy_cover(scene, lambda name: name not in refused)
-    wanted = plain_greedy(samples.xy().tolist(), named, share, refused)
-    assert [(p.name, round(p.share * len(samples))) for p in picks] == wanted
+    expected = plain_greedy(samples.xy().tolist(), named, share, refused)
+    assert [(p.name, round(p.share * len(samples))) for p in picks] == expected
 
 
 def test_lazy_greedy_coverage_equals_plain_greedy_for_more_than_one_batch():
@@ -93,16 +93,16 @@ def test_lazy_greedy_coverage_equals_plain_greedy_for_more_than_one_batch():
     xy = np.column_stack((rng.uniform(-50, 650, 700), rng.uniform(-80, 120, 700)))
     names = [f"n{i:03d}" for i in range(len(xy))]
     scene = CoverScene(samples, names, xy, np.full(len(xy), 60.0), 0.95)
-    found = [(p.name, round(p.share * len(samples))) for p in greedy_cover(scene, lambda _: True)]
+    chosen = [(p.name, round(p.share * len(samples))) for p in greedy_cover(scene, lambda _: True)]
     reached = np.hypot(*(samples.xy()[None] - xy[:, None]).transpose(2, 0, 1)) <= 60.0
     covered = np.zeros(len(samples), dtype=bool)
-    wanted = []
+    expected = []
     while covered.sum() < 0.95 * len(samples):
         gains = (reached & ~covered).sum(axis=1)
         best = int(np.argmax(gains))
-        wanted.append((names[best], int(gains[best])))
+        expected.append((names[best], int(gains[best])))
         covered |= reached[best]
-    assert found == wanted
+    assert chosen == expected
 
 
 def test_greedy_coverage_keeps_nodes_and_counts_covered_samples():

@@ -73,14 +73,14 @@ class Cluster:
         return self.objects.get(path)
 
     def list(self, path: str, **selectors: str) -> Sequence[Body]:
-        found = self.lists.get(path, [])
-        wanted = selectors.get("fieldSelector", "")
-        if wanted == "spec.hostNetwork=true":
-            return [body for body in found if body["spec"].get("hostNetwork")]
+        bodies = self.lists.get(path, [])
+        selector = selectors.get("fieldSelector", "")
+        if selector == "spec.hostNetwork=true":
+            return [body for body in bodies if body["spec"].get("hostNetwork")]
         if "labelSelector" in selectors:
-            return [b for b in found if b["metadata"]["labels"].get("fractus.dev/class") in {"drone", "edge"}]
-        name = wanted.partition("involvedObject.name=")[2]
-        return [body for body in found if not name or body["involvedObject"]["name"] == name]
+            return [b for b in bodies if b["metadata"]["labels"].get("fractus.dev/class") in {"drone", "edge"}]
+        name = selector.partition("involvedObject.name=")[2]
+        return [body for body in bodies if not name or body["involvedObject"]["name"] == name]
 
 
 def findings(cluster: Any) -> list[Finding]:
@@ -98,8 +98,8 @@ def pod(name: str, namespace: str, **spec: Any) -> Body:
 def unscheduled(cluster: Cluster) -> None:
     waiting = pod("fractus-operator-1", "fractus-system")
     waiting["metadata"]["labels"] = {"app.kubernetes.io/component": "operator"}
-    why = "0/2 nodes are available: 1 node(s) had untolerated taint {node-role.kubernetes.io/control-plane: }"
-    waiting["status"] = {"conditions": [{"type": "PodScheduled", "status": "False", "message": why}]}
+    message = "0/2 nodes are available: 1 node(s) had untolerated taint {node-role.kubernetes.io/control-plane: }"
+    waiting["status"] = {"conditions": [{"type": "PodScheduled", "status": "False", "message": message}]}
     cluster.lists[PODS] = [waiting]
 
 
@@ -108,13 +108,13 @@ def refused_service(cluster: Cluster) -> None:
     event = {"involvedObject": {"name": "fractus-agent"}, "lastTimestamp": "2026-06-01T00:00:00Z"}
     old = {"involvedObject": {"name": "fractus-agent"}, "lastTimestamp": None, "message": "long gone"}
     other = {"involvedObject": {"name": "other"}, "lastTimestamp": "2026-06-01T01:00:00Z", "message": "of another"}
-    why = 'pods "fractus-agent-" is forbidden: violates PodSecurity "restricted:latest": host namespaces'
-    cluster.lists[EVENTS] = [old, event | {"message": why}, other]
+    message = 'pods "fractus-agent-" is forbidden: violates PodSecurity "restricted:latest": host namespaces'
+    cluster.lists[EVENTS] = [old, event | {"message": message}, other]
 
 
 def refused_operator(cluster: Cluster) -> None:
-    why = "exceeded quota: compute"
-    failed = {"type": "ReplicaFailure", "status": "True", "reason": "FailedCreate", "message": why}
+    message = "exceeded quota: compute"
+    failed = {"type": "ReplicaFailure", "status": "True", "reason": "FailedCreate", "message": message}
     cluster.objects[OPERATOR]["status"] = {"conditions": [failed]}
 
 
@@ -197,7 +197,7 @@ def test_doctor_finds_problem_and_prints_remedy(
 ) -> None:
     cluster = Cluster()
     break_cluster(cluster)
-    found = [finding for finding in findings(cluster) if finding.level != "ok"]
-    assert [(f.level, f.check) for f in found] == [(level, check)]
-    assert message in found[0].message
-    assert remedy in found[0].remedy
+    problems = [finding for finding in findings(cluster) if finding.level != "ok"]
+    assert [(f.level, f.check) for f in problems] == [(level, check)]
+    assert message in problems[0].message
+    assert remedy in problems[0].remedy

@@ -28,13 +28,13 @@ def parsed(text, **how):
     ],
 )  # fmt: skip
 def test_yaml_scalars_are_parsed_as_by_kubectl(text, value):
-    ((found,),) = (tuple(one.values()) for one in parsed(f"a: {text}"))
-    assert (found, type(found)) == (value, type(value))
+    ((parsed_value,),) = (tuple(mapping.values()) for mapping in parsed(f"a: {text}"))
+    assert (parsed_value, type(parsed_value)) == (value, type(value))
 
 
 def test_yaml_aliases_and_merges_are_expanded():
-    (found,) = parsed("a: &a {p: 1, q: 2}\nb:\n  <<: *a\n  r: 3\nc: [*a, &n 5, *n]")
-    assert found == {"a": {"p": 1, "q": 2}, "b": {"p": 1, "q": 2, "r": 3}, "c": [{"p": 1, "q": 2}, 5, 5]}
+    (parsed_value,) = parsed("a: &a {p: 1, q: 2}\nb:\n  <<: *a\n  r: 3\nc: [*a, &n 5, *n]")
+    assert parsed_value == {"a": {"p": 1, "q": 2}, "b": {"p": 1, "q": 2, "r": 3}, "c": [{"p": 1, "q": 2}, 5, 5]}
 
 
 def test_json_is_parsed_as_by_json_module():
@@ -48,8 +48,8 @@ def test_json_is_parsed_as_by_json_module():
 def test_json_accepts_characters_that_yaml_forbids(number):
     text = f'{{"a{chr(number)}": "b{chr(number)} c", "d": ["{chr(number)}\\u00e9"]}}'
     assert parsed(text, is_json=True) == (json.loads(text),)
-    (found,) = parse_documents(f'{{"a": "{chr(number)}",\n"b": {{}}}}'.encode(), "f", is_json=True).values
-    assert found == {"a": chr(number), "b": {}}
+    (parsed_value,) = parse_documents(f'{{"a": "{chr(number)}",\n"b": {{}}}}'.encode(), "f", is_json=True).values
+    assert parsed_value == {"a": chr(number), "b": {}}
 
 
 @pytest.mark.parametrize(
@@ -114,20 +114,20 @@ def test_document_limits_are_enforced(monkeypatch):
 
 def test_document_returns_line_of_field():
     text = "---\nkind: A\nspec:\n  list:\n    - {p: 1}\n    -\n      p: 2\n      q: [3]\n---\nkind: B\n"
-    found = parse_documents(text.encode(), "f")
-    first, second = found.values
+    parsed_value = parse_documents(text.encode(), "f")
+    first, second = parsed_value.values
     paths = {"": 2, "spec": 3, "spec.list[0].p": 5, "spec.list[1].q[0]": 8, "spec.list[7].q": 4, "spec.lost": 3}
-    assert {path: found.line(first, path) for path in paths} == paths
-    assert found.where(second, "kind") == "f:10"
-    assert found.where({}) == "f"
+    assert {path: parsed_value.line(first, path) for path in paths} == paths
+    assert parsed_value.where(second, "kind") == "f:10"
+    assert parsed_value.where({}) == "f"
 
 
 def test_large_zone_is_parsed_within_four_seconds():
     text = "ring:\n" + "".join(f"  - {{lat: {50 + i / 1e6}, lon: {4 + i / 1e6}}}\n" for i in range(50_000))
     begun = time.process_time()
-    (found,) = parsed(text)
+    (parsed_value,) = parsed(text)
     assert time.process_time() - begun < 4
-    assert len(found["ring"]) == 50_000
+    assert len(parsed_value["ring"]) == 50_000
 
 
 def test_dumped_documents_are_parsed_unchanged():

@@ -1,4 +1,4 @@
-"""Events of a drone: each transition has one Event, also after restarts and repeated reports, and a flapping drone has few."""
+"""Events of a drone: one Event for each transition, also after restarts and repeated reports, and few Events of a flapping drone."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ DRIVER = "spiffe://fractus.dev/ns/city/app/traffic/component/Navigator/instance/
 APPLICATION = "city/traffic"
 
 
-def drone(state: str, controller: str | None = "system", *, at_s: int, why: str = "", uid: str = "u1") -> Drone:
+def drone(state: str, controller: str | None = "system", *, at_s: int, reason: str = "", uid: str = "u1") -> Drone:
     taken = {
-        "type": "ControlTaken", "status": "True", "reason": "SystemInControl", "message": why,
+        "type": "ControlTaken", "status": "True", "reason": "SystemInControl", "message": reason,
         "lastTransitionTime": "2026-06-01T12:00:00Z",
     }  # fmt: skip
     status = {"flightState": state, "controller": controller, "lastSeen": (NOW + timedelta(seconds=at_s)).isoformat()}
-    status |= {"conditions": [taken] if why else [], "lastFlightState": "flying" if state == "unknown" else state}
+    status |= {"conditions": [taken] if reason else [], "lastFlightState": "flying" if state == "unknown" else state}
     metadata = {"name": "drone-1", "uid": uid}
     return Drone.from_body(
         {"apiVersion": API_VERSION, "kind": "Drone", "metadata": metadata, "spec": {}, "status": status}
@@ -60,14 +60,14 @@ class Cluster:
         self.failing -= 1
         if self.failing == 0:
             raise KubeError(503, "ServiceUnavailable", "not now")
-        self.posted.setdefault(name, (reason, message))  # A second one of that name is dropped.
+        self.posted.setdefault(name, (reason, message))  # The API server refuses a second Event of that name.
         if reason == "Landed":
             self.landed.set()
 
-    async def see(self, *seen: Drone | None) -> list[str]:
+    async def observe(self, *reports: Drone | None) -> list[str]:
         """Return the reasons of the Events after these reports."""
         before = len(self.posted)
-        for each in seen:
+        for each in reports:
             if each is None:
                 self.drones.pop("drone-1")
             else:
@@ -91,17 +91,19 @@ def ended(message: str) -> Any:
 
 
 async def test_events_of_a_complete_flight(cluster: Cluster) -> None:
-    assert await cluster.see(drone("inactive", at_s=0), drone("inactive", DRIVER, at_s=1)) == []
-    assert await cluster.see(drone("takingOff", DRIVER, at_s=2)) == ["TookOff", "MissionBegun"]
-    assert await cluster.see(drone("flying", DRIVER, at_s=6), drone("flying", DRIVER, at_s=11)) == []
-    taken = drone("flying", "system", at_s=12, why="policy campus forbids it")
-    assert await cluster.see(taken) == ["SystemTookControl"]
-    assert await cluster.see(drone("flying", DRIVER, at_s=20)) == ["ControlGranted"]
-    assert await cluster.see(drone("flying", "pilot", at_s=25)) == ["PilotTookControl"]
+    assert await cluster.observe(drone("inactive", at_s=0), drone("inactive", DRIVER, at_s=1)) == []
+    assert await cluster.observe(drone("takingOff", DRIVER, at_s=2)) == ["TookOff", "MissionBegun"]
+    assert await cluster.observe(drone("flying", DRIVER, at_s=6), drone("flying", DRIVER, at_s=11)) == []
+    taken = drone("flying", "system", at_s=12, reason="policy campus forbids it")
+    assert await cluster.observe(taken) == ["SystemTookControl"]
+    assert await cluster.observe(drone("flying", DRIVER, at_s=20)) == ["ControlGranted"]
+    assert await cluster.observe(drone("flying", "pilot", at_s=25)) == ["PilotTookControl"]
     cluster.holders = []
     cluster.applications["city", "traffic"] = ended("all control points were returned")
-    assert await cluster.see(drone("landing", "pilot", at_s=28)) == ["MissionOver"]
-    assert await cluster.see(drone("inactive", "system", at_s=30), drone("charging", "system", at_s=60)) == ["Landed"]
+    assert await cluster.observe(drone("landing", "pilot", at_s=28)) == ["MissionOver"]
+    assert await cluster.observe(drone("inactive", "system", at_s=30), drone("charging", "system", at_s=60)) == [
+        "Landed"
+    ]
     assert cluster.sentences() == [
         "drone-1 took off, flown by Navigator",
         "city/traffic flies drone-1",
@@ -114,84 +116,87 @@ async def test_events_of_a_complete_flight(cluster: Cluster) -> None:
 
 
 async def test_drone_on_the_ground_has_no_events(cluster: Cluster) -> None:
-    """Planning, and what follows from it, takes no further request."""
+    """The phases before the takeoff cause no Event."""
     cluster.holders = []
-    await cluster.see(drone("inactive", at_s=0))
+    await cluster.observe(drone("inactive", at_s=0))
     cluster.holders = [APPLICATION]
-    await cluster.see(drone("inactive", DRIVER, at_s=5))
+    await cluster.observe(drone("inactive", DRIVER, at_s=5))
     cluster.holders = []
-    assert await cluster.see(drone("inactive", "system", at_s=9)) == []
+    assert await cluster.observe(drone("inactive", "system", at_s=9)) == []
     assert not cluster.posted
 
 
 async def test_restarted_operator_posts_only_new_events(cluster: Cluster) -> None:
-    await cluster.see(drone("inactive", at_s=0), drone("flying", DRIVER, at_s=5))
+    await cluster.observe(drone("inactive", at_s=0), drone("flying", DRIVER, at_s=5))
     before = dict(cluster.posted)
     cluster.start()
-    assert await cluster.see(drone("flying", DRIVER, at_s=5), drone("flying", DRIVER, at_s=10)) == []
+    assert await cluster.observe(drone("flying", DRIVER, at_s=5), drone("flying", DRIVER, at_s=10)) == []
     assert cluster.posted == before
     cluster.holders = []
-    assert await cluster.see(drone("landing", DRIVER, at_s=15)) == ["MissionOver"], "it flew when the operator started"
+    assert await cluster.observe(drone("landing", DRIVER, at_s=15)) == ["MissionOver"], (
+        "the drone was in flight when the operator started"
+    )
     assert cluster.sentences()[-1].endswith("no longer flies drone-1: it was deleted")
     cluster.start()
-    assert await cluster.see(drone("inactive", at_s=16)) == []
+    assert await cluster.observe(drone("inactive", at_s=16)) == []
 
 
 @pytest.mark.parametrize("late_s", [1, 30, 60])
 async def test_repeated_and_late_reports_have_no_events(cluster: Cluster, late_s: int) -> None:
     landed = drone("inactive", at_s=100)
-    await cluster.see(drone("inactive", at_s=0), drone("flying", at_s=50), landed)
+    await cluster.observe(drone("inactive", at_s=0), drone("flying", at_s=50), landed)
     before = dict(cluster.posted)
     assert (
-        await cluster.see(landed, drone("flying", DRIVER, at_s=100 - late_s), landed, drone("inactive", at_s=105)) == []
+        await cluster.observe(landed, drone("flying", DRIVER, at_s=100 - late_s), landed, drone("inactive", at_s=105))
+        == []
     )
     assert cluster.posted == before
 
 
 async def test_events_continue_after_clock_is_set_back(cluster: Cluster) -> None:
-    await cluster.see(drone("inactive", at_s=86_400))
-    assert await cluster.see(drone("flying", at_s=0)) == ["TookOff", "MissionBegun"]
+    await cluster.observe(drone("inactive", at_s=86_400))
+    assert await cluster.observe(drone("flying", at_s=0)) == ["TookOff", "MissionBegun"]
 
 
 async def test_stale_drone_has_no_events(cluster: Cluster) -> None:
-    await cluster.see(drone("inactive", at_s=0), drone("flying", DRIVER, at_s=5))
+    await cluster.observe(drone("inactive", at_s=0), drone("flying", DRIVER, at_s=5))
     silent = drone("unknown", None, at_s=5)
-    assert await cluster.see(silent, drone("flying", DRIVER, at_s=500)) == []
-    assert await cluster.see(silent, drone("inactive", at_s=900)) == ["Landed"]
+    assert await cluster.observe(silent, drone("flying", DRIVER, at_s=500)) == []
+    assert await cluster.observe(silent, drone("inactive", at_s=900)) == ["Landed"]
     assert cluster.sentences()[-1] == "drone-1 landed, between 12:08:20 and 12:15:00 UTC"
 
 
 async def test_recreated_drone_starts_new_events(cluster: Cluster) -> None:
-    await cluster.see(drone("inactive", at_s=0))
-    assert await cluster.see(drone("flying", at_s=5, uid="u2")) == []
-    assert await cluster.see(None, drone("inactive", at_s=9, uid="u2")) == []
+    await cluster.observe(drone("inactive", at_s=0))
+    assert await cluster.observe(drone("flying", at_s=5, uid="u2")) == []
+    assert await cluster.observe(None, drone("inactive", at_s=9, uid="u2")) == []
 
 
 async def test_failed_event_is_retried_and_others_are_not_repeated(cluster: Cluster) -> None:
-    await cluster.see(drone("inactive", at_s=0))
+    await cluster.observe(drone("inactive", at_s=0))
     cluster.failing = 2
     with pytest.raises(KubeError):
-        await cluster.see(drone("flying", at_s=5))
+        await cluster.observe(drone("flying", at_s=5))
     assert [reason for reason, _ in cluster.posted.values()] == ["TookOff"]
-    assert await cluster.see(drone("flying", at_s=10)) == ["MissionBegun"]
+    assert await cluster.observe(drone("flying", at_s=10)) == ["MissionBegun"]
 
 
 async def test_flapping_drone_has_few_events(cluster: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(drone_events, "EVENT_PERIOD_S", 1e6)
     cluster.holders = []
     for flap in range(2000):
-        await cluster.see(drone("inactive" if flap % 2 else "flying", at_s=flap))
+        await cluster.observe(drone("inactive" if flap % 2 else "flying", at_s=flap))
     assert len(cluster.posted) == EVENT_BURST
     assert cluster.sentences()[-1] == "drone-1 took off, flown by system"
     monkeypatch.setattr(drone_events, "EVENT_PERIOD_S", 1e-9)
-    assert await cluster.see(drone("inactive", at_s=2001)) == ["Landed"], "the current state is posted when allowed"
+    assert await cluster.observe(drone("inactive", at_s=2001)) == ["Landed"], "the current state is posted when allowed"
 
 
 async def test_delayed_events_are_posted_later(cluster: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(drone_events, "EVENT_PERIOD_S", 0.2)
     monkeypatch.setattr(drone_events, "EVENT_BURST", 1)
     cluster.holders = []
-    await cluster.see(drone("inactive", at_s=0), drone("flying", at_s=1), drone("inactive", at_s=2))
+    await cluster.observe(drone("inactive", at_s=0), drone("flying", at_s=1), drone("inactive", at_s=2))
     running = asyncio.create_task(cluster.events.work_queue.run())
     async with asyncio.timeout(20.0):
         await cluster.landed.wait()

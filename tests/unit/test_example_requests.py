@@ -22,35 +22,37 @@ EXAMPLE = EXAMPLES / "traffic-monitoring"
 
 @pytest.fixture
 def programs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> dict[str, Any]:
-    """The example's modules; results go from ImageCheckers to one DataStore without a network."""
+    """Modules of the example. ImageCheckers pass their results to one DataStore without a network."""
     monkeypatch.setattr(sys, "path", [str(EXAMPLE), *sys.path])
     names = ("data_store", "image_checker", "pictures", "web")
     for name in names:
         monkeypatch.delitem(sys.modules, name, raising=False)
-    found = {name: importlib.import_module(name) for name in names}
+    modules = {name: importlib.import_module(name) for name in names}
     for name in names:
-        monkeypatch.setitem(sys.modules, name, found[name])
-    monkeypatch.setattr(found["data_store"], "RESULTS", tmp_path / "results.jsonl")
+        monkeypatch.setitem(sys.modules, name, modules[name])
+    monkeypatch.setattr(modules["data_store"], "RESULTS", tmp_path / "results.jsonl")
     monkeypatch.setenv("FRACTUS_SERVICE_DATA_STORE", "data-store:8080")
     monkeypatch.setattr(
-        found["image_checker"], "post", lambda _to, _path, body, _headers: found["data_store"].store(body, Message())
+        modules["image_checker"],
+        "post",
+        lambda _to, _path, body, _headers: modules["data_store"].store(body, Message()),
     )
-    return found
+    return modules
 
 
 async def test_repeated_picture_counts_once_across_instances(programs: dict[str, Any]) -> None:
     check = programs["image_checker"].check
     pictures = programs["pictures"]
     body = pictures.pack("picture-1", "viewer-1", pictures.render(160, 120, 1))
-    for _ in range(2):  # instances, each of which knows nothing of the other
+    for _ in range(2):  # two instances without shared state
         responder = Responder({"check": check}, 0)
         await responder.start()
         async with Requester(f"127.0.0.1:{responder.port}") as asking:
-            answer = json.loads(await asking.request("check", body, request_id="r1"))
+            response = json.loads(await asking.request("check", body, request_id="r1"))
         await responder.stop(0.0)
-        assert (answer["picture"], answer["source"], answer["kind"]) == ("picture-1", "viewer-1", "PNG")
-    (kept,) = programs["data_store"].results(b"", Message())
-    assert kept["request"] == "r1"
+        assert (response["picture"], response["source"], response["kind"]) == ("picture-1", "viewer-1", "PNG")
+    (stored,) = programs["data_store"].results(b"", Message())
+    assert stored["request"] == "r1"
 
 
 async def test_example_refuses_invalid_picture(programs: dict[str, Any]) -> None:
@@ -60,20 +62,20 @@ async def test_example_refuses_invalid_picture(programs: dict[str, Any]) -> None
 
 
 class FullCamera:
-    """A camera that keeps one picture; every other one cannot be fetched."""
+    """Fake camera that stores one picture. Every second picture cannot be retrieved."""
 
     def __init__(self) -> None:
-        self.kept: list[str] = []
+        self.stored: list[str] = []
         self.taken = 0
 
     take = fractus.Camera.take
 
     async def capture(self, *_: int, timeout_s: float) -> SimpleNamespace:
         assert timeout_s > 0
-        assert not self.kept, "it takes no more"
+        assert not self.stored, "the camera stores no second picture"
         self.taken += 1
-        self.kept.append(f"picture-{self.taken}")
-        return SimpleNamespace(name=self.kept[-1])
+        self.stored.append(f"picture-{self.taken}")
+        return SimpleNamespace(name=self.stored[-1])
 
     async def retrieve(self, name: str) -> bytes:
         if self.taken % 2:
@@ -81,7 +83,7 @@ class FullCamera:
         return name.encode()
 
     async def delete(self, name: str) -> None:
-        self.kept.remove(name)
+        self.stored.remove(name)
 
 
 async def test_traffic_example_leaves_no_pictures_on_the_node(programs: dict[str, Any]) -> None:
@@ -91,7 +93,7 @@ async def test_traffic_example_leaves_no_pictures_on_the_node(programs: dict[str
             assert (await programs["pictures"].take_picture(camera, number))[1] == f"picture-{camera.taken}".encode()
         except fractus.PolicyDenied:
             assert camera.taken % 2
-    assert (camera.kept, camera.taken) == ([], 4)
+    assert (camera.stored, camera.taken) == ([], 4)
 
 
 async def test_links_example_leaves_no_pictures_on_the_node(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -103,7 +105,7 @@ async def test_links_example_leaves_no_pictures_on_the_node(monkeypatch: pytest.
     with pytest.raises(fractus.PolicyDenied):
         await look(camera)
     assert await look(camera) == b"picture-2"
-    assert not camera.kept
+    assert not camera.stored
 
 
 def test_components_that_take_pictures_have_delete_method() -> None:

@@ -1,4 +1,4 @@
-"""Missions: duration, order of points, and flights that passengers can share."""
+"""Duration of missions, order of points, and flights that passengers can share."""
 
 import itertools
 import math
@@ -36,13 +36,13 @@ def walk(leg, step=0.25):
 def visits(leg, points, radius, ordered):
     """Return True if the path visits all points. Oracle: walks the path in small steps."""
     steps = list(walk(leg))
-    left = list(points)
+    remaining = list(points)
     if not ordered:
         return all(any(math.dist(s, p) <= radius for s in steps) for p in points)
     for s in steps:
-        while left and math.dist(s, left[0]) <= radius:
-            left.pop(0)
-    return not left
+        while remaining and math.dist(s, remaining[0]) <= radius:
+            remaining.pop(0)
+    return not remaining
 
 
 @given(
@@ -67,8 +67,8 @@ def test_first_missed_equals_walk_along_path(leg, offsets, ordered):
 
 
 def test_first_missed_accepts_point_on_second_pass():
-    there_and_back = flight([(0, 0), (300, 0), (0, 0)])
-    assert first_missed([place(200, 0), place(100, 0)], there_and_back, 7, ordered=True) is None
+    out_and_back = flight([(0, 0), (300, 0), (0, 0)])
+    assert first_missed([place(200, 0), place(100, 0)], out_and_back, 7, ordered=True) is None
     assert first_missed([place(200, 0), place(100, 0)], flight([(0, 0), (300, 0)]), 7, ordered=True) == 1
 
 
@@ -96,9 +96,9 @@ def test_flight_of_driver_is_interrupted_by_regions():
         {"navigation": "pathBased", "path": [at(600, 0)]},
     ]
     app = application(navigator(PATH) | {"control": "partial", "controlPoints": points})
-    found = flight_of(app, {})
-    assert [[round(FRAME.xy(p.lat, p.lon)[0]) for p in leg] for leg in found.legs] == [[100, 200, 400], [600]]
-    assert found.holder == ("default", "traffic")
+    flown = flight_of(app, {})
+    assert [[round(FRAME.xy(p.lat, p.lon)[0]) for p in leg] for leg in flown.legs] == [[100, 200, 400], [600]]
+    assert flown.holder == ("default", "traffic")
 
 
 @given(st.lists(spots, min_size=1, max_size=7))
@@ -127,13 +127,13 @@ def test_mission_estimate_equals_manual_calculation():
     app = application(navigator([at(300, 0, 30), at(300, 400, 30)]))
     depots = inventory().depots
     area = operation_area(app.spec, depots, 7)
-    found = MissionEstimator(app.spec, area, Settings(cruise_speed_mps=5, climb_speed_mps=1.5)).estimate(
+    estimate = MissionEstimator(app.spec, area, Settings(cruise_speed_mps=5, climb_speed_mps=1.5)).estimate(
         HOME, drone("d")
     )
-    assert found.distance_m == pytest.approx(300 + 400 + 500, rel=1e-4)
-    assert found.needed_min == pytest.approx((1200 / 5 + 60 / 1.5) / 60, rel=1e-4)
-    assert found.available_min == pytest.approx(15 - 0.2 * 15)
-    assert found.top_m == 30
+    assert estimate.distance_m == pytest.approx(300 + 400 + 500, rel=1e-4)
+    assert estimate.needed_min == pytest.approx((1200 / 5 + 60 / 1.5) / 60, rel=1e-4)
+    assert estimate.available_min == pytest.approx(15 - 0.2 * 15)
+    assert estimate.top_m == 30
 
 
 def test_mission_estimate_includes_time_in_region():

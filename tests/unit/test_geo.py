@@ -30,8 +30,8 @@ def test_local_frame_distances_match_geodesic_distances(lat, lon, bearing, dista
     frame = LocalFrame(lat, lon)
     x = distance * math.sin(bearing)
     y = distance * math.cos(bearing)
-    there_lat, there_lon = frame.latlon(x, y)
-    geodesic = geodesic_m(Point(lat=lat, lon=lon), Point(lat=there_lat, lon=there_lon))
+    target_lat, target_lon = frame.latlon(x, y)
+    geodesic = geodesic_m(Point(lat=lat, lon=lon), Point(lat=target_lat, lon=target_lon))
     assert geodesic == pytest.approx(distance, rel=1e-3)
 
 
@@ -70,11 +70,11 @@ def test_circle_has_the_right_area_anywhere(lat, lon):
 @pytest.mark.parametrize(("radius", "pieces"), [(1e-6, 32), (0.5, 32), (7, 60), (33, 128), (500, 128), (40_000, 128)])
 def test_circles_and_corridors_are_circumscribed_tightly(radius, pieces):
     frame = LocalFrame(50, 4)
-    here = Point(lat=50, lon=4)
+    center = Point(lat=50, lon=4)
     exact = shapely.Point(0, 0).buffer(radius, quad_segs=2000)
     for shape in (
-        area_polygon(frame, Area(circle=Circle(center=here, radius=radius))),
-        corridor(frame, [here], radius),
+        area_polygon(frame, Area(circle=Circle(center=center, radius=radius))),
+        corridor(frame, [center], radius),
     ):
         assert shape.buffer(1e-12).covers(exact)
         assert shape.area == pytest.approx(exact.area, rel=4e-3)
@@ -86,7 +86,7 @@ def test_circles_and_corridors_are_circumscribed_tightly(radius, pieces):
 
 @given(latitudes, longitudes, st.floats(1, 200_000), st.floats(0, 300_000), st.floats(0, math.tau))
 def test_inscribed_circle_is_never_larger_than_the_circle(lat, lon, radius, away, bearing):
-    """Applies at any distance from the origin of the frame, which shortens distances there."""
+    """The frame shortens distances far from its origin, so the test uses any distance from it."""
     frame = LocalFrame(lat, lon)
     centre_lat, centre_lon = frame.latlon(away * math.sin(bearing), away * math.cos(bearing))
     centre = Point(lat=centre_lat, lon=centre_lon)
@@ -104,9 +104,9 @@ def test_corridor_covers_short_legs(radius, magnitude, direction):
     legs = [(0.0, 0.0), (length * math.sin(direction), length * math.cos(direction))]
     points = [Point(lat=lat, lon=lon) for lat, lon in (frame.latlon(*leg) for leg in legs)]
     shape = corridor(frame, points, radius)
-    way = shapely.LineString([frame.xy(p.lat, p.lon) for p in points])
-    assert shape.covers(way)
-    assert shape.exterior.distance(way) >= radius
+    line = shapely.LineString([frame.xy(p.lat, p.lon) for p in points])
+    assert shape.covers(line)
+    assert shape.exterior.distance(line) >= radius
 
 
 def square(lat, lon, half):
@@ -132,7 +132,7 @@ def test_polygon_across_the_antimeridian_is_small():
     st.lists(st.tuples(st.floats(0, 2 * math.pi), st.sampled_from([0.0, 0.5, 0.9, 1.1, 2.0])), min_size=5, max_size=20),
 )
 def test_geojson_of_circles_at_the_poles_covers_the_same_area(pole, off, lon, radius, places):
-    # On such a map, an edge past the pole that is shorter than a segment is bent.
+    # On a map in degrees, an edge past the pole is bent even if it is shorter than a segment.
     assume(abs(off - radius) > 0.2 * radius)
     lat = pole - math.copysign(off / 111_694, pole)
     frame = LocalFrame(lat, lon)
@@ -144,8 +144,8 @@ def test_geojson_of_circles_at_the_poles_covers_the_same_area(pole, off, lon, ra
     for bearing, share in places:
         x = share * radius * math.sin(bearing)
         y = share * radius * math.cos(bearing)
-        there_lat, there_lon = frame.latlon(x, y)
-        assert any(part.covers(shapely.Point(there_lon, there_lat)) for part in drawn) == (share < 1)
+        target_lat, target_lon = frame.latlon(x, y)
+        assert any(part.covers(shapely.Point(target_lon, target_lat)) for part in drawn) == (share < 1)
 
 
 def test_self_crossing_ring_error_names_ring_and_place():

@@ -40,9 +40,9 @@ def grant_files(directory: Path, refused: Any = lambda _name, _why: None) -> Gra
 
 
 def test_grant_files_report_added_changed_and_removed_grants(tmp_path: Path) -> None:
-    seen: list[tuple[str | None, str | None]] = []
+    changes: list[tuple[str | None, str | None]] = []
     files = grant_files(tmp_path)
-    files.listen(lambda old, new: seen.append((old and old.spec.mission, new and new.spec.mission)))
+    files.listen(lambda old, new: changes.append((old and old.spec.mission, new and new.spec.mission)))
     path = tmp_path / "g.json"
     path.write_text(body())
     files.scan()
@@ -59,7 +59,7 @@ def test_grant_files_report_added_changed_and_removed_grants(tmp_path: Path) -> 
     files.scan()
     path.unlink()
     files.scan()
-    assert seen == [(None, "u1"), ("u1", "u2"), ("u2", None), (None, "u3"), ("u3", None)]
+    assert changes == [(None, "u1"), ("u1", "u2"), ("u2", None), (None, "u3"), ("u3", None)]
 
 
 async def active_within_1_s(files: GrantFiles, count: int) -> None:
@@ -86,7 +86,7 @@ async def test_grant_files_revoke_a_removed_grant_within_one_second(tmp_path: Pa
 
 
 async def test_grant_files_grant_nothing_while_their_directory_is_missing(tmp_path: Path) -> None:
-    """A directory that is back, for example after its disk was mounted again, grants the same as before."""
+    """A restored directory grants the same as before, for example after its disk was mounted again."""
     directory = tmp_path / "grants"
     directory.mkdir()
     (directory / "g.json").write_text(body())
@@ -156,10 +156,10 @@ def test_grant_files_use_later_of_two_files_for_one_instance(tmp_path: Path) -> 
     (tmp_path / "a.json").write_text(body(uid="second"))
     files = grant_files(tmp_path)
     files.scan()
-    assert [grant.spec.mission for grant in files.active.values()] == ["second"], "the later one counts"
+    assert [grant.spec.mission for grant in files.active.values()] == ["second"], "the later Grant is active"
     (tmp_path / "a.json").unlink()
     files.scan()
-    assert not files.active, "the earlier one does not come back"
+    assert not files.active, "the earlier Grant is not activated again"
 
 
 def test_grant_files_grant_nothing_when_directory_is_missing(tmp_path: Path) -> None:
@@ -209,7 +209,7 @@ def test_grant_files_call_other_listeners_when_one_fails(tmp_path: Path) -> None
 
 
 def retry_after_s(limiter: RateLimiter, identity: str, time_s: float) -> float:
-    """Take a token and return the seconds until the next one; 0 if there was one."""
+    """Take a token. Return 0, or the seconds until the next token if there is none."""
     try:
         limiter.take(identity, time_s)
     except ResourceExhausted as refusal:

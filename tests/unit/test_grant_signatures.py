@@ -35,7 +35,7 @@ from policy_world import spec
 
 NOW = datetime(2026, 6, 1, 12, 0, 0, 123456, tzinfo=UTC)
 CA = Authority.generate(NOW)
-OTHER_CA = Authority.generate(NOW)
+FOREIGN_CA = Authority.generate(NOW)
 CAS = (CA.certificate,)
 SIGNER = CA.issue_signer(NOW)
 IDENTITY = Grant.from_body(
@@ -112,21 +112,21 @@ def of_data(data: dict[str, str]) -> tuple[ec.EllipticCurvePrivateKey, x509.Cert
 
 
 @pytest.mark.parametrize(
-    ("who", "why"),
+    ("signer", "message"),
     [
         (of_data(CA.issue_component(IDENTITY, NOW)), "instead of the operator"),
         (of_data(CA.issue_component("spiffe://fractus.dev/operator", NOW)), "not valid for signing Grants"),
         (of_data(CA.issue_node("drone-1", NOW)), "instead of the operator"),
         ((CA.key, CA.certificate), "not valid for signing Grants"),
-        (OTHER_CA.issue_signer(NOW), "authority that is not in ca.crt"),
+        (FOREIGN_CA.issue_signer(NOW), "authority that is not in ca.crt"),
         ((SIGNER[0], CA.issue_signer(NOW)[1]), "changed after signing"),
     ],
 )
 def test_signature_of_other_certificates_is_refused(
-    who: tuple[ec.EllipticCurvePrivateKey, x509.Certificate], why: str
+    signer: tuple[ec.EllipticCurvePrivateKey, x509.Certificate], message: str
 ) -> None:
-    with pytest.raises(BadSignature, match=why):
-        verify(grant(sign(manifest(), *who, NOW)), CAS)
+    with pytest.raises(BadSignature, match=message):
+        verify(grant(sign(manifest(), *signer, NOW)), CAS)
 
 
 def test_signing_certificate_and_tls_certificates_have_separate_usages() -> None:
@@ -139,7 +139,7 @@ def test_signing_certificate_and_tls_certificates_have_separate_usages() -> None
 
 
 def test_signature_is_judged_at_time_of_issue() -> None:
-    assert verify(grant(signed(NOW)), CAS), "the age does not matter"
+    assert verify(grant(signed(NOW)), CAS), "a signature does not expire"
     late = SIGNER[1].not_valid_after_utc
     assert verify(grant(signed(late + timedelta(minutes=4))), CAS), "clocks may differ by some minutes"
     for wrong in (late + timedelta(minutes=6), NOW - timedelta(hours=3)):
@@ -148,11 +148,11 @@ def test_signature_is_judged_at_time_of_issue() -> None:
 
 
 def test_signature_is_valid_for_each_of_several_authorities() -> None:
-    both = read_authorities(OTHER_CA.certificate_pem + CA.certificate_pem)
+    both = read_authorities(FOREIGN_CA.certificate_pem + CA.certificate_pem)
     assert verify(grant(signed()), both) == NOW
 
 
-# The operator
+# Operator
 
 
 def test_signer_issue_time_always_increases() -> None:
@@ -188,10 +188,10 @@ def test_signer_detects_foreign_and_invalid_signatures() -> None:
     body["metadata"]["annotations"][SIGNATURE_ANNOTATION] = "bm9uc2Vuc2U="
     assert signer.problem(grant(body)) is not None
     assert signer.problem(grant(manifest())) is not None
-    assert GrantSigner(OTHER_CA, lambda: NOW).problem(grant(signed())) is not None
+    assert GrantSigner(FOREIGN_CA, lambda: NOW).problem(grant(signed())) is not None
 
 
-# The node
+# Node
 
 
 class Node:
@@ -262,14 +262,14 @@ def test_verifier_refuses_replay_with_another_uid(node: Node) -> None:
 def test_verifier_accepts_verified_grant_after_authority_change(node: Node) -> None:
     body = signed()
     digest = node.take(body)
-    node.trust(OTHER_CA)
+    node.trust(FOREIGN_CA)
     assert node.verifier.reload_authorities()
     assert node.take(body) == digest
     node.restart()
     assert node.take(body) == digest
     with pytest.raises(UnknownAuthority):
         node.take(signed(later()))
-    assert node.take(sign(manifest(), *OTHER_CA.issue_signer(NOW), later(2)))
+    assert node.take(sign(manifest(), *FOREIGN_CA.issue_signer(NOW), later(2)))
 
 
 def test_verifier_refuses_grants_without_authority(node: Node) -> None:
@@ -337,7 +337,7 @@ def test_verifier_state_is_bounded_and_still_refuses_old_grants(node: Node, monk
     assert node.take(signed(later(7), instance="i0"))
 
 
-# Standalone services without a cluster
+# Standalone services
 
 
 def test_grants_command_creates_authority_and_signs_grant(tmp_path: Path) -> None:
@@ -348,8 +348,8 @@ def test_grants_command_creates_authority_and_signs_grant(tmp_path: Path) -> Non
     missing = CliRunner().invoke(grants, ["sign", str(file), "--tls", str(pki), "--to", str(to)])
     assert missing.exit_code == 1
     assert "fractus grants init" in missing.output
-    made = CliRunner().invoke(grants, ["init", str(pki), "--node", "drone-1"])
-    assert made.exit_code == 0, made.output
+    result = CliRunner().invoke(grants, ["init", str(pki), "--node", "drone-1"])
+    assert result.exit_code == 0, result.output
     ca = (pki / "nodes" / "drone-1" / "ca.crt").read_bytes()
     assert (pki / "authority" / "tls.key").stat().st_mode & 0o777 == 0o600
     times = []
@@ -366,17 +366,17 @@ def test_grants_command_creates_authority_and_signs_grant(tmp_path: Path) -> Non
 
 @pytest.mark.parametrize("name", ["", "../x", "a/b", ".", "Drone"])
 def test_standalone_pki_refuses_invalid_names(tmp_path: Path, name: str) -> None:
-    made = CliRunner().invoke(grants, ["init", str(tmp_path / "pki"), "--node", name])
-    assert made.exit_code == 1
-    assert f"node: {name!r} is not a valid node name" in made.output
+    result = CliRunner().invoke(grants, ["init", str(tmp_path / "pki"), "--node", name])
+    assert result.exit_code == 1
+    assert f"node: {name!r} is not a valid node name" in result.output
     assert not (tmp_path / "pki" / "nodes").exists()
     with pytest.raises(InvalidObject, match=r"spec\.instance"):
         StandalonePki.open(tmp_path / "pki").component(component_identity("ns", "app", "Navigator", name))
 
 
 def test_standalone_pki_is_created_once(tmp_path: Path) -> None:
-    one = StandalonePki.create(tmp_path)
-    folder = one.component(component_identity("ns", "app", "Navigator", "app-navigator"))
+    pki = StandalonePki.create(tmp_path)
+    folder = pki.component(component_identity("ns", "app", "Navigator", "app-navigator"))
     assert folder.name == "ns.app-navigator"
     before = (folder / "tls.crt").read_bytes()
     two = StandalonePki.create(tmp_path)
@@ -406,10 +406,10 @@ def test_mission_id_is_signed_and_kept_with_the_grant() -> None:
 
 
 def test_mission_key_differs_between_instances(node: Node) -> None:
-    own = signed()
-    other = signed(instance="app-b", component="B", mission="u1")
-    other["metadata"]["uid"] = own["metadata"]["uid"] = "u1"
-    assert grant(other).spec.mission_key != grant(own).spec.mission_key
+    first = signed()
+    second = signed(instance="app-b", component="B", mission="u1")
+    second["metadata"]["uid"] = first["metadata"]["uid"] = "u1"
+    assert grant(second).spec.mission_key != grant(first).spec.mission_key
 
 
 def test_tour_without_operation_area_is_not_signed() -> None:
@@ -417,10 +417,10 @@ def test_tour_without_operation_area_is_not_signed() -> None:
         signed(operationArea=[], tour=[{"lat": 39.36, "lon": 22.95, "alt": 10}], **{"class": None})
 
 
-@pytest.mark.parametrize("who", ["driver", "passenger"])
-def test_grant_without_operation_area_is_neither_signed_nor_accepted(who: str) -> None:
-    with pytest.raises(InvalidObject, match=f"a {who} needs operationArea"):
-        signed(operationArea=[], **{"class": who})
+@pytest.mark.parametrize("component_class", ["driver", "passenger"])
+def test_grant_without_operation_area_is_neither_signed_nor_accepted(component_class: str) -> None:
+    with pytest.raises(InvalidObject, match=f"a {component_class} needs operationArea"):
+        signed(operationArea=[], **{"class": component_class})
     body = signed()
     body["spec"].pop("operationArea")
     with pytest.raises(BadSignature, match="does not bound its drone"):

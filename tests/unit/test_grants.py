@@ -26,8 +26,8 @@ from fractus_core.validation import check_policy
 from test_planning import FRAME, PATH, VIEWER, application, at, component, drone, edge, inventory, manifest, navigator
 
 
-def zone(name, where, radius=50):
-    return Zone.from_body(manifest("Zone", name, {"area": {"circle": {"center": at(*where), "radius": radius}}}))
+def zone(name, center, radius=50):
+    return Zone.from_body(manifest("Zone", name, {"area": {"circle": {"center": at(*center), "radius": radius}}}))
 
 
 def policy(name, zones=(), nodes=(), applications=None, **spec):
@@ -56,24 +56,24 @@ def comb(name, teeth, across=False, lon=None):
 
 
 def test_grant_refuses_zones_with_too_many_crossings():
-    """The union takes minutes, and a drone's services would read no other Grant during that time."""
+    """The union of these zones takes minutes. The services would read no other Grant during that time."""
     spiky = [comb("north", 480), comb("east", 480, across=True)]
     inside = {"type": "GeofenceControl", "kind": "inclusion", "action": "land"}
     with pytest.raises(
         InvalidObject, match=r"Policy in spec\.selector\.zones: edges of its zones cross more than 50000 times"
     ):
         compiled(policy("in", ("north", "east"), **inside), zones=spiky)
-    # The granted policy stays, as for every broken policy.
+    # The previously granted policy is kept, as for every broken policy.
     (granted,) = compiled(policy("in", ("north",), **inside), zones=spiky)
     stock = inventory([drone("d")], zones={z.name: z for z in spiky})
     broken = dataclasses.replace(stock, policies={"in": policy("in", ("north", "east"), **inside)})
     assert refresh(granted, broken).policies == granted.policies
-    # Exclusion zones are not united.
+    # Exclusion zones need no union.
     assert compiled(policy("out", ("north", "east"), **FENCE), zones=spiky)
 
 
 def test_zone_validity_cache_is_cleared_with_the_zone():
-    """Each change of a zone, even of its status, creates another object."""
+    """Each change of a zone, even of its status, creates a new object."""
     gc.collect()
     before = len(_VALIDATED)
     near = zone("near", (50, 0))
@@ -228,10 +228,10 @@ def test_refreshed_grant_keeps_policies_when_node_description_is_missing():
     stock = inventory([drone("d")])
     app = application(navigator(PATH))
     decided = plan(app, stock)
-    gone = inventory([], policies={"heavy": heavy, "low": policy("low", **ALTITUDE)})
-    assert compile_grants(app, decided, gone, None, [old]) == (fresh,)
+    without_zone = inventory([], policies={"heavy": heavy, "low": policy("low", **ALTITUDE)})
+    assert compile_grants(app, decided, without_zone, None, [old]) == (fresh,)
     with pytest.raises(InvalidObject, match="node d"):
-        compile_grants(app, decided, gone)
+        compile_grants(app, decided, without_zone)
 
 
 def test_grant_omits_zones_beyond_reach():
@@ -241,14 +241,16 @@ def test_grant_omits_zones_beyond_reach():
 
 
 @pytest.mark.parametrize(
-    "there", [FENCE | {"kind": "inclusion"}, {"type": "AccessControl", "kind": "grant", "methods": ["Goto"]}]
+    "options", [FENCE | {"kind": "inclusion"}, {"type": "AccessControl", "kind": "grant", "methods": ["Goto"]}]
 )
-def test_grant_keeps_permission_of_zone_beyond_reach(there):
-    (grant,) = compiled(policy("a", zones=["far"], **there), zones=[zone("far", (80_000, 0))])
+def test_grant_keeps_permission_of_zone_beyond_reach(options):
+    (grant,) = compiled(policy("a", zones=["far"], **options), zones=[zone("far", (80_000, 0))])
     assert [p.name for p in grant.policies] == ["a"]
-    here = Situation(time_s=0.0, lat=FRAME.lat, lon=FRAME.lon, altitude_m=20.0, home=Home(FRAME.lat, FRAME.lon, 0.0))
+    situation = Situation(
+        time_s=0.0, lat=FRAME.lat, lon=FRAME.lon, altitude_m=20.0, home=Home(FRAME.lat, FRAME.lon, 0.0)
+    )
     goto = Call("Goto", GotoArgs(FRAME.lat, FRAME.lon, 20.0))
-    assert not judge(goto, here, compile_grant(grant)).permits
+    assert not judge(goto, situation, compile_grant(grant)).permits
 
 
 @pytest.mark.parametrize(
@@ -264,9 +266,9 @@ def test_grant_keeps_camera_policies_of_distant_zones_in_view(spec):
     private = policy("a", zones=["near", "far"], **spec)
     policies = {"a": private, "b": policy("b", zones=["near"], **FENCE)}
     stock = inventory(edges=[edge("e", (0, 0))], zones={z.name: z for z in (near, far)}, policies=policies)
-    where = [{"center": at(0, 0), "radius": 100, "instances": 1}]
+    locations = [{"center": at(0, 0), "radius": 100, "instances": 1}]
     services = [{"service": "camera", "methods": ["CaptureImage"]}]
-    app = application(component("Watch", "edge", locations=where, services=services))
+    app = application(component("Watch", "edge", locations=locations, services=services))
     (grant,) = compile_grants(app, plan(app, stock), stock)
     assert [[z.name for z in p.zones] for p in grant.policies] == [["near"]]
     # The camera has no description, so it may see everything around it.

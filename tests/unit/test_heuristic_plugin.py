@@ -34,9 +34,9 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
 
 def test_example_tests_of_heuristic_plugin_pass(installed: str) -> None:
     tests = vars(importlib.import_module("test_acme_heuristics"))
-    found = [test for name, test in tests.items() if name.startswith("test_")]
-    assert found
-    for test in found:
+    tests_of_example = [test for name, test in tests.items() if name.startswith("test_")]
+    assert tests_of_example
+    for test in tests_of_example:
         test()
 
 

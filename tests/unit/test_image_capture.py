@@ -52,31 +52,31 @@ async def test_capture_is_refused_when_camera_turns_to_privacy_zone_and_back(wor
     """The view is narrow and oblique. At both ends of the exposure, the zone 60 m to the south is behind the camera."""
     world.drone.lens = Lens(20.0, 20.0, pitch_deg=-15.0, stabilised=True, error_deg=0.0)
 
-    def turn_and_back(**changes: float) -> None:
+    def turn_and_return(**changes: float) -> None:
         before = {name: getattr(world.drone, name) for name in changes}
         for now in (changes, before):
             for name, value in now.items():
                 setattr(world.drone, name, value)
             world.drone.situation(NOW)
 
-    world.scene.during = lambda: turn_and_back(yaw=45.0)
+    world.scene.during = lambda: turn_and_return(yaw=45.0)
     record = await world.capture(active_grant())
     assert {round(pose.attitude.yaw_deg) for pose in record.poses if pose.attitude} == {0, 45}
-    world.scene.during = lambda: turn_and_back(yaw=180.0)
+    world.scene.during = lambda: turn_and_return(yaw=180.0)
     assert await refusal(world.camera.capture(active_grant(), CaptureArgs())) == "PrivacyZone"
-    world.scene.during = lambda: turn_and_back(y=0.0)
+    world.scene.during = lambda: turn_and_return(y=0.0)
     assert await refusal(world.camera.capture(active_grant(), CaptureArgs())) == "PrivacyZone"
     blind = policy("a", "AccessControl", "denial", [zone("z", box(-20, -20, 20, 20))], methods=["CaptureImage"])
     assert await refusal(world.camera.capture(active_grant(blind), CaptureArgs())) == "MethodDenied"
     elsewhere = policy("q", "PrivacyControl", "camera", [zone("z", box(500, 500, 510, 510))], action="refuse")
-    world.scene.during = lambda: turn_and_back(yaw=180.0)
+    world.scene.during = lambda: turn_and_return(yaw=180.0)
     record = await world.capture(active_grant(elsewhere))
     assert await refusal(world.stored_images.retrieve(active_grant(), record.name)) == "PrivacyZone"
 
 
 @pytest.mark.parametrize("model", ["pinhole", "equidistant", None])
 async def test_focal_length_is_in_metadata_only_of_pinhole_camera(tmp_path: Path, model: str | None) -> None:
-    """Only a wider bound is known of the view of another lens."""
+    """The view of a fisheye lens is only known by an upper bound."""
     described = {"methods": ["CaptureImage"], "horizontalFieldOfView": 60} | (
         {"lens": {"model": model}} if model else {}
     )
@@ -151,21 +151,21 @@ async def test_cancelled_capture_keeps_shutter_until_picture_is_stored(world: Wo
     await asyncio.gather(task, return_exceptions=True)
     second = asyncio.create_task(world.capture(active_grant()))
     await asyncio.sleep(0.05)
-    assert len(world.scene.taken) == 1, "the shutter is not free before the first picture is done"
+    assert len(world.scene.taken) == 1, "the shutter is busy until the first picture is stored"
     held_up.set()
     await second
     for _ in range(1000):
         if len((await world.stored_images.list(active_grant()))[1]) == 2:
             return
         await asyncio.sleep(0.01)
-    raise AssertionError("the picture of the caller that hung up was not stored")
+    raise AssertionError("the picture of the cancelled call was not stored")
 
 
 async def test_capture_is_refused_when_grant_ends_in_queue(world: World) -> None:
-    def gone() -> ActiveGrant:
+    def removed_grant() -> ActiveGrant:
         raise PolicyDenied("NoGrant", "gone")
 
-    assert await refusal(world.camera.capture(active_grant(), CaptureArgs(), gone)) == "NoGrant"
+    assert await refusal(world.camera.capture(active_grant(), CaptureArgs(), removed_grant)) == "NoGrant"
     assert not world.scene.taken
 
 
@@ -188,12 +188,12 @@ async def test_audit_contains_filters_that_become_necessary(world: World) -> Non
     bound = active_grant(private("black"))
     faces = active_grant(private("blurFaces"))
     world.scene.during = lambda: setattr(world.drone, "y", 0.0)
-    record = await world.capture(bound)  # The drone came over the zone during the exposure,
-    await world.capture(bound)  # was there from the beginning,
-    await world.capture(faces)  # and too high for faces to be found.
+    record = await world.capture(bound)  # The drone enters the zone during the exposure.
+    await world.capture(bound)  # The drone is above the zone from the beginning.
+    await world.capture(faces)  # The drone is too high to detect faces.
     plain = await world.capture(free)
     world.drone.y = 80.0
-    await world.pixels(bound, record)  # This picture has its filters already, the next one does not.
+    await world.pixels(bound, record)  # This picture is already filtered, the next one is not.
     await world.pixels(bound, plain)
     await world.audit.close()
     assert written() == [
@@ -213,9 +213,9 @@ async def test_picture_is_filtered_before_it_is_stored(world: World, action: str
     verdict, record = await world.camera.capture(grant, CaptureArgs())
     assert (verdict.action, verdict.code, verdict.policies) == ("correct", "PrivacyFilter", ("p",))
     assert len(world.scene.taken) == (3 if action == "removeBackground" else 1)
-    kept = world.stored(grant, record)
-    assert grain(kept) < 12
-    assert np.array_equal(await world.pixels(grant, record), kept), "it is not filtered twice"
+    stored = world.stored(grant, record)
+    assert grain(stored) < 12
+    assert np.array_equal(await world.pixels(grant, record), stored), "a filtered picture is not filtered again"
     data = world.store.path(owner_of(grant), record.name).read_bytes()
     assert b"Exif" not in data
     assert b"Camera:" not in data
@@ -267,7 +267,7 @@ async def test_retrieval_is_judged_again_after_filters_are_applied(world: World)
     world.drone.y = 0.0
     record = await world.capture(free)
     _, shown, _ = await world.stored_images.retrieve(bound, record.name, lambda: bound)
-    assert [one.action for one in shown.filters] == ["blurAverage"]
+    assert [filter_.action for filter_ in shown.filters] == ["blurAverage"]
     assert await refusal(world.stored_images.retrieve(bound, record.name, active_grant)) == "PrivacyZone"
     stricter = active_grant(private("black"))
     with pytest.raises(Refused, match="request it again") as caught:
@@ -287,9 +287,9 @@ async def test_faces_are_blurred_or_fallback_applies_when_too_small(tmp_path: Pa
     world.drone.alt = 2.0
     world.finder.boxes = [(700, 700, 100, 100)]
     grant = active_grant(private("blurFaces"))
-    kept = world.stored(grant, await world.capture(grant))
-    assert grain(kept[700:800, 700:800]) < 12
-    assert grain(kept[:600]) > 30
+    stored = world.stored(grant, await world.capture(grant))
+    assert grain(stored[700:800, 700:800]) < 12
+    assert grain(stored[:600]) > 30
     world.drone.alt = 40.0
     verdict, record = await world.camera.capture(grant, CaptureArgs())
     assert "blurAverage is applied" in verdict.reason
@@ -326,7 +326,7 @@ async def test_faces_cut_by_cropping_are_blurred(
     world.drone.y = 80.0
     record = await world.capture(later, width=width, height=height)
     assert not record.filters
-    assert not record.face_px, "faces in it are not found either when they have to be hidden later"
+    assert not record.face_px, "faces in the picture cannot be detected later either"
     assert (await world.capture(later, width=800, height=800)).face_px
     world.shutter.close()
 
@@ -360,12 +360,14 @@ async def test_stored_picture_shows_only_judged_view(
     top = (size[1] - shown[1]) // 2
     picture[top : top + shown[1], left : left + shown[0]] = 200
     monkeypatch.setattr(world.scene, "capture", lambda _request: picture)
-    for asked in ({"width": 64, "height": 64}, {"width": 64, "height": 36}, {"width": 90, "height": 160}):
-        kept = world.stored(active_grant(), await world.capture(active_grant(), **asked))
-        assert kept.min() > 150, asked
+    for requested in ({"width": 64, "height": 64}, {"width": 64, "height": 36}, {"width": 90, "height": 160}):
+        stored = world.stored(active_grant(), await world.capture(active_grant(), **requested))
+        assert stored.min() > 150, requested
     world.drone.lens = None
     elsewhere = active_grant(private("black"), uid="u9")
-    assert (await world.capture(elsewhere, width=64, height=64)).filters, "without a lens it sees everything"
+    assert (await world.capture(elsewhere, width=64, height=64)).filters, (
+        "a camera without a known lens may see everything"
+    )
     world.shutter.close()
 
 
@@ -394,7 +396,7 @@ async def test_capture_refuses_invalid_picture_size(world: World, width: int, he
     assert not world.scene.taken
 
 
-# Cameras that break
+# Failing cameras
 
 
 async def test_hanging_camera_is_reported_and_recovers(tmp_path: Path) -> None:

@@ -67,7 +67,7 @@ def test_blur_leaves_16_by_16_values_and_no_face(blur: Any, photo: Pixels, detec
     assert blurred.shape == photo.shape
     assert abs(float(blurred.mean()) - float(photo.mean())) < 12
     assert not covers(detector.detect(blurred, 48, upright=True), FACE)
-    # No structure finer than a cell is left: the picture follows from 16x16 values.
+    # The picture contains no structure finer than a cell: it can be computed from 16x16 values.
     few = cv2.resize(blurred[16::32, 16::32], (512, 512), interpolation=cv2.INTER_LINEAR)
     assert float(np.abs(few.astype(float) - blurred).mean()) < 6
 
@@ -103,9 +103,9 @@ def test_hide_faces_reveals_nothing_when_boxes_overlap(method: Any, photo: Pixel
     coarse = photo.copy()
     coarse[region] = cv2.resize(cells, (168, 168), interpolation=cv2.INTER_NEAREST)
     for boxes in ([face, (140, 130, 30, 30), (110, 150, 24, 24)], [(140, 130, 30, 30), face], [face, (60, 60, 40, 40)]):
-        shown, nothing = (hide_faces(one, boxes, method)[region] for one in (photo, coarse))
+        visible, nothing = (hide_faces(source, boxes, method)[region] for source in (photo, coarse))
         # A box across the edge of the region mixes in adjacent pixels, before or after the face is hidden.
-        assert float(np.abs(shown.astype(int) - nothing).mean()) < 1, boxes
+        assert float(np.abs(visible.astype(int) - nothing).mean()) < 1, boxes
 
 
 def test_hide_faces_leaves_few_colours_at_picture_edge(photo: Pixels) -> None:
@@ -138,10 +138,10 @@ def test_remove_background_keeps_moving_objects_only(photo: Pixels) -> None:
     before, now, after = (frame(s, c) for s, c in ((0, 100), (3, 200), (6, 300)))
     mask = detect_motion(before, now, after, fixed=False)
     assert mask is not None
-    kept = remove_background(now, mask)
-    assert (kept[352:378, 202:238] == (0, 0, 255)).all()
-    assert (kept.max(axis=2) > 0).mean() < 0.08, "the landscape and the earlier place of the car must be black"
-    assert kept[66:163, 177:274].max() == 0
+    foreground = remove_background(now, mask)
+    assert (foreground[352:378, 202:238] == (0, 0, 255)).all()
+    assert (foreground.max(axis=2) > 0).mean() < 0.08, "the landscape and the earlier place of the car must be black"
+    assert foreground[66:163, 177:274].max() == 0
     standing = detect_motion(frame(0, 100), frame(0, 200), frame(0, 300), fixed=True)
     assert standing is not None
     assert standing[360, 220]
@@ -250,7 +250,7 @@ def test_invalid_face_model_is_refused_with_reason(tmp_path: Path) -> None:
         ModelDetector(corrupt)
 
 
-# Pictures as arrays
+# Encoding and decoding
 
 
 @given(st.integers(16, 400), st.integers(16, 400), st.sampled_from([(640, 480), (1280, 720), (100, 100), (480, 640)]))
@@ -280,8 +280,8 @@ def test_invalid_image_data_is_refused(data: bytes) -> None:
     ("suffix", "kind"), [("png", np.uint8), ("png", np.uint16), ("tiff", np.uint8), ("bmp", np.uint8)]
 )
 def test_image_is_decoded_as_by_opencv(shape: tuple[int, ...], suffix: str, kind: Any) -> None:
-    made = np.random.default_rng(3).integers(0, np.iinfo(kind).max, shape, kind)
-    data = cv2.imencode(f".{suffix}", made)[1].tobytes()
+    original = np.random.default_rng(3).integers(0, np.iinfo(kind).max, shape, kind)
+    data = cv2.imencode(f".{suffix}", original)[1].tobytes()
     expected = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
     assert np.abs(decode_image(data).astype(int) - expected).max() <= 1
 
@@ -366,7 +366,7 @@ def test_image_record_survives_json_round_trip() -> None:
             ImageRecord.from_json(broken)
 
 
-# Drivers
+# Camera drivers
 
 
 def capture_request(**more: Any) -> CaptureRequest:

@@ -78,8 +78,8 @@ async def test_picture_of_earlier_release_has_unknown_position(tmp_path: Path) -
     record_path.write_text(json.dumps({**body, "face_px": 900.0, "before": poses[0], "after": poses[-1]}))
     world.shutter.close()
     world = World(tmp_path)
-    (kept,) = (await world.stored_images.list(active_grant()))[1]
-    assert (kept.name, kept.poses[0].lat, kept.face_px) == (record.name, None, 0.0)
+    (stored,) = (await world.stored_images.list(active_grant()))[1]
+    assert (stored.name, stored.poses[0].lat, stored.face_px) == (record.name, None, 0.0)
     assert await refusal(world.stored_images.retrieve(active_grant(), record.name)) == "PrivacyZone", (
         "every active policy applies"
     )
@@ -98,17 +98,17 @@ async def test_faces_are_not_detected_in_picture_that_may_be_cropped(tmp_path: P
     record_path.write_text(json.dumps({**body, "face_px": 900.0}))
     world.shutter.close()
     world = World(tmp_path)
-    (kept,) = (await world.stored_images.list(active_grant()))[1]
-    assert kept == replace(record, face_px=0.0, whole=False)
+    (stored,) = (await world.stored_images.list(active_grant()))[1]
+    assert stored == replace(record, face_px=0.0, whole=False)
     world.shutter.close()
 
 
 def modes(directory: Path) -> dict[str, set[int]]:
     """Return the permissions of the folders and files of an image store."""
-    found = [(path.is_dir(), stat.S_IMODE(path.stat().st_mode)) for path in directory.rglob("*")]
+    entries = [(path.is_dir(), stat.S_IMODE(path.stat().st_mode)) for path in directory.rglob("*")]
     return {
-        "folders": {mode for is_dir, mode in found if is_dir},
-        "files": {mode for is_dir, mode in found if not is_dir},
+        "folders": {mode for is_dir, mode in entries if is_dir},
+        "files": {mode for is_dir, mode in entries if not is_dir},
     }
 
 

@@ -1,4 +1,4 @@
-"""The informer against a scripted API server: broken watches, expiry, retries. No network."""
+"""The informer with a scripted API server: broken watches, expiry and retries."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def zone(name: str, version: int, value: int = 0) -> Body:
 
 
 class Script:
-    """Gives lists and watches in the order written; then waits indefinitely."""
+    """Fake client that returns scripted lists and watches in order, and then waits forever."""
 
     def __init__(self, *steps: Any) -> None:
         self.steps = list(steps)
@@ -56,7 +56,7 @@ def page(version: int, *items: Body, continue_: str = "") -> Body:
 async def follow(
     script: Script, monkeypatch: pytest.MonkeyPatch
 ) -> tuple[dict[Key, int], list[tuple[Key, int | None, int | None]]]:
-    """Run a reflector through the script; what it holds then, and what it reported."""
+    """Run an informer through the script. Return its objects and the reported changes."""
     monkeypatch.setattr(informer_module, "_BACKOFF_S", (0.0, 0.0))
     changes: list[tuple[Key, int | None, int | None]] = []
     informer: Informer[int] = Informer(
@@ -136,7 +136,7 @@ async def test_informer_reconnects_after_broken_connection(monkeypatch: pytest.M
 
 
 async def test_informer_lists_again_after_long_silence(monkeypatch: pytest.MonkeyPatch) -> None:
-    """An API server that was restored from a backup tells a watch nothing until it comes to the watch's version once more."""
+    """An API server restored from a backup sends no events until it reaches the version of the watch again."""
     monkeypatch.setattr(informer_module, "_SILENCE_S", 0.0)
     silent = [KubeError(0, "Unreachable", "TimeoutError")]
     script = Script(page(50, zone("a", 40, 4), zone("b", 41, 5)), silent, page(9, zone("a", 7, 3)))
@@ -176,7 +176,7 @@ def test_informer_keeps_own_write_over_older_event() -> None:
     informer._take("MODIFIED", zone("a", 6, 1))
     assert informer.get(("", "a")) == 2
     informer._take("MODIFIED", zone("a", 7, 2))
-    assert len(read) == 1, "what the watch repeats is not read again"
+    assert len(read) == 1, "an object repeated by the watch is not parsed again"
     informer._take("MODIFIED", zone("a", 8, 3))
     assert changes == [(None, 2), (2, 3)]
     informer.record_write(("", "a"), zone("a", 9, 4))
@@ -226,7 +226,7 @@ async def test_informer_ignores_older_own_write_between_pages() -> None:
     task.cancel()
 
 
-def test_paths_of_objects() -> None:
+def test_kind_has_paths_of_objects() -> None:
     assert ZONE.path(name="a", subresource="status") == "/apis/fractus.dev/v1alpha1/zones/a/status"
     assert POLICY.path() == "/apis/fractus.dev/v1alpha1/policies"
 
@@ -250,14 +250,14 @@ async def test_informer_reports_open_watch() -> None:
                 await asyncio.Event().wait()
             return Page(page(1))
 
-    kept = Informer(Watched(), ZONE, lambda body: body, lambda *_: None)  # type: ignore[arg-type]
-    assert not kept.watching
-    task = asyncio.create_task(kept.run())
+    informer = Informer(Watched(), ZONE, lambda body: body, lambda *_: None)  # type: ignore[arg-type]
+    assert not informer.watching
+    task = asyncio.create_task(informer.run())
     async with asyncio.timeout(20.0):
         await is_open.wait()
-        assert kept.watching
+        assert informer.watching
         ended.set()
         await listed_again.wait()
-        assert not kept.watching
+        assert not informer.watching
     task.cancel()
     await asyncio.gather(task, return_exceptions=True)

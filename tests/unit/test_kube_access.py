@@ -12,14 +12,14 @@ class Tokens:
     """Issues numbered tokens, or refuses if `refuses` is set."""
 
     def __init__(self) -> None:
-        self.given = 0
+        self.issued = 0
         self.refuses = False
 
     async def __call__(self) -> str:
         if self.refuses:
             raise KubeError(403, "Forbidden", "not now")
-        self.given += 1
-        return str(self.given)
+        self.issued += 1
+        return str(self.issued)
 
 
 async def bearer(access: Access) -> str | None:
@@ -31,13 +31,13 @@ async def test_token_is_requested_before_first_request_and_reused() -> None:
     base = Configuration(host="https://api", cert_file="crt", key_file="key")
     base.api_key["BearerToken"] = "Bearer of the pod"
     access = with_tokens(base, tokens, 3600.0)
-    assert tokens.given == 0
+    assert tokens.issued == 0
     assert [await bearer(access) for _ in range(2)] == ["Bearer 1", "Bearer 1"]
     await access.renew()
     assert await bearer(access) == "Bearer 2", "a refused token is replaced at once"
     assert access.configuration.host == "https://api"
     assert access.configuration.cert_file is access.configuration.key_file is None, (
-        "no client certificate is sent beside the token"
+        "no client certificate is sent in addition to the token"
     )
     assert base.api_key == {"BearerToken": "Bearer of the pod"}
     assert base.cert_file == "crt"

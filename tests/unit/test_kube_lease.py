@@ -1,4 +1,4 @@
-"""The Lease by which one of several operators acts, on a clock and an API server of the test's own."""
+"""Leader election by a Lease, with a fake clock and a fake API server."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ DURATION_S = 10.0
 
 
 class Shelf:
-    """As much of an API server as a Lease needs: one object with a version."""
+    """Fake API server with one Lease object and its resource version."""
 
     def __init__(self) -> None:
         self.body: Body | None = None
@@ -80,19 +80,19 @@ def lease(shelf: Shelf, clock: Clock, identity: str) -> Lease:
 
 
 async def step(*leases: Lease) -> None:
-    """Each asks once, in order."""
-    for one in leases:
-        task = asyncio.create_task(one.run())
+    """Let each candidate make one attempt, in order."""
+    for candidate in leases:
+        task = asyncio.create_task(candidate.run())
         for _ in range(6):
             await asyncio.sleep(0)
         if task.done():
             task.result()
-        # Ended as a killed process is: nothing is given back.
-        one_release = one._release
-        one._release = _nothing  # type: ignore[method-assign]
+        # End like a killed process, without releasing the Lease.
+        one_release = candidate._release
+        candidate._release = _nothing  # type: ignore[method-assign]
         task.cancel()
         await asyncio.gather(task, return_exceptions=True)
-        one._release = one_release  # type: ignore[method-assign]
+        candidate._release = one_release  # type: ignore[method-assign]
 
 
 async def _nothing() -> None:
@@ -114,7 +114,7 @@ async def test_second_candidate_waits_for_lease_duration() -> None:
     clock.now += 0.1
     await step(second)
     assert second.left_s > 0
-    # The first one had stopped long before.
+    # The first holder stopped long before.
     assert acted_until < clock.now - 0.2 * DURATION_S
     assert first.left_s == 0
 
@@ -145,7 +145,7 @@ async def test_frozen_holder_loses_lease() -> None:
 
 
 async def test_restored_lease_is_lost() -> None:
-    """As after the restore of a backup: its watches would wait for versions that are yet to come."""
+    """Use the Lease of an older backup. Watches would wait for versions that do not exist yet."""
     shelf = Shelf()
     clock = Clock()
     only = lease(shelf, clock, "only")
@@ -273,7 +273,7 @@ async def test_renewal_without_response_is_released() -> None:
     assert second.left_s > 0
     writes = shelf.writes
     await first._release()
-    assert shelf.writes == writes, "what another holds is not given back"
+    assert shelf.writes == writes, "a Lease of another holder is not released"
 
 
 class _Closable(Shelf):
@@ -283,7 +283,7 @@ class _Closable(Shelf):
         self.closed = True
 
 
-def _kept_in_a_thread(shelf: _Closable, identity: str, duration_s: float) -> LeaseThread:
+def _lease_thread(shelf: _Closable, identity: str, duration_s: float) -> LeaseThread:
     async def connect() -> Client:
         return cast(Client, shelf)
 
@@ -292,17 +292,17 @@ def _kept_in_a_thread(shelf: _Closable, identity: str, duration_s: float) -> Lea
 
 async def test_busy_event_loop_keeps_lease() -> None:
     shelf = _Closable()
-    kept = _kept_in_a_thread(shelf, "busy", 1.0)
-    task = asyncio.create_task(kept.run())
+    lease_thread = _lease_thread(shelf, "busy", 1.0)
+    task = asyncio.create_task(lease_thread.run())
     async with asyncio.timeout(20.0):
-        await kept.held()
+        await lease_thread.held()
     end = time.monotonic() + 1.5
     while time.monotonic() < end:
         sum(range(1000))
-    assert kept.left_s > 0
+    assert lease_thread.left_s > 0
     task.cancel()
     await asyncio.gather(task, return_exceptions=True)
-    assert kept.left_s == 0
+    assert lease_thread.left_s == 0
     assert shelf.body is not None
     assert shelf.body["spec"]["holderIdentity"] == "", "given back"
     assert shelf.closed
@@ -310,19 +310,19 @@ async def test_busy_event_loop_keeps_lease() -> None:
 
 async def test_taken_lease_ends_lease_thread() -> None:
     shelf = _Closable()
-    kept = _kept_in_a_thread(shelf, "first", 0.5)
-    task = asyncio.create_task(kept.run())
+    lease_thread = _lease_thread(shelf, "first", 0.5)
+    task = asyncio.create_task(lease_thread.run())
     async with asyncio.timeout(20.0):
-        await kept.held()
+        await lease_thread.held()
         assert shelf.body is not None
         shelf.body["spec"] |= {"holderIdentity": "second", "leaseTransitions": 7}
         with pytest.raises(LostLease, match="second has acted"):
             await task
-    assert kept.left_s <= 0.5
+    assert lease_thread.left_s <= 0.5
 
 
 async def test_lease_thread_cancelled_at_once_ends() -> None:
-    task = asyncio.create_task(_kept_in_a_thread(_Closable(), "short", 1.0).run())
+    task = asyncio.create_task(_lease_thread(_Closable(), "short", 1.0).run())
     await asyncio.sleep(0)
     task.cancel()
     async with asyncio.timeout(20.0):
@@ -334,10 +334,10 @@ async def test_lease_thread_without_lease_has_no_time_left() -> None:
     shelf = _Closable()
     await step(lease(shelf, Clock(), "first"))
     shelf.stalls = 1
-    second = _kept_in_a_thread(shelf, "second", 60.0)
+    second = _lease_thread(shelf, "second", 60.0)
     task = asyncio.create_task(second.run())
     async with asyncio.timeout(20.0):
-        while shelf.stalls:  # noqa: ASYNC110 (nothing tells when)
+        while shelf.stalls:  # noqa: ASYNC110 (no notification)
             await asyncio.sleep(0.01)
     task.cancel()
     await asyncio.gather(task, return_exceptions=True)

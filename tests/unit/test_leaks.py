@@ -1,4 +1,4 @@
-"""The search for secrets finds each in all encodings, and has no false positives."""
+"""The search for secrets finds each secret in all encodings, and has no false positives."""
 
 from __future__ import annotations
 

@@ -41,12 +41,12 @@ def target(*pods: PodView) -> object:
 
 
 def test_direct_links_match_golden_file() -> None:
-    found = list(links(pod("a", "10.1.0.5")).values())
+    built = list(links(pod("a", "10.1.0.5")).values())
     path = GOLDEN / "expected.yaml"
     if os.environ.get("FRACTUS_GOLDEN") == "write":
-        path.write_text(yaml.safe_dump_all(found, sort_keys=False, width=120))
-    assert found == list(yaml.safe_load_all(path.read_text()))
-    for body in found:
+        path.write_text(yaml.safe_dump_all(built, sort_keys=False, width=120))
+    assert built == list(yaml.safe_load_all(path.read_text()))
+    for body in built:
         assert DirectLink.from_body(body).spec.to_dict() == body["spec"]
 
 

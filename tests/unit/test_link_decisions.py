@@ -44,15 +44,15 @@ def actions(situation: LinkSituation) -> LinkActions:
 
 
 def test_near_peer_with_beacons_is_linked() -> None:
-    found = actions(LinkSituation(NOW_S, STANDING, (TRAFFIC,), NO_LINK, IN_CONTACT, CLOUD))
-    assert (found.peer, found.link.changes, found.planned, found.abrupt) == ("e1", True, {}, {})
+    decided = actions(LinkSituation(NOW_S, STANDING, (TRAFFIC,), NO_LINK, IN_CONTACT, CLOUD))
+    assert (decided.peer, decided.link.changes, decided.planned, decided.abrupt) == ("e1", True, {}, {})
 
 
 @pytest.mark.parametrize("ago_s", [2.5, float("inf")])
 def test_peer_without_recent_beacon_is_not_linked(ago_s: float) -> None:
     ranges = {"e1": LearnedRange(last_beacon_s=NOW_S - ago_s)}
-    found = actions(LinkSituation(NOW_S, STANDING, (TRAFFIC,), NO_LINK, ranges, CLOUD))
-    assert (found.peer, found.link.changes, found.link.code) == ("", False, "CloudOnly")
+    decided = actions(LinkSituation(NOW_S, STANDING, (TRAFFIC,), NO_LINK, ranges, CLOUD))
+    assert (decided.peer, decided.link.changes, decided.link.code) == ("", False, "CloudOnly")
 
 
 def test_peer_with_beacons_is_linked_if_a_better_peer_is_silent() -> None:
@@ -67,26 +67,26 @@ def test_traffic_moves_once_the_link_is_measured_and_serves() -> None:
     assert actions(replace(LINKED, direct=None)).planned == {}
     unserved = actions(replace(LINKED, routes={}))
     assert (unserved.planned, unserved.targets["ns/app"].code) == ({}, "NotServed")
-    found = actions(LINKED)
-    assert (found.planned, found.abrupt, found.targets["ns/app"].code) == ({VIP: ROUTE}, {}, "BetterPath")
+    decided = actions(LINKED)
+    assert (decided.planned, decided.abrupt, decided.targets["ns/app"].code) == ({VIP: ROUTE}, {}, "BetterPath")
     assert actions(DIRECT).planned == actions(DIRECT).abrupt == {}
 
 
 def test_link_slower_than_the_cloud_path_carries_no_traffic() -> None:
     assert actions(replace(LINKED, direct=replace(WIFI, ingress_mbps=3.0))).planned == {}
-    back = actions(replace(DIRECT, direct=replace(WIFI, ingress_mbps=3.0)))
-    assert (back.planned, back.abrupt) == ({VIP: None}, {})
+    restored = actions(replace(DIRECT, direct=replace(WIFI, ingress_mbps=3.0)))
+    assert (restored.planned, restored.abrupt) == ({VIP: None}, {})
 
 
 def test_traffic_leaves_a_lost_link_abruptly() -> None:
-    found = actions(replace(DIRECT, link=NO_LINK, direct=None, routes={}))
-    assert (found.abrupt, found.planned) == ({VIP: None}, {})
+    decided = actions(replace(DIRECT, link=NO_LINK, direct=None, routes={}))
+    assert (decided.abrupt, decided.planned) == ({VIP: None}, {})
 
 
 def test_traffic_leaves_the_link_before_its_range_ends() -> None:
     leaving = Track((-69.0, 0.0, 0.0), velocity_mps=(-3.0, 0.0, 0.0))
-    found = actions(replace(DIRECT, track=leaving))
-    assert (found.planned, found.targets["ns/app"].code) == ({VIP: None}, "LeavingLink")
+    decided = actions(replace(DIRECT, track=leaving))
+    assert (decided.planned, decided.targets["ns/app"].code) == ({VIP: None}, "LeavingLink")
 
 
 def test_traffic_moves_back_before_another_peer_is_linked() -> None:
@@ -94,28 +94,28 @@ def test_traffic_moves_back_before_another_peer_is_linked() -> None:
     better = Peer("e2", (60.0, 0.0, 0.0), 80.0, WIFI)
     flight = Track((3.0, 0.0, 0.0), 3.0, ((300.0, 0.0, 0.0),))
     ranges = IN_CONTACT | {"e2": LearnedRange(last_beacon_s=NOW_S)}
-    found = actions(replace(DIRECT, track=flight, traffic=(replace(TRAFFIC, peers=(far, better)),), ranges=ranges))
-    assert (found.peer, found.link.changes) == ("e2", True)
-    assert (found.planned, found.abrupt) == ({VIP: None}, {})
+    decided = actions(replace(DIRECT, track=flight, traffic=(replace(TRAFFIC, peers=(far, better)),), ranges=ranges))
+    assert (decided.peer, decided.link.changes) == ("e2", True)
+    assert (decided.planned, decided.abrupt) == ({VIP: None}, {})
 
 
 def test_link_stays_unchanged_without_a_position() -> None:
-    found = actions(replace(DIRECT, track=None))
-    assert (found.peer, found.link.changes, found.link.code) == ("e1", False, "PositionUnknown")
-    assert found.planned == found.abrupt == {}
+    decided = actions(replace(DIRECT, track=None))
+    assert (decided.peer, decided.link.changes, decided.link.code) == ("e1", False, "PositionUnknown")
+    assert decided.planned == decided.abrupt == {}
 
 
 def test_link_ends_if_it_is_no_longer_planned() -> None:
-    found = actions(replace(DIRECT, traffic=()))
-    assert (found.peer, found.link.changes, found.planned) == ("", True, {VIP: None})
+    decided = actions(replace(DIRECT, traffic=()))
+    assert (decided.peer, decided.link.changes, decided.planned) == ("", True, {VIP: None})
 
 
 def test_each_application_takes_its_own_path() -> None:
     quick = ApplicationTraffic("ns/quick", find_heuristic("min", "ingress-latency"), (NEAR,), frozenset({OTHER_VIP}))
     other = replace(ROUTE, port=30_001)
     slow = replace(WIFI, ingress_mbps=3.0)
-    found = actions(replace(LINKED, traffic=(TRAFFIC, quick), routes={VIP: ROUTE, OTHER_VIP: other}, direct=slow))
-    assert found.planned == {OTHER_VIP: other}
+    decided = actions(replace(LINKED, traffic=(TRAFFIC, quick), routes={VIP: ROUTE, OTHER_VIP: other}, direct=slow))
+    assert decided.planned == {OTHER_VIP: other}
 
 
 def test_traffic_follows_a_moved_pod_and_leaves_a_removed_one() -> None:
@@ -134,14 +134,14 @@ def test_traffic_leaves_an_unreachable_cloud_path(heuristic_of: tuple[str, str |
     traffic = replace(TRAFFIC, heuristic=find_heuristic(*heuristic_of))
     worse = replace(WIFI, ingress_mbps=0.1, egress_mbps=0.1, ingress_latency_ms=500.0)
     linked = replace(LINKED, traffic=(traffic,), direct=worse, **SILENT)
-    found = actions(linked)
-    # Its connections hang, so they are closed without a drain.
-    assert (found.abrupt, found.planned, found.targets["ns/app"].code) == ({VIP: ROUTE}, {}, "CloudSilent")
-    kept = actions(replace(linked, redirects={VIP: ROUTE}))
-    assert kept.abrupt == kept.planned == {}
-    # Once it is reachable, traffic goes back to it as from any slower path.
-    back = actions(replace(linked, redirects={VIP: ROUTE}, cloud=CLOUD))
-    assert back.planned == ({} if heuristic_of[0] == "preferDirect" else {VIP: None})
+    decided = actions(linked)
+    # The connections on the cloud path hang, so they are closed without a drain.
+    assert (decided.abrupt, decided.planned, decided.targets["ns/app"].code) == ({VIP: ROUTE}, {}, "CloudSilent")
+    unchanged = actions(replace(linked, redirects={VIP: ROUTE}))
+    assert unchanged.abrupt == unchanged.planned == {}
+    # When the cloud path is reachable again, traffic returns to it as from any slower path.
+    restored = actions(replace(linked, redirects={VIP: ROUTE}, cloud=CLOUD))
+    assert restored.planned == ({} if heuristic_of[0] == "preferDirect" else {VIP: None})
 
 
 def test_slow_link_is_made_and_kept_without_a_cloud_path() -> None:
@@ -149,41 +149,41 @@ def test_slow_link_is_made_and_kept_without_a_cloud_path() -> None:
     alone = LinkSituation(NOW_S, STANDING, (slow,), NO_LINK, IN_CONTACT, CLOUD)
     assert actions(alone).peer == ""
     assert actions(replace(alone, **SILENT)).peer == "e1"
-    for east in (-69.0, -75.0):  # about to leave the declared range, and outside it
+    for east in (-69.0, -75.0):  # inside the declared range but about to leave it, and outside of it
         leaving = replace(DIRECT, track=Track((east, 0.0, 0.0), velocity_mps=(-3.0, 0.0, 0.0)), **SILENT)
-        found = actions(leaving)
-        assert (found.peer, found.planned, found.abrupt) == ("e1", {}, {})
+        decided = actions(leaving)
+        assert (decided.peer, decided.planned, decided.abrupt) == ("e1", {}, {})
         assert not actions(replace(leaving, redirects={})).abrupt, "no traffic moves to a link that is about to end"
 
 
 def test_traffic_waits_for_the_cloud_path_if_no_path_works() -> None:
-    found = actions(replace(DIRECT, link=NO_LINK, direct=None, routes={}, **SILENT))
-    assert (found.abrupt, found.planned) == ({VIP: None}, {})
+    decided = actions(replace(DIRECT, link=NO_LINK, direct=None, routes={}, **SILENT))
+    assert (decided.abrupt, decided.planned) == ({VIP: None}, {})
 
 
 # Range model
 
 
 def range_model(distance_m: float, **learned: float) -> RangeModel:
-    found = RangeModel(SETTINGS, position=(0.0, 0.0, 0.0), peers={"e1": replace(NEAR, position=(distance_m, 0.0, 0.0))})
+    model = RangeModel(SETTINGS, position=(0.0, 0.0, 0.0), peers={"e1": replace(NEAR, position=(distance_m, 0.0, 0.0))})
     if learned:
-        found.ranges["e1"] = LearnedRange(**learned)
-    return found
+        model.ranges["e1"] = LearnedRange(**learned)
+    return model
 
 
 def test_range_grows_with_measurements_beyond_it_but_not_with_beacons() -> None:
-    found = range_model(96.0)
-    found.on_beacon("e1", NOW_S)
-    assert found.ranges["e1"] == LearnedRange(last_beacon_s=NOW_S)
-    found.on_measurement("e1", WIFI)
-    assert found.ranges["e1"].range_factor == pytest.approx(1.2 * 1.02)
+    model = range_model(96.0)
+    model.on_beacon("e1", NOW_S)
+    assert model.ranges["e1"] == LearnedRange(last_beacon_s=NOW_S)
+    model.on_measurement("e1", WIFI)
+    assert model.ranges["e1"].range_factor == pytest.approx(1.2 * 1.02)
 
 
 def test_beacon_restores_at_most_the_declared_range() -> None:
-    found = range_model(96.0, range_factor=1.4)
-    found.on_link_lost("e1", NOW_S)
-    found.on_beacon("e1", NOW_S + 1.0)
-    assert found.ranges["e1"].range_factor == pytest.approx(1.2 / 1.02)
+    model = range_model(96.0, range_factor=1.4)
+    model.on_link_lost("e1", NOW_S)
+    model.on_beacon("e1", NOW_S + 1.0)
+    assert model.ranges["e1"].range_factor == pytest.approx(1.2 / 1.02)
     near = range_model(72.0, range_factor=1.4)
     near.on_link_lost("e1", NOW_S)
     near.on_beacon("e1", NOW_S + 1.0)
@@ -191,11 +191,11 @@ def test_beacon_restores_at_most_the_declared_range() -> None:
 
 
 def test_range_model_forgets_peers_that_are_not_planned() -> None:
-    found = range_model(64.0)
+    model = range_model(64.0)
     for name in ("e1", "e2"):
-        found.on_link_up(name, NOW_S)
-    found.retain({"e2"})
-    assert set(found.ranges) == {"e2"}
+        model.on_link_up(name, NOW_S)
+    model.retain({"e2"})
+    assert set(model.ranges) == {"e2"}
 
 
 def test_loss_well_inside_the_range_does_not_shorten_it() -> None:
@@ -208,33 +208,33 @@ def test_loss_well_inside_the_range_does_not_shorten_it() -> None:
 
 
 def test_range_is_restored_by_a_beacon_from_where_the_link_broke() -> None:
-    found = range_model(64.0)
-    found.on_link_lost("e1", NOW_S)
-    assert found.ranges["e1"].last_failure_s == NOW_S
-    found.peers = {"e1": replace(NEAR, position=(50.0, 0.0, 0.0))}
-    found.on_beacon("e1", NOW_S + 0.5)
-    assert found.ranges["e1"].range_factor == pytest.approx(0.8 / 1.02)
-    found.peers = {"e1": replace(NEAR, position=(64.0, 0.0, 0.0))}
-    found.on_beacon("e1", NOW_S + 1.0)
-    assert found.ranges["e1"].range_factor == 1.0
+    model = range_model(64.0)
+    model.on_link_lost("e1", NOW_S)
+    assert model.ranges["e1"].last_failure_s == NOW_S
+    model.peers = {"e1": replace(NEAR, position=(50.0, 0.0, 0.0))}
+    model.on_beacon("e1", NOW_S + 0.5)
+    assert model.ranges["e1"].range_factor == pytest.approx(0.8 / 1.02)
+    model.peers = {"e1": replace(NEAR, position=(64.0, 0.0, 0.0))}
+    model.on_beacon("e1", NOW_S + 1.0)
+    assert model.ranges["e1"].range_factor == 1.0
 
 
 def test_rate_is_learned_only_well_inside_the_range() -> None:
     inside = range_model(10.0)
     edge = range_model(79.0)
-    for found in (inside, edge):
-        found.on_measurement("e1", replace(WIFI, ingress_mbps=6.0))
+    for model in (inside, edge):
+        model.on_measurement("e1", replace(WIFI, ingress_mbps=6.0))
     assert inside.ranges["e1"].rate_factor < 1.0
     assert "e1" not in edge.ranges
 
 
 def test_failed_pairing_attempts_back_off() -> None:
-    found = range_model(10.0)
-    found.on_pairing_failed("e1", NOW_S)
-    found.on_pairing_failed("e1", NOW_S)
-    assert next_attempt_s(found.ranges["e1"], linked=False) == NOW_S + 2.0
-    found.on_link_up("e1", NOW_S)
-    assert found.ranges["e1"].failures == 0
+    model = range_model(10.0)
+    model.on_pairing_failed("e1", NOW_S)
+    model.on_pairing_failed("e1", NOW_S)
+    assert next_attempt_s(model.ranges["e1"], linked=False) == NOW_S + 2.0
+    model.on_link_up("e1", NOW_S)
+    assert model.ranges["e1"].failures == 0
 
 
 def test_audit_records_contain_the_inputs_of_a_decision() -> None:
@@ -247,9 +247,11 @@ def test_audit_records_contain_the_inputs_of_a_decision() -> None:
     ((kind, moved),) = decision_records(actions(LINKED), LINKED)
     assert (kind, moved["application"], moved["path"], moved["code"]) == ("traffic", "ns/app", "e1", "BetterPath")
     assert (moved["cloud"]["ingress_mbps"], moved["direct"]["ingress_mbps"]) == (8.0, 12.0)
-    gone = replace(DIRECT, link=NO_LINK, direct=None, routes={})
-    ((_, back),) = [found for found in decision_records(actions(gone), gone) if found[0] == "traffic"]
-    assert (back["path"], back["code"], back["direct"]) == ("cloud", "NoDirectLink", None)
+    without_link = replace(DIRECT, link=NO_LINK, direct=None, routes={})
+    ((_, restored),) = [
+        decided for decided in decision_records(actions(without_link), without_link) if decided[0] == "traffic"
+    ]
+    assert (restored["path"], restored["code"], restored["direct"]) == ("cloud", "NoDirectLink", None)
 
 
 def test_decision_without_changes_has_no_audit_record() -> None:

@@ -1,4 +1,4 @@
-"""Events of direct links: each change has one Event, in order, and a flapping link has few."""
+"""Events of direct links: each change has one Event, in order. A flapping link has few Events."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ def report(phase: str = "Idle", traffic: str = "cloud", switches: int = 0, messa
     return parse_link_report({"spec": SPEC, "status": status})
 
 
-def reasons(told: LinkReport, now: LinkReport) -> list[str]:
-    return [reason for reason, _ in link_changes(told, now)]
+def reasons(before: LinkReport, now: LinkReport) -> list[str]:
+    return [reason for reason, _ in link_changes(before, now)]
 
 
 UP = report("Up")
@@ -71,7 +71,7 @@ def events(posted: Recorder) -> LinkEventRecorder:
 
 
 async def see(events: LinkEventRecorder, *reports: LinkReport | None) -> None:
-    """Let the watch show these one after the other."""
+    """Deliver the reports by the watch, one after the other."""
     for now in reports:
         events.changed(KEY, events._current.get(KEY), now)
         await events.reconcile(KEY)

@@ -1,4 +1,4 @@
-"""Link planner: plans against exhaustive enumeration, and in closed loop against an oracle that knows the flight."""
+"""Link planner compared with exhaustive enumeration, and in closed loop with an oracle that knows the whole flight."""
 
 from __future__ import annotations
 
@@ -59,16 +59,16 @@ def peer(name: str, east: float, north: float = 0.0, range_m: float = 80.0) -> P
     return Peer(name, (east, north, 0.0), range_m, WIFI)
 
 
-def decide(track: Track, peers: Sequence[Peer], link: LinkState = NO_LINK, now_s: float = 100.0, **given_: object):
-    kwargs = {"heuristic": INGRESS, "settings": SETTINGS, "ranges": {}} | given_
+def decide(track: Track, peers: Sequence[Peer], link: LinkState = NO_LINK, now_s: float = 100.0, **overrides: object):
+    kwargs = {"heuristic": INGRESS, "settings": SETTINGS, "ranges": {}} | overrides
     return plan_link(track, peers, CLOUD, link, now_s, **kwargs)
 
 
-# Dynamic program against exhaustive enumeration
+# Dynamic program compared with exhaustive enumeration
 
 
 def best_by_enumeration(horizon: Horizon, step: int, state: int) -> float:
-    """Return the best sum of scores from a step on, by trying every move at every step."""
+    """Return the best sum of scores from a step on, by exhaustive enumeration of all moves."""
     if step >= horizon.steps:
         return 0.0
     options = [horizon.cloud + best_by_enumeration(horizon, step + 1, 0)]
@@ -123,9 +123,9 @@ def test_peer_ahead_is_linked_when_it_comes_into_range() -> None:
 
 def test_plan_contains_the_time_of_the_next_peer() -> None:
     flight = Track((125.0, 0.0, 0.0), 5.0, ((600.0, 0.0, 0.0),))
-    found = decide(flight, [peer("e1", 200.0), peer("e2", 330.0)])
-    assert [segment.peer for segment in found.plan][:2] == ["e1", "e2"]
-    assert 15.0 < found.plan[1].begin_s < 35.0
+    decision = decide(flight, [peer("e1", 200.0), peer("e2", 330.0)])
+    assert [segment.peer for segment in decision.plan][:2] == ["e1", "e2"]
+    assert 15.0 < decision.plan[1].begin_s < 35.0
 
 
 def test_link_slower_than_the_cloud_path_is_not_used() -> None:
@@ -137,8 +137,8 @@ def test_link_slower_than_the_cloud_path_is_not_used() -> None:
 
 def test_working_link_is_kept_if_another_peer_is_equal() -> None:
     up = LinkState(LinkPhase.UP, "e1", 0.0)
-    found = decide(Track((0.0, 0.0, 0.0)), [peer("e1", -30.0), peer("e2", 20.0)], up)
-    assert (found.peer, found.changes) == ("e1", False)
+    decision = decide(Track((0.0, 0.0, 0.0)), [peer("e1", -30.0), peer("e2", 20.0)], up)
+    assert (decision.peer, decision.changes) == ("e1", False)
 
 
 def test_new_link_is_kept_for_the_dwell_time() -> None:
@@ -150,15 +150,17 @@ def test_new_link_is_kept_for_the_dwell_time() -> None:
 
 def test_link_out_of_range_is_left() -> None:
     up = LinkState(LinkPhase.UP, "e1", 0.0)
-    found = decide(Track((200.0, 0.0, 0.0)), [peer("e1", 0.0)], up)
-    assert (found.peer, found.code, found.changes) == ("", "OutOfReach", True)
+    decision = decide(Track((200.0, 0.0, 0.0)), [peer("e1", 0.0)], up)
+    assert (decision.peer, decision.code, decision.changes) == ("", "OutOfReach", True)
 
 
 def test_connecting_link_is_abandoned_only_if_no_longer_useful() -> None:
     coming = LinkState(LinkPhase.CONNECTING, "e1", 99.6)
     assert decide(Track((0.0, 0.0, 0.0)), [peer("e1", 0.0)], coming).code == "Connecting"
-    gone = decide(Track((79.0, 0.0, 0.0), 20.0, ((900.0, 0.0, 0.0),)), [peer("e1", 0.0), peer("e2", 120.0)], coming)
-    assert gone.peer == "e2"
+    left_link = decide(
+        Track((79.0, 0.0, 0.0), 20.0, ((900.0, 0.0, 0.0),)), [peer("e1", 0.0), peer("e2", 120.0)], coming
+    )
+    assert left_link.peer == "e2"
 
 
 def test_peer_that_failed_to_pair_is_retried_after_the_back_off() -> None:
@@ -186,8 +188,8 @@ def test_lost_link_shortens_the_expected_range_of_unknown_peers() -> None:
     ranges = {"e1": with_loss(with_contact(LearnedRange(), 0.5, 10.0), 0.8)}
     assert expected_range(ranges, "e1").range_factor == pytest.approx(0.8 / 1.02)
     assert expected_range(ranges, "e2").range_factor == pytest.approx(0.8 / 1.02)
-    heard_far = {"e2": with_contact(LearnedRange(), 1.2, 11.0)} | ranges
-    assert expected_range(heard_far, "e2").range_factor == pytest.approx(1.2 * 1.02)
+    extended = {"e2": with_contact(LearnedRange(), 1.2, 11.0)} | ranges
+    assert expected_range(extended, "e2").range_factor == pytest.approx(1.2 * 1.02)
 
 
 def test_velocity_is_extrapolated_for_the_trust_time() -> None:
@@ -221,10 +223,10 @@ def test_path_choice_takes_the_better_path_with_hysteresis() -> None:
     assert not choose(replace(WIFI, ingress_mbps=8.2), False).changes
     assert not choose(replace(WIFI, ingress_mbps=7.8), True).changes
     assert choose(replace(WIFI, ingress_mbps=5.0), True).code == "BetterPath"
-    left = choose(WIFI, True, leaving=True)
-    assert (left.direct, left.changes, left.planned) == (False, True, True)
-    gone = choose(None, True)
-    assert (gone.direct, gone.changes, gone.planned) == (False, True, False)
+    leaving = choose(WIFI, True, leaving=True)
+    assert (leaving.direct, leaving.changes, leaving.planned) == (False, True, True)
+    left_link = choose(None, True)
+    assert (left_link.direct, left_link.changes, left_link.planned) == (False, True, False)
 
 
 def test_traffic_leaves_the_link_before_its_range_ends() -> None:
@@ -294,9 +296,9 @@ def test_planner_gains_more_with_fewer_links_than_the_thesis_rule() -> None:
     for seed in range(examples(40, 2)):
         totals["best"] += most(seed)
         for name, rule in (("planner", planner_rule), ("thesis", thesis_rule)):
-            gain, made = gained(seed, rule)
+            gain, links_made = gained(seed, rule)
             totals[name] += gain
-            links[name] += made
+            links[name] += links_made
     print(f"seeds 0-: {totals} {links}")
     assert totals["planner"] >= 0.95 * totals["best"]
     assert totals["planner"] > totals["thesis"]
@@ -317,6 +319,6 @@ def test_no_rule_gains_more_than_the_best_gain() -> None:
 
 def test_decisions_are_deterministic() -> None:
     flight = random_flight(7)
-    found = [planner_rule(flight, step, NO_LINK, {}) for step in range(0, 100, 5)]
-    assert found == [planner_rule(flight, step, NO_LINK, {}) for step in range(0, 100, 5)]
-    assert len(list(itertools.groupby(found))) >= 1
+    decisions = [planner_rule(flight, step, NO_LINK, {}) for step in range(0, 100, 5)]
+    assert decisions == [planner_rule(flight, step, NO_LINK, {}) for step in range(0, 100, 5)]
+    assert len(list(itertools.groupby(decisions))) >= 1

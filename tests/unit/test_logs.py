@@ -12,7 +12,7 @@ from fractus_runtime.logs import BURST, MAX_CALLERS, RATE_PER_S, CallerLogLimit,
 
 
 class LimitedLog:
-    """A log with a rate limit and a clock that the test sets."""
+    """Log filter with a rate limit and a clock set by the test."""
 
     def __init__(self) -> None:
         self.now_s = 10.0
@@ -91,7 +91,7 @@ def test_json_log_has_the_values_of_a_message_as_fields() -> None:
     assert entry["time"].endswith("+00:00")
 
 
-def test_what_a_peer_says_adds_no_field_and_no_formatted() -> None:
+def test_text_from_a_peer_adds_no_json_fields() -> None:
     text = JsonFormatter().format(
         logging.LogRecord("n", 20, "m.py", 1, "call: refused (peer=%s)", ('x) level=ok\n{"a": 1}',), None)
     )

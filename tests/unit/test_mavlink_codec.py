@@ -1,4 +1,4 @@
-"""The MAVLink codec: encoding by name, and a parser that survives every stream of bytes."""
+"""The MAVLink codec: encoding by name, and a parser that accepts every stream of bytes without an error."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from mavlink_frames import MESSAGE_CLASSES, MessageClass, frame_v1, frame_v2
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 KEY = hashlib.sha256(b"secret").digest()
-OTHER_KEY = hashlib.sha256(b"other").digest()
+FOREIGN_KEY = hashlib.sha256(b"other").digest()
 FRAME_STARTS = bytes((mavlink.PROTOCOL_MARKER_V1, mavlink.PROTOCOL_MARKER_V2))
 
 
@@ -154,7 +154,7 @@ def test_fragmented_frames_between_garbage_are_decoded() -> None:
 
 @pytest.mark.parametrize("length", [0, 2, 30, 60, 100, 255])
 def test_frames_behind_a_damaged_length_byte_are_decoded(length: int) -> None:
-    """pymavlink's own parser loses them."""
+    """The parser of pymavlink loses these frames."""
     damaged = bytearray(heartbeat(99))
     damaged[1] = length
     intact = [heartbeat(number) for number in range(20)]
@@ -167,7 +167,7 @@ def test_frames_behind_a_damaged_length_byte_are_decoded(length: int) -> None:
 def test_frame_behind_a_truncated_frame_is_decoded() -> None:
     whole = Endpoint(1, 1).encode("ATTITUDE", {"yaw": 1.0})
     for length in range(1, len(whole)):
-        # Enough bytes follow to complete the length that the truncated frame announces.
+        # Enough bytes follow to complete the length in the header of the truncated frame.
         received = Parser().feed(whole[:length] + heartbeat(7) * 3 + bytes(300))
         assert [message.integer("custom_mode") for message in received] == [7, 7, 7], length
 
@@ -195,7 +195,7 @@ def test_large_input_without_frames_leaves_nothing_behind() -> None:
     assert [message.name for message in parser.feed(bytes(300) + heartbeat())] == ["HEARTBEAT"]
 
 
-def test_a_flipped_bit_is_never_accepted() -> None:
+def test_frame_with_a_flipped_bit_is_never_accepted() -> None:
     frame = Endpoint(255, 190).encode("COMMAND_LONG", {"command": 400, "param1": 1.0})
     for bit in range(8, len(frame) * 8):
         damaged = bytearray(frame)
@@ -240,7 +240,9 @@ def test_only_frames_with_the_key_are_accepted_once_signing_is_on() -> None:
     assert received.signed
     assert receiver.decode(frame) == [], "a replayed frame"
     assert receiver.decode(Endpoint(255, 190).encode("HEARTBEAT", {})) == [], "a frame without signature"
-    assert receiver.decode(signing_endpoint(OTHER_KEY, 2000).encode("HEARTBEAT", {})) == [], "a frame with another key"
+    assert receiver.decode(signing_endpoint(FOREIGN_KEY, 2000).encode("HEARTBEAT", {})) == [], (
+        "a frame with another key"
+    )
     (answer,) = signing_endpoint(KEY, 1000).decode(receiver.encode("HEARTBEAT", {}))
     assert answer.signed
 
@@ -254,9 +256,9 @@ def test_modem_status_needs_no_signature() -> None:
 def test_forged_signature_with_a_late_timestamp_does_not_shut_out_the_sender() -> None:
     receiver = signing_endpoint(KEY, 1000, sysid=1)
     sender = signing_endpoint(KEY, 1000)
-    assert receiver.decode(signing_endpoint(OTHER_KEY, 10**9).encode("HEARTBEAT", {})) == []
+    assert receiver.decode(signing_endpoint(FOREIGN_KEY, 10**9).encode("HEARTBEAT", {})) == []
     assert len(receiver.decode(sender.encode("HEARTBEAT", {}))) == 1
-    assert receiver.decode(signing_endpoint(OTHER_KEY, 10**9).encode("HEARTBEAT", {})) == []
+    assert receiver.decode(signing_endpoint(FOREIGN_KEY, 10**9).encode("HEARTBEAT", {})) == []
     assert len(receiver.decode(sender.encode("HEARTBEAT", {}))) == 1
 
 

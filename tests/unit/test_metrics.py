@@ -10,14 +10,14 @@ from fractus_runtime.metrics import gauge, hash_number, metrics_text
 from prometheus_client import Counter
 from scraping import DOCS, documented, values
 
-OTHER_NAMES = {"fractus_agent", "fractus_call", "fractus_operator"}
+NON_METRIC_NAMES = {"fractus_agent", "fractus_call", "fractus_operator"}
 """Names of loggers and of a context variable."""
 
 
 def test_metrics_page_lists_exactly_the_metrics_of_the_code() -> None:
     folders = ("runtime", "operator", "agent", "services", "view", "core")
     code = "".join(file.read_text() for folder in folders for file in (DOCS.parent / folder).rglob("*.py"))
-    assert set(re.findall(r'"(fractus_[a-z_]+)"', code)) - OTHER_NAMES == documented().keys()
+    assert set(re.findall(r'"(fractus_[a-z_]+)"', code)) - NON_METRIC_NAMES == documented().keys()
 
 
 @pytest.mark.parametrize("value", [0.0, -1.5, 1e-9, 1_780_000_000.25, math.inf, -math.inf, True])

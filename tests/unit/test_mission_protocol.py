@@ -1,4 +1,4 @@
-"""The mission protocol from our side: lists written and read over a link that loses messages."""
+"""Upload and download of lists by the mission protocol over a link that loses messages."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 ITEMS = tuple(MissionItem(5001, 3.0, 393600000 + i, 229500000 - i) for i in range(3))
 
 
-class Keeper(MavlinkAutopilot):
-    """An autopilot that keeps one list; it hears and says every message but those whose number is in `lost`."""
+class ListVehicle(MavlinkAutopilot):
+    """Fake autopilot that stores one list. Messages with the numbers in `lost` are lost, in either direction."""
 
     def __init__(self, *lost: int, result: int = 0) -> None:
         super().__init__("tcp:nowhere:1", ARDUCOPTER)
         self.target = (1, 1)
         self.vehicle.heartbeat_at = asyncio.get_running_loop().time()
         self.items: list[Message] = []
-        self.wanted = 0
+        self.expected_count = 0
         self.result = result
         self._lost = set(lost)
         self._count = 0
@@ -41,7 +41,7 @@ class Keeper(MavlinkAutopilot):
             if answer is not None and self._passes():
                 self.take(
                     message("MISSION_ACK", mission_type=mavlink.MAV_MISSION_TYPE_MISSION)
-                )  # of another list: not ours
+                )  # of another list, which must be ignored
                 self.take(answer)
 
     def _answer(self, outgoing: Message) -> Message | None:
@@ -50,17 +50,17 @@ class Keeper(MavlinkAutopilot):
             return message("MISSION_ACK", type=self.result, mission_type=mavlink.MAV_MISSION_TYPE_FENCE)
         if kind == "MISSION_COUNT":
             self.items = []
-            self.wanted = outgoing.integer("count")
+            self.expected_count = outgoing.integer("count")
         elif kind == "MISSION_ITEM_INT" and outgoing.integer("seq") == len(self.items):
             self.items.append(outgoing)
         elif kind == "MISSION_REQUEST_LIST":
             return message("MISSION_COUNT", count=len(self.items), mission_type=mavlink.MAV_MISSION_TYPE_FENCE)
         elif kind == "MISSION_REQUEST_INT":
-            back = {"target_system": SYSTEM_ID, "target_component": COMPONENT_ID}
-            return message("MISSION_ITEM_INT", **self.items[outgoing.integer("seq")].values | back)
+            addresses = {"target_system": SYSTEM_ID, "target_component": COMPONENT_ID}
+            return message("MISSION_ITEM_INT", **self.items[outgoing.integer("seq")].values | addresses)
         elif kind == "MISSION_ACK":
             return None
-        if len(self.items) < self.wanted:
+        if len(self.items) < self.expected_count:
             return message("MISSION_REQUEST", seq=len(self.items), mission_type=mavlink.MAV_MISSION_TYPE_FENCE)
         return message("MISSION_ACK", mission_type=mavlink.MAV_MISSION_TYPE_FENCE)
 
@@ -72,73 +72,73 @@ def _impatient(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("lost", [(), (1,), (2,), (3, 4), (6,), (8, 9, 10), (11,)])
 async def test_uploaded_items_are_downloaded_despite_lost_messages(lost: tuple[int, ...]) -> None:
-    keeper = Keeper(*lost)
-    await upload(keeper, ITEMS)
-    assert await download(keeper) == ITEMS
-    await upload(keeper, ())
-    assert await download(keeper) == ()
+    vehicle = ListVehicle(*lost)
+    await upload(vehicle, ITEMS)
+    assert await download(vehicle) == ITEMS
+    await upload(vehicle, ())
+    assert await download(vehicle) == ()
 
 
 @pytest.mark.parametrize(("result", "why"), [(4, "no space"), (14, "denied"), (77, "result 77")])
 async def test_upload_raises_the_reason_of_a_refusal(result: int, why: str) -> None:
     with pytest.raises(AutopilotError, match=why):
-        await upload(Keeper(result=result), ITEMS)
+        await upload(ListVehicle(result=result), ITEMS)
 
 
 async def test_unsupported_list_raises_items_unsupported() -> None:
     with pytest.raises(ItemsUnsupported):
-        await upload(Keeper(result=3), ITEMS)
+        await upload(ListVehicle(result=3), ITEMS)
     with pytest.raises(ItemsUnsupported):
-        await download(Keeper(result=3))
+        await download(ListVehicle(result=3))
 
 
 async def test_upload_and_download_raise_when_the_vehicle_is_silent() -> None:
     silent = range(1, 100)
     with pytest.raises(AutopilotError, match="stopped answering") as written:
-        await upload(Keeper(*silent), ITEMS)
+        await upload(ListVehicle(*silent), ITEMS)
     with pytest.raises(AutopilotError, match="stopped answering") as read:
-        await download(Keeper(*silent))
+        await download(ListVehicle(*silent))
     assert written.value.link
     assert read.value.link
 
 
 async def test_nothing_is_sent_without_a_connected_vehicle() -> None:
-    keeper = Keeper()
-    keeper.target = None
+    vehicle = ListVehicle()
+    vehicle.target = None
     with pytest.raises(AutopilotError, match="not connected"):
-        await download(keeper)
+        await download(vehicle)
 
 
 @pytest.mark.parametrize(
     ("result", "kind"), [(mavlink.MAV_MISSION_ERROR, AutopilotError), (mavlink.MAV_MISSION_NO_SPACE, NoSpace)]
 )
 async def test_refusal_contains_the_status_text_of_the_autopilot(result: int, kind: type[AutopilotError]) -> None:
-    keeper = Keeper(result=result)
+    vehicle = ListVehicle(result=result)
     text = message("STATUSTEXT", severity=4, text=b"Invalid vertex count (2)")
-    asyncio.get_running_loop().call_later(0.1, keeper.take, text)
+    asyncio.get_running_loop().call_later(0.1, vehicle.take, text)
     with pytest.raises(kind, match=r"refused the fence: .*: Invalid vertex count \(2\)"):
-        await upload(keeper, ITEMS)
+        await upload(vehicle, ITEMS)
 
 
 async def test_lost_acknowledgement_of_the_last_item_is_not_a_refusal() -> None:
-    class Finished(Keeper):
-        """As ArduPilot, which answers ERROR to an item that it does not await."""
+    class Finished(ListVehicle):
+        """Respond with ERROR to an unexpected item, as ArduPilot does."""
 
         def _answer(self, outgoing: Message) -> Message | None:
-            if outgoing.name == "MISSION_ITEM_INT" and len(self.items) == self.wanted:
+            if outgoing.name == "MISSION_ITEM_INT" and len(self.items) == self.expected_count:
                 return message(
                     "MISSION_ACK", type=mavlink.MAV_MISSION_ERROR, mission_type=mavlink.MAV_MISSION_TYPE_FENCE
                 )
             return super()._answer(outgoing)
 
-    keeper = Finished(8)
-    await upload(keeper, ITEMS)
-    assert await download(keeper) == ITEMS
+    vehicle = Finished(8)
+    await upload(vehicle, ITEMS)
+    assert await download(vehicle) == ITEMS
 
 
 async def test_duplicate_item_does_not_end_the_upload() -> None:
-    class Impatient(Keeper):
-        """It asks for the second item again before that has come, and tells that the copy is out of order."""
+    class Impatient(ListVehicle):
+        """Request the second item again before it arrives, and report the duplicate as out of order."""
 
         def _answer(self, outgoing: Message) -> Message | None:
             if outgoing.name == "MISSION_ITEM_INT" and outgoing.integer("seq") < len(self.items):
@@ -152,11 +152,11 @@ async def test_duplicate_item_does_not_end_the_upload() -> None:
                 self.take(answer)
             return answer
 
-    keeper = Impatient()
-    await upload(keeper, ITEMS)
-    assert await download(keeper) == ITEMS
+    vehicle = Impatient()
+    await upload(vehicle, ITEMS)
+    assert await download(vehicle) == ITEMS
 
 
 async def test_persistent_invalid_sequence_ends_the_upload() -> None:
     with pytest.raises(AutopilotError, match="stopped answering"):
-        await upload(Keeper(result=mavlink.MAV_MISSION_INVALID_SEQUENCE), ITEMS)
+        await upload(ListVehicle(result=mavlink.MAV_MISSION_INVALID_SEQUENCE), ITEMS)

@@ -24,21 +24,21 @@ def instance(application, component, node=None):
 
 def divisions(tokens):
     """Return all divisions of words into application, component and optional node, joined by hyphens or dots."""
-    found = []
+    results = []
     for i, j in itertools.combinations(range(1, len(tokens) + 1), 2):
         component = "-".join(tokens[i:j])
         node = tokens[j:]
         if not component[0].isalpha():
             continue
-        found += [(mark.join(tokens[:i]), component, inner.join(node) or None) for mark in "-." for inner in "-."]
-    return list(dict.fromkeys(found))
+        results += [(mark.join(tokens[:i]), component, inner.join(node) or None) for mark in "-." for inner in "-."]
+    return list(dict.fromkeys(results))
 
 
 words = st.lists(st.sampled_from(["a", "b", "e", "1", "edge", "stat", "c2", "x" * 20]), min_size=2, max_size=6)
 
 
 @pytest.mark.parametrize(
-    ("one", "other"),
+    ("first", "second"),
     [
         (("a", "Viewer", "e.1"), ("a", "Viewer", "e-1")),
         (("a", "Stat", "e-1"), ("a", "Stat-e", "1")),
@@ -47,10 +47,10 @@ words = st.lists(st.sampled_from(["a", "b", "e", "1", "edge", "stat", "c2", "x" 
         (("a.b", "C"), ("a-b", "C")),
     ],
 )
-def test_instance_names_differ_when_joined_parts_are_equal(one, other):
-    assert instance(*one) != instance(*other)
-    if len(one) == 2:
-        assert service_name(one[0], named(one[1])) != service_name(other[0], named(other[1]))
+def test_instance_names_differ_when_joined_parts_are_equal(first, second):
+    assert instance(*first) != instance(*second)
+    if len(first) == 2:
+        assert service_name(first[0], named(first[1])) != service_name(second[0], named(second[1]))
 
 
 @given(words)
@@ -58,9 +58,9 @@ def test_instance_names_differ_when_joined_parts_are_equal(one, other):
 def test_instance_names_differ_for_every_division_of_same_words(tokens):
     divided = divisions(tokens)
     names = [instance(*parts) for parts in divided]
-    # A name that looks like a generated name, including its hash, also differs from all others.
-    made = {parts for name in names for parts in divisions(name.split("-"))} if len(tokens) < 4 else set()
-    everything = list(dict.fromkeys([*divided, *made]))
+    # Names that imitate generated names, including the hash, also differ from all other names.
+    generated = {parts for name in names for parts in divisions(name.split("-"))} if len(tokens) < 4 else set()
+    everything = list(dict.fromkeys([*divided, *generated]))
     names = [instance(*parts) for parts in everything]
     assert len(set(names)) == len(everything)
     assert all(LABEL.fullmatch(name) and LABEL.fullmatch(secret_name(name)) for name in names)

@@ -22,20 +22,20 @@ def drone(pitch: float, name: str = "drone-1") -> dict[str, Any]:
 
 
 class Node:
-    """The files of a node."""
+    """Files with the description of a node."""
 
     def __init__(self, directory: Path) -> None:
-        self.handed = directory / "node.json"
+        self.object_path = directory / "node.json"
         self.file = directory / "node.yaml"
 
-    def hand_over(self, pitch: float, name: str = "drone-1") -> None:
-        NodeObjectFile(self.handed).write(Drone.from_body(drone(pitch, name)))
+    def store_object(self, pitch: float, name: str = "drone-1") -> None:
+        NodeObjectFile(self.object_path).write(Drone.from_body(drone(pitch, name)))
 
     def write(self, text: str) -> None:
         self.file.write_text(text)
 
     def describe(self, *kinds: type[Drone | EdgeNode], node: str | None = "drone-1") -> NodeDescription:
-        return NodeDescription(node, self.handed, self.file, *(kinds or (Drone, EdgeNode)))
+        return NodeDescription(node, self.object_path, self.file, *(kinds or (Drone, EdgeNode)))
 
 
 @pytest.fixture
@@ -44,10 +44,10 @@ def node(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Node:
     return Node(tmp_path)
 
 
-def pitch(found: NodeDescription) -> float | None:
-    if found.value is None:
+def pitch(description: NodeDescription) -> float | None:
+    if description.value is None:
         return None
-    camera = found.value.spec.services.camera
+    camera = description.value.spec.services.camera
     assert camera is not None
     assert camera.mount is not None
     return camera.mount.pitch
@@ -57,7 +57,7 @@ def test_node_description_prefers_object_of_agent_to_file(node: Node) -> None:
     assert pitch(node.describe()) is None
     node.write(str(drone(-10)))
     assert pitch(node.describe()) == -10
-    node.hand_over(-20)
+    node.store_object(-20)
     assert pitch(node.describe()) == -20
 
 
@@ -66,31 +66,31 @@ def test_node_description_prefers_object_of_agent_to_file(node: Node) -> None:
 )
 def test_node_description_is_empty_when_object_is_unreadable(node: Node, content: str) -> None:
     node.write(str(drone(-10)))
-    node.handed.write_text(content)
+    node.object_path.write_text(content)
     assert pitch(node.describe()) is None
 
 
 def test_node_description_is_empty_when_object_is_emptied(node: Node) -> None:
     node.write(str(drone(-10)))
-    node.hand_over(-20)
-    NodeObjectFile(node.handed).clear("The agent cannot read the object.")
+    node.store_object(-20)
+    NodeObjectFile(node.object_path).clear("The agent cannot read the object.")
     assert pitch(node.describe()) is None
 
 
 def test_node_object_file_accepts_any_text(node: Node) -> None:
     body = drone(-20)
     body["spec"]["services"]["camera"]["model"] = 'Kamera \U0001f681 é\x7f\u2028"\\'
-    NodeObjectFile(node.handed).write(Drone.from_body(body))
-    found = node.describe().value
-    assert found is not None
-    assert found.spec == Drone.from_body(body).spec
+    NodeObjectFile(node.object_path).write(Drone.from_body(body))
+    description = node.describe().value
+    assert description is not None
+    assert description.spec == Drone.from_body(body).spec
 
 
 def test_node_description_ignores_object_of_another_node(node: Node) -> None:
-    node.hand_over(-20, "drone-2")
+    node.store_object(-20, "drone-2")
     assert pitch(node.describe()) is None
     assert pitch(node.describe(node=None)) == -20
-    assert pitch(node.describe(EdgeNode)) is None, "nor one of another kind"
+    assert pitch(node.describe(EdgeNode)) is None, "an object of another kind is ignored too"
 
 
 def test_node_description_raises_at_start_when_file_is_unreadable(node: Node) -> None:
@@ -100,23 +100,23 @@ def test_node_description_raises_at_start_when_file_is_unreadable(node: Node) ->
 
 
 async def test_node_description_reports_each_change_once(node: Node) -> None:
-    found = node.describe()
+    description = node.describe()
 
     async def changed() -> float | None:
-        await asyncio.wait_for(found.changed(), 5)
-        return pitch(found)
+        await asyncio.wait_for(description.changed(), 5)
+        return pitch(description)
 
     node.write(str(drone(-10)))
     assert await changed() == -10
-    node.hand_over(-20)
+    node.store_object(-20)
     assert await changed() == -20
-    node.handed.touch()
+    node.object_path.touch()
     node.write(str(drone(-30)))
     with pytest.raises(TimeoutError):
-        await asyncio.wait_for(found.changed(), 0.1)
-    node.handed.write_text("{")
+        await asyncio.wait_for(description.changed(), 0.1)
+    node.object_path.write_text("{")
     assert await changed() is None
-    node.handed.unlink()
+    node.object_path.unlink()
     assert await changed() == -30
     node.write("kind: [")
-    assert await changed() is None, "whatever it was before"
+    assert await changed() is None, "an unreadable file reports an unknown description"

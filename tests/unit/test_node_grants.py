@@ -1,4 +1,4 @@
-"""The Grants of a node, packed into one object."""
+"""Packing of the Grants of a node into one object."""
 
 from __future__ import annotations
 
@@ -57,8 +57,10 @@ def test_node_grants_omit_fields_changed_by_reports() -> None:
 
 def test_node_grants_pack_shared_zones_once() -> None:
     area = [[round(0.001 * i, 7), round(0.0013 * i * i % 7, 7)] for i in range(1_500)]
-    one, many = (len(pack([body(f"g{i}", {"area": area, "n": i}) for i in range(count)])) for count in (1, 100))
-    assert many < 3 * one
+    single_size, large_size = (
+        len(pack([body(f"g{i}", {"area": area, "n": i}) for i in range(count)])) for count in (1, 100)
+    )
+    assert large_size < 3 * single_size
 
 
 @pytest.mark.parametrize(

@@ -52,9 +52,9 @@ def test_certificate_is_invalid_for_other_identity_or_authority() -> None:
 
 
 def test_authority_is_restored_from_its_secret() -> None:
-    again = Authority.from_data(AUTHORITY.to_data())
-    assert again.certificate == AUTHORITY.certificate
-    assert again.is_current(AUTHORITY.issue_component(IDENTITY, NOW), IDENTITY, NOW)
+    restored = Authority.from_data(AUTHORITY.to_data())
+    assert restored.certificate == AUTHORITY.certificate
+    assert restored.is_current(AUTHORITY.issue_component(IDENTITY, NOW), IDENTITY, NOW)
 
 
 def test_damaged_authority_secret_raises_error() -> None:
@@ -84,5 +84,5 @@ def test_csr_with_invalid_names_is_malformed(names: str) -> None:
         "usages": ["server auth", "client auth"],
         "request": base64.b64encode(request.public_bytes(serialization.Encoding.PEM)).decode(),
     }
-    found = review({"spec": spec}, {"agent"})
-    assert (found.reason, found.node) == ("Malformed", None)
+    review_result = review({"spec": spec}, {"agent"})
+    assert (review_result.reason, review_result.node) == ("Malformed", None)

@@ -67,7 +67,7 @@ class EventsOfTheCluster(RuleBasedStateMachine):
         self.decided: dict[Key, OwnedPlan] = {}
         self.last_claims: dict[str, Claim] = {}
 
-    # -- at the API server --
+    # -- changes at the API server --
 
     def put(self, kind: Kind, body: Body) -> None:
         self.version += 1

@@ -1,4 +1,4 @@
-"""Child objects against a fake API server: order of writes, ownership, deletion, and Secrets."""
+"""Child objects of Applications, written to a fake API server: order of writes, ownership, deletion, and Secrets."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ PLACED = PLAN.model_copy(update={"placements": PLAN.placements[:2], "drone": Non
 
 
 class Copy(dict[Key, Body]):
-    """An empty cache of one kind."""
+    """Empty cache of one kind."""
 
     def record_write(self, key: Key, body: Body) -> None:
         """Ignore the write."""
@@ -48,19 +48,19 @@ class Webhooks:
         self.hangs = 0
         self.full = asyncio.Event()
         self.full_at = full
-        self.said: list[str] = []
-        self.there: dict[tuple[Kind, str], Body] = {}
+        self.requests: list[str] = []
+        self.objects: dict[tuple[Kind, str], Body] = {}
         self.frozen = False
 
     async def get(self, kind: Kind, name: str, namespace: str = "") -> Body:
-        self.said.append(f"get {kind.name}")
-        if (kind, name) not in self.there:
+        self.requests.append(f"get {kind.name}")
+        if (kind, name) not in self.objects:
             raise NotFound(404, "NotFound", name)
-        return self.there[kind, name]
+        return self.objects[kind, name]
 
     async def create(self, kind: Kind, body: Body) -> Body:
-        if (kind, body["metadata"]["name"]) in self.there:
-            self.said.append(f"create {kind.name} refused")
+        if (kind, body["metadata"]["name"]) in self.objects:
+            self.requests.append(f"create {kind.name} refused")
             raise Conflict(409, "AlreadyExists", "it is there")
         return await self.written("create", kind, body)
 
@@ -72,13 +72,13 @@ class Webhooks:
         return await self.written("replace spec", kind, body)
 
     async def delete(self, kind: Kind, key: Key, _uid: str) -> None:
-        self.said.append(f"delete {kind.name}")
-        del self.there[kind, key[1]]
+        self.requests.append(f"delete {kind.name}")
+        del self.objects[kind, key[1]]
 
     async def take_ownership(self, kind: Kind, _key: Key) -> None:
-        self.said.append(f"own {kind.name}")
+        self.requests.append(f"own {kind.name}")
         if self.frozen:
-            raise KubeError(422, "Invalid", "its image may not be used any more")
+            raise KubeError(422, "Invalid", "its image may no longer be used")
 
     async def written(self, how: str, kind: Kind, body: Body) -> Body:
         if kind is self.hanging:
@@ -86,11 +86,11 @@ class Webhooks:
             if self.hangs == self.full_at:
                 self.full.set()
             await asyncio.Event().wait()
-        self.said.append(f"{how} {kind.name}")
+        self.requests.append(f"{how} {kind.name}")
         return body
 
 
-def made_on(store: Webhooks) -> ChildObjects:
+def child_objects(store: Webhooks) -> ChildObjects:
     signer = SimpleNamespace(sign=lambda body, _=None: body, problem=lambda _grant: "unsigned")
     return ChildObjects(cast(Any, store), cast(Any, defaultdict(Copy)), cast(Any, signer))
 
@@ -98,16 +98,16 @@ def made_on(store: Webhooks) -> ChildObjects:
 @pytest.mark.parametrize("hanging", [kinds.SERVICE, kinds.DEPLOYMENT])
 async def test_hanging_webhook_delays_neither_plans_nor_grants(hanging: Kind) -> None:
     store = Webhooks(hanging, full=16)
-    children = made_on(store)
+    children = child_objects(store)
     many = [hanging.header(f"s{i}", "city") for i in range(20)]
     stuck = asyncio.create_task(children.apply(APPLICATION, {hanging: many}))
     async with asyncio.timeout(10.0):
         await store.full.wait()
-    store.said.clear()
-    wanted = {kind: [kind.header("other", "city")] for kind in (kinds.DEPLOYMENT_PLAN, kinds.GRANT)}
+    store.requests.clear()
+    desired = {kind: [kind.header("other", "city")] for kind in (kinds.DEPLOYMENT_PLAN, kinds.GRANT)}
     async with asyncio.timeout(10.0):
-        await children.apply(APPLICATION, wanted)
-    assert store.said == ["create DeploymentPlan", "create Grant"]
+        await children.apply(APPLICATION, desired)
+    assert store.requests == ["create DeploymentPlan", "create Grant"]
     stuck.cancel()
     await asyncio.gather(stuck, return_exceptions=True)
 
@@ -119,33 +119,33 @@ def standing(kind: Kind, **metadata: Any) -> Body:
 async def test_taken_name_is_created_once_and_then_looked_up() -> None:
     """Each failed creation counts against the quota of the namespace."""
     store = Webhooks(None)
-    store.there[kinds.SERVICE, "one"] = standing(kinds.SERVICE)
-    children = made_on(store)
+    store.objects[kinds.SERVICE, "one"] = standing(kinds.SERVICE)
+    children = child_objects(store)
     for _ in range(2):
         with pytest.raises(NameTaken, match="does not belong to this Application"):
             await children.apply(APPLICATION, {kinds.SERVICE: [kinds.SERVICE.header("one", "city")]})
-    assert store.said == ["create Service refused", "get Service", "get Service"]
-    store.there.clear()
+    assert store.requests == ["create Service refused", "get Service", "get Service"]
+    store.objects.clear()
     await children.apply(APPLICATION, {kinds.SERVICE: [kinds.SERVICE.header("one", "city")]})
-    assert store.said[3:] == ["get Service", "create Service"]
+    assert store.requests[3:] == ["get Service", "create Service"]
 
 
 async def test_inadmissible_object_is_replaced_before_ownership_changes() -> None:
     store = Webhooks(None)
     owners = [{"uid": APPLICATION.metadata.uid}]
-    store.there[kinds.DEPLOYMENT, "one"] = standing(kinds.DEPLOYMENT, ownerReferences=owners)
+    store.objects[kinds.DEPLOYMENT, "one"] = standing(kinds.DEPLOYMENT, ownerReferences=owners)
     store.frozen = True
-    await made_on(store).apply(APPLICATION, {kinds.DEPLOYMENT: [kinds.DEPLOYMENT.header("one", "city")]})
-    assert store.said[2:] == ["own Deployment", "apply Deployment", "own Deployment", "apply Deployment"]
+    await child_objects(store).apply(APPLICATION, {kinds.DEPLOYMENT: [kinds.DEPLOYMENT.header("one", "city")]})
+    assert store.requests[2:] == ["own Deployment", "apply Deployment", "own Deployment", "apply Deployment"]
 
 
 async def test_refused_object_does_not_stop_later_kinds() -> None:
     store = Webhooks(None)
-    store.there[kinds.SERVICE, "one"] = standing(kinds.SERVICE)
+    store.objects[kinds.SERVICE, "one"] = standing(kinds.SERVICE)
     desired = {kind: [kind.header("one", "city")] for kind in (kinds.SERVICE, kinds.DEPLOYMENT)}
     with pytest.raises(NameTaken):
-        await made_on(store).apply(APPLICATION, desired)
-    assert store.said[2:] == ["create Deployment"]
+        await child_objects(store).apply(APPLICATION, desired)
+    assert store.requests[2:] == ["create Deployment"]
 
 
 @pytest.mark.parametrize(
@@ -154,23 +154,28 @@ async def test_refused_object_does_not_stop_later_kinds() -> None:
 async def test_existing_grant_is_replaced_in_place_unless_its_node_changes(node: str, then: list[str]) -> None:
     store = Webhooks(None)
     of = {"uid": APPLICATION.metadata.uid}
-    store.there[kinds.GRANT, "one"] = {**kinds.GRANT.header("one", uid="1"), "spec": {"application": of, "node": "n1"}}
-    wanted = {**kinds.GRANT.header("one", labels={}), "spec": {"application": of, "node": node}}
-    await made_on(store).apply(APPLICATION, {kinds.GRANT: [wanted]})
-    assert store.said == ["create Grant refused", "get Grant", *then]
+    store.objects[kinds.GRANT, "one"] = {
+        **kinds.GRANT.header("one", uid="1"),
+        "spec": {"application": of, "node": "n1"},
+    }
+    desired = {**kinds.GRANT.header("one", labels={}), "spec": {"application": of, "node": node}}
+    await child_objects(store).apply(APPLICATION, {kinds.GRANT: [desired]})
+    assert store.requests == ["create Grant refused", "get Grant", *then]
 
 
 async def test_grant_of_another_application_is_not_written() -> None:
     store = Webhooks(None)
     spec = {"application": {"uid": "another"}, "node": "n1"}
-    store.there[kinds.GRANT, "one"] = {**kinds.GRANT.header("one", uid="1"), "spec": spec}
+    store.objects[kinds.GRANT, "one"] = {**kinds.GRANT.header("one", uid="1"), "spec": spec}
     with pytest.raises(NameTaken):
-        await made_on(store).apply(APPLICATION, {kinds.GRANT: [{**kinds.GRANT.header("one", labels={}), "spec": spec}]})
-    assert store.said == ["create Grant refused", "get Grant"]
+        await child_objects(store).apply(
+            APPLICATION, {kinds.GRANT: [{**kinds.GRANT.header("one", labels={}), "spec": spec}]}
+        )
+    assert store.requests == ["create Grant refused", "get Grant"]
 
 
 async def test_endpoint_slice_of_kubernetes_is_not_deleted() -> None:
-    """EndpointSlices of Kubernetes have the labels of their Service, and are created again after a deletion."""
+    """EndpointSlices created by Kubernetes have the labels of their Service. Kubernetes creates a deleted one again."""
     store = Spelling(None)
     copies = {kind: OwnedObjects(cast(Any, store), kind, lambda body: body, lambda *_: None) for kind in kinds.CHILDREN}
     children = ChildObjects(cast(Any, store), copies, cast(Any, None))
@@ -182,21 +187,21 @@ async def test_endpoint_slice_of_kubernetes_is_not_deleted() -> None:
         body["metadata"]["ownerReferences"][0]["kind"] = owner
         copies[kinds.ENDPOINT_SLICE].record_write((APPLICATION.key[0], name), body)
     assert await children.remove(APPLICATION.key, kinds.ENDPOINT_SLICE)
-    assert store.said == ["delete EndpointSlice"]
+    assert store.requests == ["delete EndpointSlice"]
 
 
 async def test_addresses_are_updated_only_in_endpoint_slices_of_the_operator() -> None:
-    """Kubernetes manages the EndpointSlice of a Service with a selector. Admission refuses writes of others."""
+    """Kubernetes manages the EndpointSlice of a Service with a selector, and admission refuses writes by the operator."""
     store = Spelling(None)
     copies = {kind: OwnedObjects(cast(Any, store), kind, lambda body: body, lambda *_: None) for kind in kinds.CHILDREN}
     children = ChildObjects(cast(Any, store), copies, cast(Any, None))
     for name, by in (("ours", "operator.fractus.dev"), ("theirs", "endpointslice-controller.k8s.io")):
-        made = owned_object(kinds.ENDPOINT_SLICE, APPLICATION, name, {"endpointslice.kubernetes.io/managed-by": by})
-        made["endpoints"] = [{"addresses": ["10.0.0.7"]}]
-        copies[kinds.ENDPOINT_SLICE].record_write((APPLICATION.key[0], name), made)
+        owned = owned_object(kinds.ENDPOINT_SLICE, APPLICATION, name, {"endpointslice.kubernetes.io/managed-by": by})
+        owned["endpoints"] = [{"addresses": ["10.0.0.7"]}]
+        copies[kinds.ENDPOINT_SLICE].record_write((APPLICATION.key[0], name), owned)
     rollout = Rollout(children, cast(Any, None), cast(Any, None), lambda: NOW)
     await rollout.update_addresses(APPLICATION.key, PLAN, [])
-    assert store.said == ["patch EndpointSlice ours"]
+    assert store.requests == ["patch EndpointSlice ours"]
 
 
 @pytest.mark.parametrize("owner", ["Application", "Service"])
@@ -208,25 +213,25 @@ async def test_deployment_with_changed_owner_is_deleted(owner: str) -> None:
     body["metadata"]["ownerReferences"][0]["kind"] = owner
     copies[kinds.DEPLOYMENT].record_write((APPLICATION.key[0], "one"), body)
     assert await ChildObjects(cast(Any, store), copies, cast(Any, None)).remove(APPLICATION.key, kinds.DEPLOYMENT)
-    assert store.said == ["delete Secret", "delete Deployment"]
+    assert store.requests == ["delete Secret", "delete Deployment"]
 
 
-@pytest.mark.parametrize("kept", [True, False])
-async def test_pods_of_deployment_with_foreign_finalizer_are_deleted_one_by_one(kept: bool) -> None:
-    """Pods of a Deployment that is gone are left to the garbage collector."""
+@pytest.mark.parametrize("has_finalizer", [True, False])
+async def test_pods_of_deployment_with_foreign_finalizer_are_deleted_one_by_one(has_finalizer: bool) -> None:
+    """The garbage collector deletes the pods of a deleted Deployment."""
     store = Spelling(None)
     labels = {"app.kubernetes.io/managed-by": "fractus", "fractus.dev/instance": "one"}
 
-    def made(kind: Kind, uid: str, owner: str) -> Body:
+    def owned(kind: Kind, uid: str, owner: str) -> Body:
         return kind.header("one", "city", uid=uid, labels=labels, ownerReferences=[{"uid": owner}]) | {"spec": {}}
 
-    deployment = made(kinds.DEPLOYMENT, "d", "app")
-    # The Deployment is not found by its label, which may have been removed as well.
-    store.kept = frozenset({(kinds.DEPLOYMENT, "one")} if kept else ())
+    deployment = owned(kinds.DEPLOYMENT, "d", "app")
+    # The Deployment is not selected by its label, because users may have removed the label too.
+    store.with_finalizer = frozenset({(kinds.DEPLOYMENT, "one")} if has_finalizer else ())
     listed = {
         kinds.DEPLOYMENT: [],
-        kinds.REPLICA_SET: [made(kinds.REPLICA_SET, "r", "d")],
-        kinds.POD: [made(kinds.POD, "p", "r")],
+        kinds.REPLICA_SET: [owned(kinds.REPLICA_SET, "r", "d")],
+        kinds.POD: [owned(kinds.POD, "p", "r")],
     }
 
     async def list_whole(kind: Kind, **_: object) -> Any:
@@ -239,30 +244,36 @@ async def test_pods_of_deployment_with_foreign_finalizer_are_deleted_one_by_one(
     cache = SimpleNamespace(applications={("city", "a"): SimpleNamespace(settled_generation=None)})
     children = ChildObjects(cast(Any, store), copies, cast(Any, None))
     await FinishedPods(cast(Any, store), cast(Any, cache), children, lambda: NOW).tear_down(("city", "a"))
-    assert store.said == ["delete Secret", "delete Deployment", *(["delete ReplicaSet", "delete Pod"] if kept else [])]
+    assert store.requests == [
+        "delete Secret",
+        "delete Deployment",
+        *(["delete ReplicaSet", "delete Pod"] if has_finalizer else []),
+    ]
 
 
 async def test_teardown_deletes_kept_pods() -> None:
     store = Spelling(None)
     labels = {"app.kubernetes.io/managed-by": "fractus", "fractus.dev/instance": "one"}
-    kept = kinds.POD.header("one-x", "city", uid="p", labels=labels, ownerReferences=[{"uid": "app"}]) | {"spec": {}}
+    with_finalizer = kinds.POD.header("one-x", "city", uid="p", labels=labels, ownerReferences=[{"uid": "app"}]) | {
+        "spec": {}
+    }
 
     async def list_whole(kind: Kind, **_: object) -> Any:
-        return SimpleNamespace(items=[kept] if kind is kinds.POD else [])
+        return SimpleNamespace(items=[with_finalizer] if kind is kinds.POD else [])
 
     cast(Any, store).list_whole = list_whole
     copies = {kind: OwnedObjects(cast(Any, store), kind, lambda body: body, lambda *_: None) for kind in kinds.CHILDREN}
     cache = SimpleNamespace(applications={("city", "a"): SimpleNamespace(settled_generation=1)})
     children = ChildObjects(cast(Any, store), copies, cast(Any, None))
     await FinishedPods(cast(Any, store), cast(Any, cache), children, lambda: NOW).tear_down(("city", "a"))
-    assert store.said == ["delete Pod"]
+    assert store.requests == ["delete Pod"]
 
 
 class Late(Store):
     """A fake API server in which requests without a response take effect late, with the reactions of controllers."""
 
     def __init__(self) -> None:
-        self.there: dict[tuple[str, Key], Body] = {}
+        self.objects: dict[tuple[str, Key], Body] = {}
 
     def put(self, kind: Kind, name: str, *owners: Body, **metadata: Any) -> Body:
         labels = {
@@ -278,48 +289,48 @@ class Late(Store):
         if references:
             known["ownerReferences"] = references
         body = kind.header(name, "city", **known) | {"spec": {}}
-        self.there[kind.path("city"), ("city", name)] = body
+        self.objects[kind.path("city"), ("city", name)] = body
         return body
 
     async def request(self, method: str, path: str, body: Any = None, **_: Any) -> Body:
         collection, _, name = path.rpartition("/")
         if method == "DELETE":
-            if self.there.pop((collection, ("city", name)), None) is None:
+            if self.objects.pop((collection, ("city", name)), None) is None:
                 raise NotFound(404, "NotFound", name)
             return {"kind": "Status"}
-        return {"items": [found for (of, _), found in self.there.items() if of == path], "metadata": {}}
+        return {"items": [body for (of, _), body in self.objects.items() if of == path], "metadata": {}}
 
     def names(self) -> set[str]:
-        return {f"{body['kind']}/{body['metadata']['name']}" for body in self.there.values()}
+        return {f"{body['kind']}/{body['metadata']['name']}" for body in self.objects.values()}
 
 
-def seen_by(store: Late) -> ClusterCache:
+def cache_with_pods(store: Late) -> ClusterCache:
     """Return a cache that contains the pods."""
     cache = ClusterCache(store)
     for informer in cache.informers:
         informer.synced.set()
-    for (_, key), body in store.there.items():
+    for (_, key), body in store.objects.items():
         if body["kind"] == "Pod":
             cache.pods.record_write(key, body)
     return cache
 
 
 async def test_orphaned_pods_created_after_teardown_are_deleted() -> None:
-    """A deletion that orphans pods takes effect late, while a controller creates deleted objects again."""
+    """A deletion that orphans pods takes effect late. Meanwhile a controller creates deleted objects again."""
     store = Late()
-    cache = seen_by(store)
+    cache = cache_with_pods(store)
     children = ChildObjects(store, cache.children, cast(Any, None))
     await FinishedPods(store, cache, children, lambda: NOW).tear_down(("city", "a"))
     owned = store.put(kinds.REPLICA_SET, "one-7f")
     store.put(kinds.POD, "one-7f-x", owned)
-    lost = OrphanedPods(store, cache := seen_by(store))
-    await lost.step()
-    assert store.names() == {"ReplicaSet/one-7f", "Pod/one-7f-x"}, "the garbage collector has time to delete them"
+    orphaned_pods = OrphanedPods(store, cache := cache_with_pods(store))
+    await orphaned_pods.step()
+    assert store.names() == {"ReplicaSet/one-7f", "Pod/one-7f-x"}, "the garbage collector gets time to delete the pods"
     store.put(kinds.APPLICATION, "a")
-    await lost.step()
+    await orphaned_pods.step()
     assert {"ReplicaSet/one-7f", "Pod/one-7f-x"} < store.names(), "the watch of Applications is behind"
     await store.delete(kinds.APPLICATION, ("city", "a"))
-    await lost.step()
+    await orphaned_pods.step()
     assert store.names() == set()
 
 
@@ -327,36 +338,36 @@ async def test_deployment_created_after_teardown_is_deleted() -> None:
     store = Late()
     deployment = store.put(kinds.DEPLOYMENT, "one", kinds.APPLICATION.header("a", "city", uid="gone"))
     store.put(kinds.POD, "one-7f-x", store.put(kinds.REPLICA_SET, "one-7f", deployment))
-    lost = OrphanedPods(store, seen_by(store))
+    orphaned_pods = OrphanedPods(store, cache_with_pods(store))
     for _ in range(2):
-        await lost.step()
+        await orphaned_pods.step()
     assert store.names() == set()
 
 
 async def test_copy_of_deployment_without_owner_is_kept() -> None:
     store = Late()
     store.put(kinds.POD, "one-7f-x", store.put(kinds.REPLICA_SET, "one-7f", store.put(kinds.DEPLOYMENT, "one")))
-    lost = OrphanedPods(store, seen_by(store))
+    orphaned_pods = OrphanedPods(store, cache_with_pods(store))
     for _ in range(3):
-        await lost.step()
-    assert len(store.there) == 3
+        await orphaned_pods.step()
+    assert len(store.objects) == 3
 
 
 class Spelling(Webhooks):
-    """An API server that spells what it is given in its own way; finalizers keep some of it."""
+    """Fake API server that normalises written objects. Finalizers prevent the deletion of some objects."""
 
-    kept: frozenset[tuple[Kind, str]] = frozenset()
+    with_finalizer: frozenset[tuple[Kind, str]] = frozenset()
 
     async def written(self, how: str, kind: Kind, body: Body) -> Body:
         written = await super().written(how, kind, body)
         return {**written, "spec": {"cpu": "500m"}, "metadata": {**written["metadata"], "resourceVersion": "1"}}
 
     async def delete(self, kind: Kind, key: Key, _uid: str | None = None, *, orphan: bool = False) -> bool:
-        self.said.append(f"delete {kind.name}")
-        return (kind, key[1]) not in self.kept
+        self.requests.append(f"delete {kind.name}")
+        return (kind, key[1]) not in self.with_finalizer
 
     async def patch(self, kind: Kind, key: Key, changes: Body, _type: object) -> Body:
-        self.said.append(f"patch {kind.name} {key[1]}")
+        self.requests.append(f"patch {kind.name} {key[1]}")
         return {"metadata": {"name": key[1], "namespace": key[0]}, **changes}
 
 
@@ -364,37 +375,37 @@ async def test_normalised_object_is_forgotten_when_deleted() -> None:
     store = Spelling(None)
     copies = {kind: OwnedObjects(cast(Any, store), kind, lambda body: body, lambda *_: None) for kind in kinds.CHILDREN}
     children = ChildObjects(cast(Any, store), copies, cast(Any, None))
-    one = owned_object(kinds.DEPLOYMENT, APPLICATION, "one", {}, spec={"cpu": 0.5})
+    deployment = owned_object(kinds.DEPLOYMENT, APPLICATION, "one", {}, spec={"cpu": 0.5})
     for _ in range(2):
-        await children.apply(APPLICATION, {kinds.DEPLOYMENT: [one]})
-    assert store.said == ["create Deployment"], "an object that the API server normalised is not written again"
+        await children.apply(APPLICATION, {kinds.DEPLOYMENT: [deployment]})
+    assert store.requests == ["create Deployment"], "an object that the API server normalised is not written again"
     nothing: dict[Kind, list[Body]] = {kind: [] for kind in kinds.CHILDREN}
     await children.prune(APPLICATION, nothing)
-    assert store.said[1:] == ["delete Secret", "delete Deployment"]
+    assert store.requests[1:] == ["delete Secret", "delete Deployment"]
     assert not children._normalised
 
 
 class Secrets:
     """A fake API server that allows writing and deleting Secrets, but not reading."""
 
-    def __init__(self, *there: str) -> None:
-        self.there = set(there)
-        self.said: list[str] = []
+    def __init__(self, *existing: str) -> None:
+        self.objects = set(existing)
+        self.requests: list[str] = []
         self.refused = False
         self.full = False
 
     async def create(self, kind: Kind, body: Body) -> Body:
-        self.said.append("create")
+        self.requests.append("create")
         if self.full:
             raise KubeError(403, "Forbidden", "exceeded quota")
-        if body["metadata"]["name"] in self.there:
+        if body["metadata"]["name"] in self.objects:
             raise Conflict(409, "AlreadyExists", "it is there")
-        self.there.add(body["metadata"]["name"])
+        self.objects.add(body["metadata"]["name"])
         return body
 
     async def replace(self, kind: Kind, body: Body) -> Body:
-        self.said.append("replace")
-        if body["metadata"]["name"] not in self.there:
+        self.requests.append("replace")
+        if body["metadata"]["name"] not in self.objects:
             raise NotFound(404, "NotFound", "it is gone")
         return body
 
@@ -402,13 +413,13 @@ class Secrets:
         if kind is kinds.SECRET:
             if self.refused:
                 raise KubeError(422, "Invalid", "no")
-            self.there.discard(key[1])
-        self.said.append(f"delete {kind.name}")
+            self.objects.discard(key[1])
+        self.requests.append(f"delete {kind.name}")
         return True
 
 
 @pytest.mark.parametrize(
-    ("why", "there", "said"),
+    ("reason", "existing", "requests"),
     [
         ("new", False, ["create"]),
         ("new", True, ["create", "replace"]),
@@ -418,25 +429,25 @@ class Secrets:
         ("lost", False, ["create"]),
     ],
 )
-async def test_secret_is_written_without_reading_it(why: Any, there: bool, said: list[str]) -> None:
-    store = Secrets(*["one-tls"] * there)
-    children = made_on(cast(Any, store))
-    assert await children.write_secret(APPLICATION, "one", kinds.SECRET.header("one-tls", "city"), why)
-    assert store.said == said
-    assert store.there == {"one-tls"}
+async def test_secret_is_written_without_reading_it(reason: Any, existing: bool, requests: list[str]) -> None:
+    store = Secrets(*["one-tls"] * existing)
+    children = child_objects(cast(Any, store))
+    assert await children.write_secret(APPLICATION, "one", kinds.SECRET.header("one-tls", "city"), reason)
+    assert store.requests == requests
+    assert store.objects == {"one-tls"}
 
 
-@pytest.mark.parametrize("why", ["new", "renewed", "lost"])
-async def test_exhausted_quota_is_reported_only_for_missing_secret(why: Any) -> None:
+@pytest.mark.parametrize("reason", ["new", "renewed", "lost"])
+async def test_exhausted_quota_is_reported_only_for_missing_secret(reason: Any) -> None:
     """The API server checks quotas first, so that creating an existing Secret would always be refused."""
     secret = kinds.SECRET.header("one-tls", "city")
     store = Secrets("one-tls")
     store.full = True
-    assert await made_on(cast(Any, store)).write_secret(APPLICATION, "one", secret, why)
-    assert store.said[-1] == "replace"
-    store.there.clear()
+    assert await child_objects(cast(Any, store)).write_secret(APPLICATION, "one", secret, reason)
+    assert store.requests[-1] == "replace"
+    store.objects.clear()
     with pytest.raises(KubeError, match="exceeded quota"):
-        await made_on(cast(Any, store)).write_secret(APPLICATION, "one", secret, why)
+        await child_objects(cast(Any, store)).write_secret(APPLICATION, "one", secret, reason)
 
 
 async def test_secret_is_not_written_for_deployment_of_another_owner() -> None:
@@ -447,7 +458,7 @@ async def test_secret_is_not_written_for_deployment_of_another_owner() -> None:
     )
     children = ChildObjects(cast(Any, store), copies, cast(Any, None))
     assert not await children.write_secret(APPLICATION, "one", kinds.SECRET.header("one-tls", "city"), "new")
-    assert store.said == []
+    assert store.requests == []
 
 
 async def test_secret_is_deleted_with_its_deployment_and_retried_after_refusal() -> None:
@@ -460,10 +471,10 @@ async def test_secret_is_deleted_with_its_deployment_and_retried_after_refusal()
     store.refused = True
     with pytest.raises(KubeError, match="no"):
         await children.remove(APPLICATION.key, kinds.DEPLOYMENT)
-    assert store.said == ["delete Deployment"], "the Deployment is deleted although its Secret is not"
+    assert store.requests == ["delete Deployment"], "the Deployment is deleted although its Secret is not"
     store.refused = False
     await children.remove(APPLICATION.key, kinds.SERVICE)
-    assert store.there == set()
-    store.said.clear()
+    assert store.objects == set()
+    store.requests.clear()
     await children.remove(APPLICATION.key, kinds.SERVICE)
-    assert store.said == []
+    assert store.requests == []

@@ -60,11 +60,11 @@ def test_stages_reached_together_have_one_event() -> None:
     (only,) = transition_events([*stages, waiting])
     assert (only.reason, only.message) == ("Planned", "Planned it is; Granted it is; Deployed it is")
     assert [update.reason for update in transition_events([*stages, ready])] == ["Planned", "PodsReady"]
-    assert list(transition_events([stages[2], ready])) == [stages[2], ready], "one alone is told as it is"
-    refused = ConditionUpdate("Deployed", "False", "NameTaken", "a Secret is in the way")
-    not_ready = ConditionUpdate("Ready", "False", "NameTaken", "a Secret is in the way")
-    told = list(transition_events([*stages[:2], refused, not_ready]))
-    assert [(update.reason, update.warning) for update in told] == [("Planned", False), ("NameTaken", True)]
+    assert list(transition_events([stages[2], ready])) == [stages[2], ready], "a single transition is not merged"
+    refused = ConditionUpdate("Deployed", "False", "NameTaken", "a Secret has the same name")
+    not_ready = ConditionUpdate("Ready", "False", "NameTaken", "a Secret has the same name")
+    merged = list(transition_events([*stages[:2], refused, not_ready]))
+    assert [(update.reason, update.warning) for update in merged] == [("Planned", False), ("NameTaken", True)]
 
 
 def test_condition_is_warning_only_for_problem() -> None:
@@ -167,8 +167,8 @@ def test_changed_manifest_waits_for_landing() -> None:
 def test_instances_in_flight_keep_names_of_another_release() -> None:
     named = PLAN.model_copy(update={"placements": (placed("old-1", "edge-1"), placed("old-c", None, replicas=2))})
     fresh = (placed("new-1", "edge-1"), placed("new-c", None, replicas=2), placed("new-2", "edge-2"))
-    kept = _with_names_of(named, PLAN.model_copy(update={"placements": fresh}))
-    assert [p.instance for p in kept.placements] == ["old-1", "old-c", "new-2"]
+    renamed = _with_names_of(named, PLAN.model_copy(update={"placements": fresh}))
+    assert [p.instance for p in renamed.placements] == ["old-1", "old-c", "new-2"]
     clash = (*fresh[:2], placed("old-1", "edge-2"))
     assert [p.instance for p in _with_names_of(named, PLAN.model_copy(update={"placements": clash})).placements] == [
         "new-1", "new-c", "old-1",
@@ -223,7 +223,7 @@ def test_status_reports_why_pods_cannot_be_created() -> None:
     scaled = {"type": "Available", "status": "False", "message": "no"}
     conditions = {"a": [scaled, failure], "b": [scaled, failure | {"status": "False"}], "c": []}
     conditions["e"] = [failure | {"reason": "FailedDelete"}]
-    bodies = [{"metadata": {"name": name}, "status": {"conditions": found}} for name, found in conditions.items()]
+    bodies = [{"metadata": {"name": name}, "status": {"conditions": reported}} for name, reported in conditions.items()]
     bodies.append({"metadata": {"name": "d"}})
     refused = {body["metadata"]["name"]: refusal_of(body) for body in bodies}
     assert refused == {"a": why, "b": "", "c": "", "d": "", "e": ""}
@@ -231,19 +231,19 @@ def test_status_reports_why_pods_cannot_be_created() -> None:
 
 def test_status_reports_exit_code_and_last_log_lines() -> None:
     ended = {"exitCode": 1, "message": "Traceback\nValueError: no route\n"}
-    again = {"state": {"running": {}}, "lastState": {"terminated": ended}}
+    restarting = {"state": {"running": {}}, "lastState": {"terminated": ended}}
     never = {"state": {"waiting": {"reason": "ImagePullBackOff", "message": "no such image"}}}
     well = {"state": {"running": {}}, "lastState": {"terminated": {"exitCode": 0}}}
     body = {"metadata": {"name": "p", "namespace": "ns"}, "spec": {}}
-    failures = [parse_pod(body | {"status": {"containerStatuses": [c]}}).failure for c in (again, never, well)]
+    failures = [parse_pod(body | {"status": {"containerStatuses": [c]}}).failure for c in (restarting, never, well)]
     assert failures == ["exit code 1: Traceback | ValueError: no route", "ImagePullBackOff: no such image", ""]
     pods = [view("a-c"), view("a-c"), view("a-1", ready=False, failure=failures[0])]
     update = status.deployed(PLAN, pods, 0)
     ready = next(c for c in update.conditions if c.type == "Ready")
     assert (ready.reason, ready.warning) == ("ComponentFailed", True)
     assert update.message == "waiting for a-1; a-1 failed with exit code 1: Traceback | ValueError: no route"
-    lost = status.finished(Outcome(OutcomeKind.FAILED, "driver lost"), "d", None, pods)
-    assert lost.message == "driver lost; a-1 failed with exit code 1: Traceback | ValueError: no route"
+    failed = status.finished(Outcome(OutcomeKind.FAILED, "driver lost"), "d", None, pods)
+    assert failed.message == "driver lost; a-1 failed with exit code 1: Traceback | ValueError: no route"
     assert status.finished(Outcome(OutcomeKind.COMPLETE, "done"), "d", None, pods).message == "done"
 
 
@@ -272,9 +272,9 @@ def test_status_reports_every_mission_outcome(kind: OutcomeKind) -> None:
 
 
 def flown(state: str, last: str | None = None, controller: str | None = None) -> Drone:
-    said = {"flightState": state, "lastFlightState": last or state, "controller": controller}
+    fields = {"flightState": state, "lastFlightState": last or state, "controller": controller}
     body = {"apiVersion": V1, "kind": "Drone", "metadata": {"name": "d"}, "spec": {}}
-    return Drone.from_body({**body, "status": {name: value for name, value in said.items() if value}})
+    return Drone.from_body({**body, "status": {name: value for name, value in fields.items() if value}})
 
 
 def test_phase_is_returning_until_drone_has_landed() -> None:
@@ -303,9 +303,9 @@ def test_phase_is_returning_until_drone_has_landed() -> None:
 )
 def test_flight_phase_follows_drone_state(drone: Drone | None, begun: bool, phase: str) -> None:
     mission = {"type": "MissionComplete", "reason": "MissionBegun" if begun else "MissionWaiting"}
-    found = flight("d", drone, {"drone": "d", "conditions": [mission]})
-    assert found.phase == phase
-    update = status.deployed(PLAN, [view("a-1")], 0, found)
+    flight_phase = flight("d", drone, {"drone": "d", "conditions": [mission]})
+    assert flight_phase.phase == phase
+    update = status.deployed(PLAN, [view("a-1")], 0, flight_phase)
     assert update.phase == ("Deploying" if phase in {"Waiting", "Landed"} else phase), "a pod is missing"
 
 
@@ -360,12 +360,16 @@ def test_quantities_are_parsed(text: str | int, value: float) -> None:
 
 
 def test_pod_requests_are_maximum_of_init_and_main_containers() -> None:
-    def asks(cpu: str) -> dict:
+    def container(cpu: str) -> dict:
         return {"resources": {"requests": {"cpu": cpu}}}
 
     body = {
         "metadata": {"name": "p", "namespace": "ns", "labels": {"x": "y", "fractus.dev/instance": "i"}},
-        "spec": {"containers": [asks("100m"), asks("200m")], "initContainers": [asks("1")], "overhead": {"cpu": "50m"}},
+        "spec": {
+            "containers": [container("100m"), container("200m")],
+            "initContainers": [container("1")],
+            "overhead": {"cpu": "50m"},
+        },
     }
     pod = parse_pod(body)
     assert pod.requests["cpu"] == pytest.approx(1.05)
@@ -373,31 +377,31 @@ def test_pod_requests_are_maximum_of_init_and_main_containers() -> None:
 
 
 def test_pod_requests_include_sidecars_and_overhead() -> None:
-    """As by a service mesh, whose proxy is an init container that stays: the scheduler counts it, too."""
+    """A service mesh adds its proxy as an init container that keeps running. The scheduler counts it too."""
 
-    def asks(cpu: str, **more: str) -> dict:
+    def container(cpu: str, **more: str) -> dict:
         return {"resources": {"requests": {"cpu": cpu}}, **more}
 
-    def asked(**spec: Any) -> float:
+    def cpu_requests(**spec: Any) -> float:
         return parse_pod({"metadata": {"name": "p", "namespace": "ns"}, "spec": spec}).requests["cpu"]
 
-    proxy = asks("200m", restartPolicy="Always")
-    main = asks("300m")
-    assert asked(containers=[main], initContainers=[proxy]) == pytest.approx(0.5)
-    assert asked(containers=[main], initContainers=[proxy, asks("400m")]) == pytest.approx(0.6)
-    assert asked(containers=[main], initContainers=[asks("400m"), proxy]) == pytest.approx(0.5)
-    assert asked(containers=[main], initContainers=[proxy], **asks("1")) == pytest.approx(1)
+    proxy = container("200m", restartPolicy="Always")
+    main = container("300m")
+    assert cpu_requests(containers=[main], initContainers=[proxy]) == pytest.approx(0.5)
+    assert cpu_requests(containers=[main], initContainers=[proxy, container("400m")]) == pytest.approx(0.6)
+    assert cpu_requests(containers=[main], initContainers=[container("400m"), proxy]) == pytest.approx(0.5)
+    assert cpu_requests(containers=[main], initContainers=[proxy], **container("1")) == pytest.approx(1)
 
 
 @pytest.mark.parametrize(
-    ("spec", "phase", "kept"),
+    ("spec", "phase", "finished"),
     [({}, "Running", False), ({}, "Failed", True), ({"activeDeadlineSeconds": 1}, "Running", True),
      ({"activeDeadlineSeconds": 2**31}, "Running", False)],
 )  # fmt: skip
-def test_finished_label_does_not_hide_running_pod(spec: dict, phase: str, kept: bool) -> None:
+def test_finished_label_does_not_hide_running_pod(spec: dict, phase: str, finished: bool) -> None:
     metadata = {"name": "p", "namespace": "ns", "labels": {"fractus.dev/finished": "20260601T120000Z"}}
     pod = parse_pod({"metadata": metadata, "spec": spec, "status": {"phase": phase}})
-    assert (pod.finished_at is not None) == kept
+    assert (pod.finished_at is not None) == finished
 
 
 @pytest.mark.parametrize(
@@ -415,11 +419,11 @@ def test_finished_label_does_not_hide_running_pod(spec: dict, phase: str, kept: 
 def test_displayed_state_is_unknown_only_if_drone_may_be_in_the_air(
     state: str, last: str, mission: str, shown: str
 ) -> None:
-    told: dict[str, Any] = {"flightState": state, "lastSeen": "2026-06-01T12:00:00Z"}
+    drone_status: dict[str, Any] = {"flightState": state, "lastSeen": "2026-06-01T12:00:00Z"}
     if last is not None:
-        told["lastFlightState"] = last
+        drone_status["lastFlightState"] = last
     if mission is not None:
-        told["conditions"] = [
+        drone_status["conditions"] = [
             {
                 "type": "OnMission",
                 "status": mission,
@@ -429,7 +433,7 @@ def test_displayed_state_is_unknown_only_if_drone_may_be_in_the_air(
             }
         ]
     body = {"apiVersion": V1, "kind": "Drone", "metadata": {"name": "d"}, "spec": {}}
-    assert displayed_flight_state(Drone.from_body({**body, "status": told})) == shown
+    assert displayed_flight_state(Drone.from_body({**body, "status": drone_status})) == shown
     assert displayed_flight_state(Drone.from_body(body)) == "offline"
 
 
@@ -510,11 +514,11 @@ async def test_applications_wake_when_edge_node_becomes_ready() -> None:
 
 def test_update_policy_and_ttl_do_not_change_the_mission() -> None:
     spec = application().spec
-    kept = spec.model_copy(update={"ttl_after_finished": 5, "update_policy": "Immediate"})
-    assert kept.mission_digest == spec.mission_digest
-    renamed = tuple(c.model_copy(update={"name": f"{c.name}2"}) for c in spec.components)
-    assert spec.model_copy(update={"components": renamed}).mission_digest != spec.mission_digest
-    # A field that is said is the same mission as one that is left to its default.
+    same_mission = spec.model_copy(update={"ttl_after_finished": 5, "update_policy": "Immediate"})
+    assert same_mission.mission_digest == spec.mission_digest
+    same_mission = tuple(c.model_copy(update={"name": f"{c.name}2"}) for c in spec.components)
+    assert spec.model_copy(update={"components": same_mission}).mission_digest != spec.mission_digest
+    # An explicit default value gives the same mission as an omitted field.
     assert type(spec).model_validate(spec.model_dump(by_alias=True)).mission_digest == spec.mission_digest
 
 

@@ -1,4 +1,4 @@
-"""kopf handlers: the teardown of an Application does not depend on its annotations."""
+"""kopf handlers: teardown of an Application, and progress stored in annotations."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def body(uid: str = "1", **annotations: str) -> kopf.Body:
     "noted", ['{"success":true}', '{"delayed":"9999-12-31T00:00:00+00:00"}', "5", "no JSON", "[]", ""]
 )
 def test_annotations_neither_skip_nor_delay_teardown(noted: str) -> None:
-    """Who may edit an Application writes them, and another may want its drone home."""
+    """Users who may edit an Application can write its annotations. Other users must still be able to end its flight."""
     assert InMemoryProgress("kopf.fractus.dev").fetch(key=TEARDOWN, body=body(**{NOTE: noted})) is None
 
 
@@ -34,9 +34,9 @@ def test_failed_teardown_is_retried() -> None:
     patch = kopf.Patch()
     record: Any = {"started": "2026-01-01T00:00:00+00:00", "delayed": "2026-01-01T00:00:05+00:00", "retries": 1}
     progress.store(key=TEARDOWN, record=record, body=body(), patch=patch)
-    assert json.loads(patch["metadata"]["annotations"][NOTE]) == record, "whose change wakes kopf"
+    assert json.loads(patch["metadata"]["annotations"][NOTE]) == record, "the change of the annotation wakes kopf"
     assert progress.fetch(key=TEARDOWN, body=body()) == record
-    assert progress.fetch(key=TEARDOWN, body=body(uid="2")) is None, "another one of its name"
+    assert progress.fetch(key=TEARDOWN, body=body(uid="2")) is None, "another object with the same name"
     patch = kopf.Patch()
     progress.purge(key=TEARDOWN, body=body(**{NOTE: json.dumps(record)}), patch=patch)
     assert patch["metadata"]["annotations"] == {NOTE: None}
@@ -44,7 +44,7 @@ def test_failed_teardown_is_retried() -> None:
 
 
 async def test_unchanged_progress_is_not_stored_again() -> None:
-    """Else kopf waits for the event of a patch that changes nothing, and never tries again."""
+    """Otherwise kopf waits for an event that a patch without changes never causes."""
     progress = InMemoryProgress("kopf.fractus.dev")
     patch = kopf.Patch()
     handler: Any = SimpleNamespace(id=TEARDOWN)
@@ -52,11 +52,11 @@ async def test_unchanged_progress_is_not_stored_again() -> None:
     state = State.from_scratch().with_purpose("delete").with_handlers([handler]).with_outcomes({TEARDOWN: failed})
     state.store(body=body(), patch=patch, storage=progress)
     assert patch
-    again = kopf.Patch()
+    second_patch = kopf.Patch()
     State.from_storage(body=body(), storage=progress, handlers=[handler]).store(
-        body=body(), patch=again, storage=progress
+        body=body(), patch=second_patch, storage=progress
     )
-    assert not again
+    assert not second_patch
 
 
 def test_kopf_accepts_api_servers_without_authority_key_identifier(monkeypatch: pytest.MonkeyPatch) -> None:

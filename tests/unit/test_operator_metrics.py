@@ -34,11 +34,11 @@ def test_every_metric_is_documented() -> None:
         pass
     text = metrics_text(source().collect()).decode()
     assert_documented(text, "Operator")
-    seen = values(text)
-    assert seen["fractus_operator_lease_left_seconds",] == 6.5
-    assert seen["fractus_operator_watch_open", "drones"] == 1
-    assert seen["fractus_applications", "Flying"] == 2
-    assert seen["fractus_certificate_expiry_timestamp_seconds",] == 2e9
+    samples = values(text)
+    assert samples["fractus_operator_lease_left_seconds",] == 6.5
+    assert samples["fractus_operator_watch_open", "drones"] == 1
+    assert samples["fractus_applications", "Flying"] == 2
+    assert samples["fractus_certificate_expiry_timestamp_seconds",] == 2e9
 
 
 @pytest.mark.parametrize(("error", "reason"), [(KubeError(403, "Forbidden", "no"), "Forbidden"), (ValueError(), "Bug")])

@@ -1,4 +1,4 @@
-"""NetworkPolicies evaluated on pods as a network plugin would: which components may call a component."""
+"""NetworkPolicies of components, evaluated as a network plug-in does."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ STRANGER = {"fractus.dev/application": "other", "fractus.dev/component": "Aerial
 
 
 def selects(selector: Body, labels: Body) -> bool:
-    wanted = selector.get("matchLabels", {}).items()
+    required = selector.get("matchLabels", {}).items()
     tests = {"In": lambda value, values: value in values, "NotIn": lambda value, values: value not in values}
-    return all(labels.get(key) == value for key, value in wanted) and all(
+    return all(labels.get(key) == value for key, value in required) and all(
         tests[e["operator"]](labels.get(e["key"]), e["values"]) for e in selector.get("matchExpressions", ())
     )
 
 
 def may_call(application: Application, sender: Body | str, instance: str) -> bool:
-    """Whether a pod, by its labels, or an address may call an instance."""
+    """Return True if a pod with the given labels, or an address, may call an instance."""
     policies = [
         p["spec"] for p in network_policies(application, PLAN) if selects(p["spec"]["podSelector"], PODS[instance])
     ]

@@ -26,7 +26,7 @@ def report(phase: Any, message: str = "", generation: int = 1, uid: str = "u") -
 
 
 @pytest.mark.parametrize(
-    ("known", "said", "wanted"),
+    ("known", "reported", "expected"),
     [
         (None, report("Active"), {"phase": "Active", "message": "", "observedGeneration": 1}),
         ({"phase": "Active", "message": "", "observedGeneration": 1}, report("Active"), None),
@@ -44,18 +44,18 @@ def report(phase: Any, message: str = "", generation: int = 1, uid: str = "u") -
     ],
 )
 def test_report_becomes_grant_status_but_final_phase_stays(
-    known: Body | None, said: ReportedGrant, wanted: Body | None
+    known: Body | None, reported: ReportedGrant, expected: Body | None
 ) -> None:
-    assert reported_status({"metadata": {"name": "g"}, "status": known}, said) == wanted
+    assert reported_status({"metadata": {"name": "g"}, "status": known}, reported) == expected
 
 
 @pytest.mark.parametrize("kind", ACCOUNT_KINDS, ids=lambda kind: kind.name)
 def test_account_with_other_rights_is_modified(kind: Kind) -> None:
-    made = account_object(kind, "drone-1")
-    assert is_unmodified(kind, made | {"secrets": []})
-    for field in made.keys() - {"apiVersion", "kind", "metadata"}:
-        assert not is_unmodified(kind, made | {field: []})
-    assert not is_unmodified(kind, made | {"metadata": {"name": "drone-2"}}) or kind is kinds.SERVICE_ACCOUNT
+    created = account_object(kind, "drone-1")
+    assert is_unmodified(kind, created | {"secrets": []})
+    for field in created.keys() - {"apiVersion", "kind", "metadata"}:
+        assert not is_unmodified(kind, created | {field: []})
+    assert not is_unmodified(kind, created | {"metadata": {"name": "drone-2"}}) or kind is kinds.SERVICE_ACCOUNT
 
 
 class Api(Store):
@@ -64,11 +64,11 @@ class Api(Store):
     def __init__(self) -> None:
         self.field_manager = "test"
         self.objects: dict[str, Body] = {}
-        self.asked: list[tuple[str, str]] = []
+        self.requests: list[tuple[str, str]] = []
         self._versions = itertools.count(1)
 
     async def request(self, method: str, path: str, body: Any = None, **_: Any) -> Any:
-        self.asked.append((method, path))
+        self.requests.append((method, path))
         await asyncio.sleep(0)
         target = path.removesuffix("/status")
         if method == "POST":
@@ -83,17 +83,17 @@ class Api(Store):
             del self.objects[target]
             return {"kind": "Status"}
         elif method == "PATCH":
-            found = self.objects[target]
+            stored = self.objects[target]
             if path != target:
                 # Like the API server, a patch of the status ignores other fields unless it tests them.
-                asked, given = body
-                if asked != {"op": "test", "path": "/metadata/uid", "value": found["metadata"]["uid"]}:
+                test_operation, status_operation = body
+                if test_operation != {"op": "test", "path": "/metadata/uid", "value": stored["metadata"]["uid"]}:
                     raise Invalid(422, "Invalid", path)
-                found["status"] = given["value"]
-            elif body["metadata"]["uid"] != found["metadata"]["uid"]:
+                stored["status"] = status_operation["value"]
+            elif body["metadata"]["uid"] != stored["metadata"]["uid"]:
                 raise Conflict(409, "Conflict", path)
             else:
-                found |= {field: value for field, value in body.items() if field != "metadata"}
+                stored |= {field: value for field, value in body.items() if field != "metadata"}
         else:
             raise KubeError(405, "MethodNotAllowed", path)
         self.objects[target]["metadata"]["resourceVersion"] = str(next(self._versions))
@@ -108,12 +108,15 @@ class Api(Store):
         }
 
     def granted(self, name: str) -> list[str] | None:
-        """The names of the Grants that a node's object carries; None without one."""
-        found = self.node(name).get("NodeGrants")
+        """Return the names of the Grants in the NodeGrants of a node, or None if there is no NodeGrants."""
+        node_grants = self.node(name).get("NodeGrants")
         return (
             None
-            if found is None
-            else [grant["metadata"]["name"] for grant in unpack(found["spec"]["packed"], found["spec"]["count"])]
+            if node_grants is None
+            else [
+                grant["metadata"]["name"]
+                for grant in unpack(node_grants["spec"]["packed"], node_grants["spec"]["count"])
+            ]
         )
 
 
@@ -171,7 +174,7 @@ class Cluster:
     def status(self, grant: str) -> Any:
         return self.api.objects[kinds.GRANT.path("", grant)].get("status")
 
-    def gone(self, kind: Kind, node: str) -> None:
+    def report_deleted(self, kind: Kind, node: str) -> None:
         """Report a deletion by the watch."""
         objects = self.cache.node_objects
         informer: Any = objects.known if kind is kinds.NODE_GRANTS else objects.accounts[kind]
@@ -183,17 +186,17 @@ class Cluster:
                 await asyncio.sleep(0)
 
     async def settled(self) -> None:
-        """All that was added is done."""
+        """Wait until all queued keys are reconciled."""
         await self.until(lambda: not any(w._waiting or w._in_progress for w in self.keeper.work_queues()))
 
 
 @pytest.fixture
 async def cluster() -> AsyncIterator[Cluster]:
-    found = Cluster()
-    yield found
-    for task in found.tasks:
+    running = Cluster()
+    yield running
+    for task in running.tasks:
         task.cancel()
-    await asyncio.gather(*found.tasks, return_exceptions=True)
+    await asyncio.gather(*running.tasks, return_exceptions=True)
 
 
 ALL = {"ServiceAccount", "Role", "RoleBinding", "NodeGrants"}
@@ -204,10 +207,10 @@ async def test_node_gets_account_and_empty_node_grants(cluster: Cluster) -> None
     await cluster.until(lambda: cluster.api.node("drone-1").keys() == ALL)
     assert cluster.api.granted("drone-1") == []
     await cluster.settled()
-    cluster.api.asked.clear()
+    cluster.api.requests.clear()
     cluster.drone("drone-1")
     await cluster.settled()
-    assert cluster.api.asked == []
+    assert cluster.api.requests == []
 
 
 async def test_nodes_are_reconciled_only_after_sync(cluster: Cluster) -> None:
@@ -215,7 +218,7 @@ async def test_nodes_are_reconciled_only_after_sync(cluster: Cluster) -> None:
     cluster.drone("drone-1")
     for _ in range(20):
         await asyncio.sleep(0)
-    assert cluster.api.asked == []
+    assert cluster.api.requests == []
     cluster.cache.children[kinds.GRANT].synced.set()
     await cluster.until(lambda: cluster.api.granted("drone-1") == [])
 
@@ -238,18 +241,18 @@ async def test_reports_are_copied_to_grants_of_the_same_node(cluster: Cluster) -
     cluster.grant("b", "edge-1")
     await cluster.until(lambda: cluster.api.granted("drone-1") == ["a"])
     await cluster.settled()
-    cluster.api.asked.clear()
+    cluster.api.requests.clear()
     strangers = (report("Failed", uid="uid of b"), report("Failed", uid="unknown"))
     cluster.report("drone-1", report("Complete", "flown", uid="uid of a"), *strangers)
     await cluster.until(lambda: cluster.status("a") is not None)
     await cluster.settled()
     assert cluster.status("a") == {"phase": "Complete", "message": "flown", "observedGeneration": 1}
     assert cluster.status("b") is None
-    # The status of a Grant does not make its node's object be written, nor the same report the status.
-    assert cluster.api.asked == [("PATCH", f"{kinds.GRANT.path('', 'a')}/status")]
+    # A changed status does not cause a write of the NodeGrants. An unchanged report does not cause a write of the status.
+    assert cluster.api.requests == [("PATCH", f"{kinds.GRANT.path('', 'a')}/status")]
     cluster.report("drone-1", report("Complete", "flown", uid="uid of a"), report("Active", uid="more"))
     await cluster.settled()
-    assert len(cluster.api.asked) == 1
+    assert len(cluster.api.requests) == 1
 
 
 async def test_deleted_node_gets_empty_node_grants_before_removal(cluster: Cluster) -> None:
@@ -258,11 +261,11 @@ async def test_deleted_node_gets_empty_node_grants_before_removal(cluster: Clust
     await cluster.until(lambda: cluster.api.node("drone-1").keys() == ALL and cluster.api.granted("drone-1") == ["a"])
     cluster.no_drone("drone-1")
     await cluster.settled()
-    assert cluster.api.granted("drone-1") == ["a"], "a Grant names it"
-    cluster.api.asked.clear()
+    assert cluster.api.granted("drone-1") == ["a"], "a Grant names the node"
+    cluster.api.requests.clear()
     cluster.no_grant("a")
     await cluster.until(lambda: not cluster.api.node("drone-1"))
-    assert [method for method, _ in cluster.api.asked] == ["PATCH", "DELETE", "DELETE", "DELETE", "DELETE"]
+    assert [method for method, _ in cluster.api.requests] == ["PATCH", "DELETE", "DELETE", "DELETE", "DELETE"]
 
 
 async def test_unregistered_node_keeps_empty_node_grants(cluster: Cluster) -> None:
@@ -281,10 +284,10 @@ async def test_report_of_recreated_grant_is_dropped(cluster: Cluster) -> None:
     cluster.grant("a", "drone-1")
     await cluster.until(lambda: cluster.api.granted("drone-1") == ["a"])
     await cluster.settled()
-    # The watch has not reported it yet.
+    # The watch has not reported the object yet.
     cluster.api.objects[kinds.GRANT.path("", "a")]["metadata"]["uid"] = "another"
     cluster.report("drone-1", report("Complete", uid="uid of a"))
-    await cluster.until(lambda: ("PATCH", f"{kinds.GRANT.path('', 'a')}/status") in cluster.api.asked)
+    await cluster.until(lambda: ("PATCH", f"{kinds.GRANT.path('', 'a')}/status") in cluster.api.requests)
     await cluster.settled()
     assert cluster.status("a") is None
 
@@ -292,8 +295,8 @@ async def test_report_of_recreated_grant_is_dropped(cluster: Cluster) -> None:
 async def test_newest_grants_are_omitted_when_node_grants_is_full(
     cluster: Cluster, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    one = cluster.grant("z-oldest", "drone-1", creationTimestamp="2026-01-01T00:00:00Z")
-    monkeypatch.setattr(grants, "MAX_UNPACKED_BYTES", 3 * len(json.dumps(one)))
+    oldest = cluster.grant("z-oldest", "drone-1", creationTimestamp="2026-01-01T00:00:00Z")
+    monkeypatch.setattr(grants, "MAX_UNPACKED_BYTES", 3 * len(json.dumps(oldest)))
     for hour in range(9):
         cluster.grant(f"g{hour}", "drone-1", creationTimestamp=f"2026-01-02T0{hour}:00:00Z")
     await cluster.settled()
@@ -305,7 +308,9 @@ async def test_newest_grants_are_omitted_when_node_grants_is_full(
     assert f"omitted={10 - len(held)}" in caplog.text
     cluster.no_grant("z-oldest")
     await cluster.settled()
-    assert cluster.api.granted("drone-1") == [f"g{hour}" for hour in range(len(held))], "revoked, and one more fits"
+    assert cluster.api.granted("drone-1") == [f"g{hour}" for hour in range(len(held))], (
+        "after the revocation, one more Grant fits"
+    )
 
 
 @pytest.mark.parametrize("kind", [*ACCOUNT_KINDS, kinds.NODE_GRANTS], ids=lambda kind: kind.name)
@@ -326,10 +331,10 @@ async def test_deleted_or_modified_node_object_is_created_again(cluster: Cluster
     cluster.api.objects[path] = json.loads(json.dumps(changed))
     informer._take("MODIFIED", changed | {"metadata": before["metadata"] | {"resourceVersion": version}})
     await cluster.settled()
-    wanted = {field: value for field, value in before.items() if field != "metadata"}
-    assert {field: cluster.api.objects[path].get(field) for field in wanted} == wanted
+    expected = {field: value for field, value in before.items() if field != "metadata"}
+    assert {field: cluster.api.objects[path].get(field) for field in expected} == expected
     del cluster.api.objects[path]
-    cluster.gone(kind, "drone-1")
+    cluster.report_deleted(kind, "drone-1")
     await cluster.until(lambda: path in cluster.api.objects)
     await cluster.settled()
     assert cluster.api.granted("drone-1") == ["a"]
@@ -341,5 +346,5 @@ async def test_grants_changed_during_packing_are_written(cluster: Cluster) -> No
         await asyncio.sleep(0)
     await cluster.until(lambda: len(cluster.api.granted("drone-1") or ()) == 20)
     await cluster.settled()
-    writes = [path for method, path in cluster.api.asked if "/nodegrants" in path]
+    writes = [path for method, path in cluster.api.requests if "/nodegrants" in path]
     assert len(writes) < 20

@@ -33,12 +33,12 @@ def test_node_is_wiped_when_its_pod_is_ready() -> None:
 
 
 class Cluster:
-    """Answers as the API server would; each look at the pods finds one more that is ready.
+    """Fake API server. One more pod is ready at each listing of the pods.
 
     Attributes:
-        fails: The looks that it answers with an error.
-        refuses: The names of objects that it does not delete.
-        operator: The Deployment of the operator, or the error that asking for it gives.
+        fails: Numbers of the listings that fail.
+        refuses: Names of objects that cannot be deleted.
+        operator: The Deployment of the operator, or the error of a request for it.
     """
 
     def __init__(self, fails: range = range(0), refuses: tuple[str, ...] = ()) -> None:
@@ -92,12 +92,12 @@ def fast(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def connect(monkeypatch: pytest.MonkeyPatch, cluster: Cluster) -> Any:
-    """Let the removal find this cluster."""
+    """Connect the removal to the fake cluster."""
 
-    async def found() -> Cluster:
+    async def connect() -> Cluster:
         return cluster
 
-    monkeypatch.setattr(Store, "connect", found)
+    monkeypatch.setattr(Store, "connect", connect)
     return cluster
 
 
@@ -115,24 +115,24 @@ async def test_wait_for_wipe_continues_after_error(cluster: Any) -> None:
 
 async def test_unwiped_nodes_are_unknown_without_response(monkeypatch: pytest.MonkeyPatch) -> None:
     cluster = connect(monkeypatch, Cluster(fails=range(1, 1_000_000)))
-    said = await run("fractus-system", "/data/fractus", timeout_s=0.05)
-    assert "it is unknown on which nodes /data/fractus was wiped (the server is busy)" in said
-    assert "rm -rf /data/fractus" in said
+    output = await run("fractus-system", "/data/fractus", timeout_s=0.05)
+    assert "it is unknown on which nodes /data/fractus was wiped (the server is busy)" in output
+    assert "rm -rf /data/fractus" in output
     assert "DaemonSet fractus-wipe" in cluster.deleted
 
 
 async def test_refused_removal_does_not_stop_the_rest(monkeypatch: pytest.MonkeyPatch) -> None:
     cluster = connect(monkeypatch, Cluster(refuses=("fractus-ca", "one", "drone-2")))
-    said = await run("fractus-system", "/data/fractus", timeout_s=0.05)
-    assert "some objects of Fractus were not removed" in said
-    for what in (
+    output = await run("fractus-system", "/data/fractus", timeout_s=0.05)
+    assert "some objects of Fractus were not removed" in output
+    for text in (
         "Secret fractus-system/fractus-ca",
         "ConfigMap fractus-system/fractus-ca",
         "one may not",
         "drone-2 may not",
     ):
-        assert what in said
-    assert "/data/fractus was not wiped on drone-2: remove it there (rm -rf /data/fractus)" in said
+        assert text in output
+    assert "/data/fractus was not wiped on drone-2: remove it there (rm -rf /data/fractus)" in output
     assert cluster.deleted == ["Lease fractus-operator", "CertificateSigningRequest two", "DaemonSet fractus-wipe"]
     assert cluster.labels == ["drone-1", "edge-1"]
     assert "wiped" not in await run("fractus-system", "")
@@ -153,22 +153,25 @@ async def test_existing_authority_is_kept() -> None:
 
 
 @pytest.mark.parametrize(
-    ("operator", "why"),
+    ("operator", "message"),
     [
         ({"metadata": {"name": "fractus-operator"}}, "Fractus is installed in fractus-system"),
-        (KubeError(0, "", "it did not answer in time"), "unknown whether Fractus is still installed (it did not"),
+        (
+            KubeError(0, "", "the server did not respond in time"),
+            "unknown whether Fractus is still installed (the server did not",
+        ),
     ],
 )
 async def test_removal_removes_nothing_while_operator_is_installed(
-    monkeypatch: pytest.MonkeyPatch, operator: object, why: str
+    monkeypatch: pytest.MonkeyPatch, operator: object, message: str
 ) -> None:
-    """Rendered by helm template, the Job is made with the rest: without its authority the fleet could not be granted anything."""
+    """`helm template` renders the Job together with the operator. If the Job removed the authority, no Grant could be signed."""
     cluster = connect(monkeypatch, Cluster())
     cluster.operator = operator
-    said = await run("fractus-system", "/data/fractus", timeout_s=0.05)
-    assert said.startswith("nothing was removed")
-    assert why in said
-    assert cluster.deleted == ["DaemonSet fractus-wipe"], "which would wipe nodes in use"
+    output = await run("fractus-system", "/data/fractus", timeout_s=0.05)
+    assert output.startswith("nothing was removed")
+    assert message in output
+    assert cluster.deleted == ["DaemonSet fractus-wipe"], "the DaemonSet would wipe nodes in use"
     assert not cluster.labels
     cluster.operator = {"metadata": {"name": "fractus-operator", "deletionTimestamp": "2026-01-01T00:00:00Z"}}
     await run("fractus-system", "/data/fractus", timeout_s=0.05)
@@ -190,7 +193,7 @@ async def test_check_for_operator_is_repeated_without_response(status: int, monk
 
 @pytest.fixture
 def terminable() -> Iterator[None]:
-    """This process outlives a SIGTERM, and has its handler back in the end."""
+    """Let the process survive a SIGTERM, and restore the handler afterwards."""
     before = signal.signal(signal.SIGTERM, signal.SIG_IGN)
     yield
     signal.signal(signal.SIGTERM, before)
@@ -200,9 +203,9 @@ def terminable() -> Iterator[None]:
 def test_signal_during_removal_deletes_wipe_daemon_set(
     terminable: None, monkeypatch: pytest.MonkeyPatch, at: str
 ) -> None:
-    """The Job's deadline, or a drained node: with the DaemonSet left, the next installation would be wiped."""
+    """The signal comes from the deadline of the Job or a drained node. A remaining DaemonSet would wipe the next installation."""
     cluster = connect(monkeypatch, Cluster())
-    cluster.ready.append(pod("drone-2", "True"))  # so that it ends by itself, too
+    cluster.ready.append(pod("drone-2", "True"))  # so that the wait ends even without the signal
     answer = getattr(cluster, at)
 
     async def interrupted(*args: Any, **selectors: Any) -> Any:

@@ -39,8 +39,8 @@ def plan() -> DeploymentPlanSpec:
 
 
 def without(name: str) -> Inventory:
-    hosts = {other: found for other, found in TWO.hosts.items() if other != name}
-    drones = {other: found for other, found in TWO.drones.items() if other != name}
+    hosts = {other: value for other, value in TWO.hosts.items() if other != name}
+    drones = {other: value for other, value in TWO.drones.items() if other != name}
     return inventory(drones.values(), hosts=hosts.values())
 
 
@@ -58,10 +58,10 @@ def test_deleted_drone_is_replaced_unless_in_flight(plan: DeploymentPlanSpec) ->
 
 def test_cordoned_node_is_left_only_if_another_fits(plan: DeploymentPlanSpec) -> None:
     cordoned = host("one", "drone", schedulable=False)
-    others = [found for name, found in TWO.hosts.items() if name != "one"]
-    left = choose(plan, inventory(TWO.drones.values(), hosts=[cordoned, *others]))
-    assert left.reason == "NodeCordoned"
-    alone = inventory([drone("one")], hosts=[cordoned, *(h for h in others if h.name != "two")])
+    other_hosts = [value for name, value in TWO.hosts.items() if name != "one"]
+    replanned = choose(plan, inventory(TWO.drones.values(), hosts=[cordoned, *other_hosts]))
+    assert replanned.reason == "NodeCordoned"
+    alone = inventory([drone("one")], hosts=[cordoned, *(h for h in other_hosts if h.name != "two")])
     assert choose(plan, alone) == Choice(plan)
 
 

@@ -41,11 +41,11 @@ def built() -> dict[str, Any]:
     )
     checker = APPLICATION.spec.component("ImageChecker")
     data = {"tls.crt": "Y2VydA==", "tls.key": "a2V5", "ca.crt": "Y2E="}
-    found = {
+    objects = {
         f"deployment-{name}": deployment(APPLICATION, p, DRONE if p.node == "drone-1" else None)
         for name, p in placed.items()
     }
-    return found | {
+    return objects | {
         "plan": deployment_plan(APPLICATION, PLAN),
         "grant": grant(APPLICATION, spec),
         "secret": tls_secret(APPLICATION, placed["traffic-navigator"], data),

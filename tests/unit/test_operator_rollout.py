@@ -61,7 +61,7 @@ async def test_subscription_pause_ends_only_with_urgent_change() -> None:
 
 
 class FakeObjects:
-    """Child objects in memory. Records the requests in their order."""
+    """Fake child objects in memory. Records the requests in order."""
 
     def __init__(self, cache: Any) -> None:
         self.cache = cache
@@ -109,14 +109,14 @@ class FakeObjects:
 
 @dataclass
 class Clock:
-    """The current time of the test."""
+    """Return the current time of the test."""
 
     now: datetime = NOW
 
 
 @dataclass
 class Scene:
-    """One Application to roll out, with an existing Grant and a new one."""
+    """Rollout of one Application with an existing Grant and a new Grant."""
 
     rollout: Rollout
     objects: FakeObjects

@@ -1,4 +1,4 @@
-"""Route checks of active plans run in a worker thread, and apply only to the plan and rules that they were made for."""
+"""Route checks of active plans run in a worker thread, and apply only to the checked plan and rules."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ NOW = datetime(2026, 1, 1, tzinfo=UTC)
 
 
 class FakeCheck:
-    """A route check that takes until the test lets it end."""
+    """Route check that waits until the test ends it."""
 
     def __init__(self) -> None:
         self.plans: list[DeploymentPlanSpec] = []
@@ -47,7 +47,7 @@ def plan() -> DeploymentPlanSpec:
 
 
 class Scene:
-    """A RouteCheckCache with a fake clock and wake-up."""
+    """RouteCheckCache with a fake clock and wake-up."""
 
     def __init__(self) -> None:
         self.now = NOW
@@ -60,7 +60,7 @@ class Scene:
 
     async def until(self, condition: Callable[[], bool]) -> None:
         async with asyncio.timeout(20.0):
-            while not condition():  # noqa: ASYNC110 (nothing tells when)
+            while not condition():  # noqa: ASYNC110 (no notification)
                 await asyncio.sleep(0.001)
 
 
@@ -129,7 +129,7 @@ async def test_failed_route_check_is_counted_and_cached(
         return sum(sample.value for sample in samples if sample.name.endswith("_total") and sample.labels == labels)
 
     def broken(*_: Any) -> DeploymentPlanSpec:
-        raise KeyError("a zone that is none")
+        raise KeyError("an invalid zone")
 
     monkeypatch.setattr(route_check_cache, "with_legality", broken)
     scene = Scene()
@@ -140,5 +140,5 @@ async def test_failed_route_check_is_counted_and_cached(
         assert scene.lookup(present) is present
         await scene.until(lambda: not scene.checks._running)
         assert count() == before + failures
-    assert "a zone that is none" in caplog.text
+    assert "an invalid zone" in caplog.text
     assert not scene.woken.is_set()

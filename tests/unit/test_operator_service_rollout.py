@@ -44,31 +44,31 @@ def node(
 
 
 def step_of(*nodes: ServicesOfNode, ready: int = 0) -> tuple[list[str], dict[str, ConditionUpdate]]:
-    chosen, said = next_step(nodes, len(nodes), lambda _: ready)
-    return [n.node for n in chosen], said
+    chosen, reasons = next_step(nodes, len(nodes), lambda _: ready)
+    return [n.node for n in chosen], reasons
 
 
 def test_services_of_one_node_are_replaced_at_a_time() -> None:
-    chosen, said = step_of(node("d1"), node("d2"), node("d3"))
+    chosen, conditions = step_of(node("d1"), node("d2"), node("d3"))
     assert chosen == ["d1"]
-    assert [said[n].reason for n in ("d1", "d2", "d3")] == ["Replacing", "Queued", "Queued"]
-    assert "when the services of d1 are ready" in said["d2"].message
-    assert "m-d2-old" in said["d2"].message
+    assert [conditions[n].reason for n in ("d1", "d2", "d3")] == ["Replacing", "Queued", "Queued"]
+    assert "when the services of d1 are ready" in conditions["d2"].message
+    assert "m-d2-old" in conditions["d2"].message
 
 
 def test_nodes_wait_while_services_of_another_start() -> None:
-    chosen, said = step_of(node("d1", outdated=False, starting=True), node("d2"))
+    chosen, conditions = step_of(node("d1", outdated=False, starting=True), node("d2"))
     assert not chosen
-    assert said["d1"].reason == "Starting"
-    assert "when the services of d1 are ready" in said["d2"].message
+    assert conditions["d1"].reason == "Starting"
+    assert "when the services of d1 are ready" in conditions["d2"].message
 
 
 @pytest.mark.parametrize("obstacle", ["InTheAir", "OnMission", "NodeUnreachable"])
 def test_services_of_flying_or_unreachable_drone_are_kept(obstacle: str) -> None:
-    chosen, said = step_of(node("d1", obstacle=obstacle), node("d2"))
-    assert chosen == ["d2"], "and no other waits for it"
-    assert (said["d1"].status, said["d1"].reason) == ("False", obstacle)
-    assert "d1 is so" in said["d1"].message
+    chosen, conditions = step_of(node("d1", obstacle=obstacle), node("d2"))
+    assert chosen == ["d2"], "no other node waits for this one"
+    assert (conditions["d1"].status, conditions["d1"].reason) == ("False", obstacle)
+    assert "d1 is so" in conditions["d1"].message
 
 
 def test_unreachable_node_does_not_stop_rollout() -> None:
@@ -80,17 +80,17 @@ STUCK = {"outdated": False, "starting": True, "starting_s": 601.0}
 
 
 def test_node_that_is_never_ready_is_skipped_and_reported() -> None:
-    chosen, said = step_of(node("d1", **STUCK), node("d2"))
+    chosen, conditions = step_of(node("d1", **STUCK), node("d2"))
     assert chosen == ["d2"]
-    assert (said["d1"].reason, said["d1"].warning) == ("NotReady", True)
-    assert "m: not ready for 10 minutes; the rollout continues without it" in said["d1"].message
+    assert (conditions["d1"].reason, conditions["d1"].warning) == ("NotReady", True)
+    assert "m: not ready for 10 minutes; the rollout continues without it" in conditions["d1"].message
 
 
 def test_broken_release_stops_at_second_node() -> None:
     failed = [node("d1", **STUCK), node("d2", **STUCK)]
-    chosen, said = step_of(*failed, node("d3"))
+    chosen, conditions = step_of(*failed, node("d3"))
     assert not chosen
-    assert "other nodes wait" in said["d1"].message
+    assert "other nodes wait" in conditions["d1"].message
     assert step_of(*failed, node("d3"), ready=2)[0] == ["d3"], "others run it"
 
 
@@ -107,8 +107,8 @@ def test_latest_revision_has_highest_number() -> None:
     services = NodeServicePods("fractus-system")
     old = pod(revision="old")
     new = pod(revision="new")
-    for one in (old, new):
-        services.pod_changed((one.namespace, one.name), None, one)
+    for replica in (old, new):
+        services.pod_changed((replica.namespace, replica.name), None, replica)
     assert services.is_current(old), "no revision is known yet"
     services.revision_changed(("", "a"), None, Revision("fractus-mobility", 1, "old"))
     services.revision_changed(("", "b"), None, Revision("fractus-mobility", 2, "new"))
@@ -126,16 +126,16 @@ def test_latest_revision_has_highest_number() -> None:
 
 def test_only_changed_nodes_are_returned() -> None:
     services = NodeServicePods("fractus-system")
-    for one in (pod("d1"), pod("d2")):
-        services.pod_changed((one.namespace, one.name), None, one)
+    for replica in (pod("d1"), pod("d2")):
+        services.pod_changed((replica.namespace, replica.name), None, replica)
     assert services.take_changed() == {"d1", "d2"}
     assert not services.take_changed()
     services.revision_changed(("", "a"), None, Revision("fractus-mobility", 1, "old"))
-    assert services.take_changed() == {"d1", "d2"}, "another release is asked for"
+    assert services.take_changed() == {"d1", "d2"}, "the other revision makes both nodes outdated"
     services.revision_changed(("", "b"), None, Revision("fractus-mobility", 0, "older"))
     assert not services.take_changed()
-    gone = pod("d2")
-    services.pod_changed((gone.namespace, gone.name), gone, None)
+    deleted_pod = pod("d2")
+    services.pod_changed((deleted_pod.namespace, deleted_pod.name), deleted_pod, None)
     assert services.take_changed() == {"d2"}
 
 
@@ -147,11 +147,11 @@ def test_other_pods_and_revisions_are_ignored() -> None:
     assert parse_revision({"metadata": {"name": "x", "namespace": "fractus-system"}, "revision": 1}) is None
 
 
-# -- silence --
+# -- stale nodes --
 
 
-def drone(seen: str | None, state: str = "flying") -> Drone:
-    status = {"flightState": state, "lastFlightState": state} | ({"lastSeen": seen} if seen else {})
+def drone(last_seen: str | None, state: str = "flying") -> Drone:
+    status = {"flightState": state, "lastFlightState": state} | ({"lastSeen": last_seen} if last_seen else {})
     return Drone.from_body({"apiVersion": V1, "kind": "Drone", "metadata": {"name": "d"}, "spec": {}, "status": status})
 
 
@@ -196,22 +196,22 @@ def test_node_without_report_is_not_stale() -> None:
 
 def test_api_server_outage_makes_no_node_stale() -> None:
     now_s = [0.0]
-    hears = [True]
-    clock = ObservationClock(lambda: now_s[0], lambda: hears[0])
+    connected = [True]
+    clock = ObservationClock(lambda: now_s[0], lambda: connected[0])
     silence = StaleNodeDetector()
 
     def silent_after(seconds: int) -> bool:
-        found = False
+        stale = False
         for _ in range(seconds):
             now_s[0] += 1.0
-            found = bool(silence.stale_nodes([drone(at(0))], clock.now_s()))
-        return found
+            stale = bool(silence.stale_nodes([drone(at(0))], clock.now_s()))
+        return stale
 
     assert not silent_after(5)
-    hears[0] = False
+    connected[0] = False
     assert not silent_after(600)
-    hears[0] = True
-    assert not silent_after(15), "agents try again at most 15 s apart"
+    connected[0] = True
+    assert not silent_after(15), "agents retry at least every 15 s"
     assert not silent_after(10)
     assert silent_after(6)
 
@@ -223,7 +223,7 @@ def test_delayed_step_makes_no_node_stale() -> None:
     assert clock.now_s() <= 3.0
 
 
-# -- steps --
+# -- rollout steps --
 
 
 class Api(Store):
@@ -235,12 +235,12 @@ class Api(Store):
         self.objects: dict[str, dict[str, Any]] = {}
         self.refused: set[str] = set()
         self.forbidden: set[str] = set()
-        self.asked: list[tuple[str, str]] = []
+        self.requests: list[tuple[str, str]] = []
 
     async def request(self, method: str, path: str, body: Any = None, **_: Any) -> Any:
         name = path.removesuffix("/status").rpartition("/")[2]
         if method != "GET":
-            self.asked.append((method, name))
+            self.requests.append((method, name))
         if name in self.refused:
             raise KubeError(422, "Invalid", f"{name} is refused")
         if method in self.forbidden:
@@ -259,18 +259,18 @@ class Api(Store):
 @pytest.fixture
 async def cache() -> ClusterCache:
     """Three drones on the ground, each with one outdated service."""
-    found = ClusterCache(Api())
-    for informer in found.informers:
+    cluster_cache = ClusterCache(Api())
+    for informer in cluster_cache.informers:
         informer.synced.set()
     for name in ("d1", "d2", "d3"):
         body = drone(at(0), "inactive").to_dict()
         body["metadata"]["name"] = name
-        found.drones.record_write(("", name), body)
+        cluster_cache.drones.record_write(("", name), body)
         ready = {"conditions": [{"type": "Ready", "status": "True"}]}
-        found.hosts.record_write(("", name), {"metadata": {"name": name}, "spec": {}, "status": ready})
-        shown(found, pod(name, "old"))
-    found.services.revision_changed(("", "b"), None, Revision("fractus-mobility", 2, "new"))
-    return found
+        cluster_cache.hosts.record_write(("", name), {"metadata": {"name": name}, "spec": {}, "status": ready})
+        shown(cluster_cache, pod(name, "old"))
+    cluster_cache.services.revision_changed(("", "b"), None, Revision("fractus-mobility", 2, "new"))
+    return cluster_cache
 
 
 def shown(cache: ClusterCache, new: PodView) -> None:
@@ -287,7 +287,7 @@ def reported(cache: ClusterCache, api: Api) -> NodeConditionWriter:
     return NodeConditionWriter(api, cache, lambda: datetime(2026, 1, 1, tzinfo=UTC))
 
 
-def told(api: Api, name: str, type_: str) -> str:
+def condition_reason(api: Api, name: str, type_: str) -> str:
     conditions = api.objects[name]["status"].get("conditions", ())
     return next((c["reason"] for c in conditions if c["type"] == type_), "")
 
@@ -298,19 +298,19 @@ async def test_missing_successor_pod_stops_rollout(cache: ClusterCache) -> None:
     rollout = ServiceRollout(api, cache, reported(cache, api), lambda: now_s[0])
 
     async def step() -> list[str]:
-        api.asked.clear()
+        api.requests.clear()
         await rollout.step()
         for name, body in api.objects.items():
             if name in {"d1", "d2", "d3"}:
                 cache.drones.record_write(("", name), json.loads(json.dumps(body)))
-        return [name for method, name in api.asked if method == "DELETE"]
+        return [name for method, name in api.requests if method == "DELETE"]
 
     assert await step() == ["m-d1-old"]
     removed(cache, pod("d1", "old"))
-    assert not await step(), "no other is deleted before the first has its successor"
+    assert not await step(), "no second pod is deleted before the first has a successor"
     now_s[0] = 600.0
-    assert not await step(), "nor before it was given its time"
-    assert told(api, "d1", "ServicesCurrent") == "Starting"
+    assert not await step(), "no second pod is deleted before the start period ends"
+    assert condition_reason(api, "d1", "ServicesCurrent") == "Starting"
     starting = pod("d1", "new")
     shown(cache, starting)
     assert not await step()
@@ -318,7 +318,7 @@ async def test_missing_successor_pod_stops_rollout(cache: ClusterCache) -> None:
     assert await step() == ["m-d2-old"]
     removed(cache, pod("d2", "old"))
     cache.hosts._drop(("", "d2"))
-    assert await step() == ["m-d3-old"], "a node that is gone is owed nothing"
+    assert await step() == ["m-d3-old"], "a deleted node does not delay the rollout"
 
 
 async def test_node_that_is_never_ready_does_not_stop_rollout(cache: ClusterCache) -> None:
@@ -330,11 +330,11 @@ async def test_node_that_is_never_ready_does_not_stop_rollout(cache: ClusterCach
     shown(cache, pod("d1", "new"))
     for now_s[0] in (10.0, 605.0):
         await rollout.step()
-        assert [name for method, name in api.asked if method == "DELETE"] == ["m-d1-old"]
+        assert [name for method, name in api.requests if method == "DELETE"] == ["m-d1-old"]
     now_s[0] = 620.0
     await rollout.step()
-    assert [name for method, name in api.asked if method == "DELETE"] == ["m-d1-old", "m-d2-old"]
-    assert told(api, "d1", "ServicesCurrent") == "NotReady"
+    assert [name for method, name in api.requests if method == "DELETE"] == ["m-d1-old", "m-d2-old"]
+    assert condition_reason(api, "d1", "ServicesCurrent") == "NotReady"
 
 
 async def test_current_fleet_is_not_checked_again(cache: ClusterCache, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -345,7 +345,7 @@ async def test_current_fleet_is_not_checked_again(cache: ClusterCache, monkeypat
     await rollout.step()
     monkeypatch.setattr(cache.services, "on", None)
     await rollout.step()
-    assert not api.asked
+    assert not api.requests
 
 
 async def test_refused_deletion_does_not_stop_rollout(cache: ClusterCache) -> None:
@@ -358,30 +358,30 @@ async def test_refused_deletion_does_not_stop_rollout(cache: ClusterCache) -> No
         )
     api.refused = {"m-d1-old", "d2"}
     await ServiceRollout(api, cache, reported(cache, api), lambda: 0.0).step()
-    assert [name for method, name in api.asked if method == "DELETE"] == ["m-d1-old", "m-d2-old"]
-    assert told(api, "d1", "ServicesCurrent") == "Refused"
-    assert told(api, "d3", "ServicesCurrent") == "Queued", "after d2, whose status is refused"
+    assert [name for method, name in api.requests if method == "DELETE"] == ["m-d1-old", "m-d2-old"]
+    assert condition_reason(api, "d1", "ServicesCurrent") == "Refused"
+    assert condition_reason(api, "d3", "ServicesCurrent") == "Queued", "after d2, whose status is refused"
 
 
-@pytest.mark.parametrize("seen", [None, "2026-01-01T00:00:00z", "yesterday"])
-async def test_report_times_are_parsed(cache: ClusterCache, seen: str | None) -> None:
+@pytest.mark.parametrize("last_seen", [None, "2026-01-01T00:00:00z", "yesterday"])
+async def test_report_times_are_parsed(cache: ClusterCache, last_seen: str | None) -> None:
     api = Api()
     now_s = [0.0]
     watch = NodeLivenessController(cache, reported(cache, api), lambda: now_s[0])
     await watch.step()
-    api.objects["d1"]["status"] = {"lastSeen": seen} if seen else {}
+    api.objects["d1"]["status"] = {"lastSeen": last_seen} if last_seen else {}
     api.refused = {"d2"}
     now_s[0] = 1000.0
     await watch.step()
-    assert told(api, "d1", "Ready") == ("AgentSilent" if seen and seen.endswith("z") else "")
-    assert told(api, "d3", "Ready") == "AgentSilent", "after d2, whose status is refused"
+    assert condition_reason(api, "d1", "Ready") == ("AgentSilent" if last_seen and last_seen.endswith("z") else "")
+    assert condition_reason(api, "d3", "Ready") == "AgentSilent", "after d2, whose status is refused"
 
 
 # -- missions --
 
 
 def granted(cache: ClusterCache, name: str, node: str | None) -> None:
-    """A Grant appears, or goes (None)."""
+    """Add a Grant, or remove it if None."""
     owner = {"namespace": "ns", "name": "app", "uid": "u"}
     grants = cache.children[GRANT]
     if node is None:
@@ -397,40 +397,40 @@ async def test_mission_condition_ends_after_two_reports(cache: ClusterCache) -> 
     changed: list[Any] = []
     cache.add_listener(GRANT, lambda key: changed.append(missions.grant_changed(key)))
 
-    async def said(**status: Any) -> str:
+    async def mission_reason(**status: Any) -> str:
         api.objects["d1"]["status"] |= status
         cache.drones.record_write(("", "d1"), json.loads(json.dumps(api.objects["d1"])))
         await missions.reconcile(("", "d1"))
         cache.drones.record_write(("", "d1"), json.loads(json.dumps(api.objects["d1"])))
-        return told(api, "d1", "OnMission")
+        return condition_reason(api, "d1", "OnMission")
 
-    assert await said() == "", "nothing was ever granted"
+    assert await mission_reason() == "", "no Grant ever existed"
     granted(cache, "ns.a", "d1")
-    assert await said() == "Granted"
-    assert api.asked == [("PATCH", "d1")], "it takes one request, and no look before"
+    assert await mission_reason() == "Granted"
+    assert api.requests == [("PATCH", "d1")], "the patch needs no prior GET"
     assert cache.drones.get(("", "d1")).may_take_off  # type: ignore[union-attr]
     granted(cache, "ns.a", None)
-    assert await said() == "AwaitingReports"
-    assert await said() == "AwaitingReports"
-    assert await said(lastSeen=at(30), flightState="unknown") == "AwaitingReports"
+    assert await mission_reason() == "AwaitingReports"
+    assert await mission_reason() == "AwaitingReports"
+    assert await mission_reason(lastSeen=at(30), flightState="unknown") == "AwaitingReports"
     assert cache.drones.get(("", "d1")).may_take_off  # type: ignore[union-attr]
     for _ in range(2):
-        assert await said(lastSeen=at(31), flightState="inactive") == "AwaitingReports", (
-            "it may be older than the Grant's end"
+        assert await mission_reason(lastSeen=at(31), flightState="inactive") == "AwaitingReports", (
+            "the report may be older than the removal of the Grant"
         )
-    assert await said(lastSeen=at(59)) == "NoGrant"
+    assert await mission_reason(lastSeen=at(59)) == "NoGrant"
     assert not cache.drones.get(("", "d1")).may_take_off  # type: ignore[union-attr]
 
 
 async def test_condition_is_not_written_twice_before_watch_event(cache: ClusterCache) -> None:
-    """Grants of an application come one by one."""
+    """Grants of an application are created one by one."""
     api = Api()
     missions = MissionConditionController(api, cache, reported(cache, api), lambda: datetime(2026, 1, 1, tzinfo=UTC))
     cache.add_listener(GRANT, lambda key: bool(missions.grant_changed(key)))
     for name in ("ns.a", "ns.b", "ns.c"):
         granted(cache, name, "d1")
         await missions.reconcile(("", "d1"))
-    assert api.asked == [("PATCH", "d1")]
+    assert api.requests == [("PATCH", "d1")]
 
 
 def test_grounded_annotation_is_valid_until_next_report() -> None:
@@ -448,7 +448,7 @@ def test_grounded_annotation_is_valid_until_next_report() -> None:
 async def test_condition_is_updated_if_patch_is_forbidden(
     cache: ClusterCache, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """After `helm rollback` the role allows only updates. Admission uses OnMission, and would take the drone for idle."""
+    """After `helm rollback` the role allows only updates. Without OnMission, admission would treat the drone as idle."""
     api = Api()
     api.forbidden = {"PATCH"}
     missions = MissionConditionController(api, cache, reported(cache, api), lambda: datetime(2026, 1, 1, tzinfo=UTC))
@@ -456,10 +456,10 @@ async def test_condition_is_updated_if_patch_is_forbidden(
     for name, reason in (("ns.a", "Granted"), (None, "AwaitingReports"), (None, "AwaitingReports")):
         granted(cache, "ns.a", "d1" if name else None)
         await missions.reconcile(("", "d1"))
-        assert told(api, "d1", "OnMission") == reason
-    assert api.asked == [("PATCH", "d1"), ("PUT", "d1")] * 2, "nothing is tried again and again"
-    (said,) = (record.getMessage() for record in caplog.records if record.levelname == "WARNING")
-    assert "upgrade the chart fractus, because its ClusterRole belongs to another release" in said
+        assert condition_reason(api, "d1", "OnMission") == reason
+    assert api.requests == [("PATCH", "d1"), ("PUT", "d1")] * 2, "a refused request is not repeated"
+    (warning,) = (record.getMessage() for record in caplog.records if record.levelname == "WARNING")
+    assert "upgrade the chart fractus, because its ClusterRole belongs to another release" in warning
     api.forbidden = {"PATCH", "PUT"}
     granted(cache, "ns.c", "d2")
     with pytest.raises(KubeError, match="cannot PUT"):

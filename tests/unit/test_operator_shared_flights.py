@@ -27,14 +27,14 @@ from test_planning import PATH, VIEWER, application, at, drone, inventory, manif
 HOST = application(navigator(PATH))
 GUEST = application(VIEWER | {"egress": [], "pointsOfInterest": {"points": [at(120, 0), at(250, 0)]}})
 DEPOTS = inventory().depots
-OWN = DeploymentPlanSpec(application="traffic", drone=DroneChoice(node="d"))
-RIDE = DeploymentPlanSpec(application="guest", drone=DroneChoice(node="d", shared_with="default/traffic"))
+HOST_PLAN = DeploymentPlanSpec(application="traffic", drone=DroneChoice(node="d"))
+GUEST_PLAN = DeploymentPlanSpec(application="guest", drone=DroneChoice(node="d", shared_with="default/traffic"))
 
 
 def flown(state: str = "inactive", x: float = 0.0, **more: Any) -> ActiveMission:
     status = {"flightState": state, "position": at(x, 0, 10)}
     flying = Drone.from_body(manifest("Drone", "d", drone("d").spec.to_dict(), status=status))
-    return ActiveMission(HOST, OWN, flying, in_flight=state != "inactive", **more)
+    return ActiveMission(HOST, HOST_PLAN, flying, in_flight=state != "inactive", **more)
 
 
 def submitted(phase: str | None) -> Any:
@@ -53,7 +53,7 @@ def test_drone_in_flight_offers_remaining_flight() -> None:
     assert begun.legs[0][0].lon == pytest.approx(at(180, 0)["lon"])
     assert offered_flights([flown("flying", 900)], DEPOTS, 7.0, None) == {}
     # A flight that is already shared is offered completely.
-    assert offered_flights([flown("flying", 900)], DEPOTS, 7.0, RIDE) == {"d": flight_of(HOST, DEPOTS)}
+    assert offered_flights([flown("flying", 900)], DEPOTS, 7.0, GUEST_PLAN) == {"d": flight_of(HOST, DEPOTS)}
 
 
 def test_flight_of_changed_application_is_not_offered() -> None:
@@ -66,27 +66,29 @@ def test_flight_of_changed_application_is_not_offered() -> None:
     [
         ("Completed", None, True),
         ("Returning", None, True),
-        ("Completed", OWN, False),
+        ("Completed", HOST_PLAN, False),
         ("Failed", None, False),
-        ("Running", OWN, False),
+        ("Running", HOST_PLAN, False),
     ],
 )
 def test_guest_is_complete_when_host_is(phase: str, host_plan: Any, done: bool) -> None:
-    outcome = shared_flight_outcome(RIDE, submitted(phase), host_plan)
+    outcome = shared_flight_outcome(GUEST_PLAN, submitted(phase), host_plan)
     assert (outcome is not None and outcome.kind is OutcomeKind.COMPLETE) is done
-    assert shared_flight_outcome(OWN, submitted("Completed"), None) is None
+    assert shared_flight_outcome(HOST_PLAN, submitted("Completed"), None) is None
 
 
 def test_lost_shared_flight_has_a_reason() -> None:
     whole = flight_of(HOST, DEPOTS)
-    assert shared_flight_lost(GUEST, RIDE, OWN, whole, 7.0) is None
-    assert shared_flight_lost(GUEST, RIDE, OWN, None, 7.0) is None
-    assert shared_flight_lost(GUEST, OWN, None, None, 7.0) is None
-    assert "no longer flies d" in str(shared_flight_lost(GUEST, RIDE, None, whole, 7.0))
-    other = OWN.model_copy(update={"drone": DroneChoice(node="e")})
-    assert "now flies e" in str(shared_flight_lost(GUEST, RIDE, other, whole, 7.0))
+    assert shared_flight_lost(GUEST, GUEST_PLAN, HOST_PLAN, whole, 7.0) is None
+    assert shared_flight_lost(GUEST, GUEST_PLAN, HOST_PLAN, None, 7.0) is None
+    assert shared_flight_lost(GUEST, HOST_PLAN, None, None, 7.0) is None
+    assert "no longer flies d" in str(shared_flight_lost(GUEST, GUEST_PLAN, None, whole, 7.0))
+    moved = HOST_PLAN.model_copy(update={"drone": DroneChoice(node="e")})
+    assert "now flies e" in str(shared_flight_lost(GUEST, GUEST_PLAN, moved, whole, 7.0))
     elsewhere = Flight(("default", "traffic"), ((*whole.legs[0][:1],),))
-    assert "no longer visits pointsOfInterest.points[0]" in str(shared_flight_lost(GUEST, RIDE, OWN, elsewhere, 7.0))
+    assert "no longer visits pointsOfInterest.points[0]" in str(
+        shared_flight_lost(GUEST, GUEST_PLAN, HOST_PLAN, elsewhere, 7.0)
+    )
 
 
 def grant(name: str, uid: str, created: str) -> Grant:
@@ -97,30 +99,30 @@ def grant(name: str, uid: str, created: str) -> Grant:
 
 
 def test_guest_claims_no_drone() -> None:
-    plans = {("default", "guest"): OwnedPlan("g", RIDE), ("default", "traffic"): OwnedPlan("t", OWN)}
+    plans = {("default", "guest"): OwnedPlan("g", GUEST_PLAN), ("default", "traffic"): OwnedPlan("t", HOST_PLAN)}
     old = grant("guest", "g", "2026-01-01T00:00:00Z")
     new = grant("traffic", "t", "2026-01-02T00:00:00Z")
     assert claims(plans, [old, new])["d"].uid == "t"
-    # Without any plan it is not known which application shared the flight.
+    # Without a plan, it is unknown which application shared the flight.
     assert claims({}, [old, new])["d"].uid == "g"
 
 
 @pytest.mark.parametrize("left_by", [None, "elsewhere"])
 def test_remaining_grant_of_guest_claims_no_drone(left_by: str | None) -> None:
-    plans = {("default", "traffic"): OwnedPlan("t", OWN)}
+    plans = {("default", "traffic"): OwnedPlan("t", HOST_PLAN)}
     if left_by is not None:
-        # It has its own drone now, and its Grant on the previous drone is not deleted yet.
-        plans["default", "guest"] = OwnedPlan("g", OWN.model_copy(update={"drone": DroneChoice(node="e")}))
-    left = grant("guest", "g", "2026-01-01T00:00:00Z")
+        # The guest has a drone of its own now, and its Grant on the previous drone still exists.
+        plans["default", "guest"] = OwnedPlan("g", HOST_PLAN.model_copy(update={"drone": DroneChoice(node="e")}))
+    remaining = grant("guest", "g", "2026-01-01T00:00:00Z")
     flown_by = grant("traffic", "t", "2026-01-02T00:00:00Z")
-    for grants in ([left, flown_by], [flown_by, left]):
+    for grants in ([remaining, flown_by], [flown_by, remaining]):
         assert claims(plans, grants)["d"].uid == "t"
     # A plan alone is no claim where another application may still fly by a grant.
-    assert claims(plans, [left])["d"].uid == "g"
+    assert claims(plans, [remaining])["d"].uid == "g"
 
 
 def test_older_grant_decides_between_two_claims() -> None:
-    plans = {("default", "a"): OwnedPlan("a", OWN), ("default", "traffic"): OwnedPlan("t", OWN)}
+    plans = {("default", "a"): OwnedPlan("a", HOST_PLAN), ("default", "traffic"): OwnedPlan("t", HOST_PLAN)}
     old = grant("traffic", "t", "2026-01-01T00:00:00Z")
     new = grant("a", "a", "2026-01-02T00:00:00Z")
     assert claims(plans, [old, new])["d"].uid == "t"
@@ -147,19 +149,19 @@ def test_bookings_follow_pods() -> None:
         bookings.pod_changed(pods.get(name), new)
         pods[name] = new
         for node in "ab":
-            there = [p for p in pods.values() if p is not None and p.node == node and not p.finished]
-            assert bookings.on(node).get("cpu", 0.0) == sum(p.requests["cpu"] for p in there)
+            bound_pods = [p for p in pods.values() if p is not None and p.node == node and not p.finished]
+            assert bookings.on(node).get("cpu", 0.0) == sum(p.requests["cpu"] for p in bound_pods)
 
 
 def test_planned_instance_is_booked_once_and_own_pods_are_free() -> None:
     bookings = Bookings()
-    mine = pod("mine", "a", 1.0, app="me")
-    for each in (mine, pod("theirs", "a", 2.0, app="them"), pod("bare", "a", 4.0)):
+    own_pod = pod("own", "a", 1.0, app="me")
+    for each in (own_pod, pod("other", "a", 2.0, app="other"), pod("bare", "a", 4.0)):
         bookings.pod_changed(None, each)
-    bookings.plan_changed(("ns", "me"), [PlannedRequest("mine-2", "b", {"cpu": 8.0})])
-    theirs = [PlannedRequest("theirs", "a", {"cpu": 2.0}), PlannedRequest("theirs-2", "a", {"cpu": 16.0})]
-    bookings.plan_changed(("ns", "them"), theirs)
-    assert bookings.on("a", ("ns", "me"), [mine])["cpu"] == 2.0 + 4.0 + 16.0
+    bookings.plan_changed(("ns", "me"), [PlannedRequest("own-2", "b", {"cpu": 8.0})])
+    other_requests = [PlannedRequest("other", "a", {"cpu": 2.0}), PlannedRequest("other-2", "a", {"cpu": 16.0})]
+    bookings.plan_changed(("ns", "other"), other_requests)
+    assert bookings.on("a", ("ns", "me"), [own_pod])["cpu"] == 2.0 + 4.0 + 16.0
     assert bookings.on("b", ("ns", "me")).get("cpu", 0.0) == 0.0
     assert bookings.on("a")["cpu"] == 1.0 + 2.0 + 4.0 + 16.0
     assert bookings.on("b")["cpu"] == 8.0
@@ -171,7 +173,7 @@ def test_guest_is_planned_and_checked_with_the_same_flight() -> None:
         claimed={"d": HOST.key},
         flights={"d": replace(flight_of(HOST, DEPOTS), holder=("default", "host"))},
     )
-    found = plan(GUEST, shared)
-    assert found.drone is not None
-    assert found.drone.shared_with == "default/host"
-    assert shared_flight_lost(GUEST, found, OWN, shared.flights["d"], 7.0) is None
+    guest_plan = plan(GUEST, shared)
+    assert guest_plan.drone is not None
+    assert guest_plan.drone.shared_with == "default/host"
+    assert shared_flight_lost(GUEST, guest_plan, HOST_PLAN, shared.flights["d"], 7.0) is None

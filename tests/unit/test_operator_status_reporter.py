@@ -1,4 +1,4 @@
-"""Status reporter: when the status of an Application is written, and when it is not."""
+"""Status reporter: conditions under which the status of an Application is written."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ DONE = StatusUpdate("Completed", "done", (ConditionUpdate("Ready", "False", "Mis
 
 
 class Statuses:
-    """An API server that takes the status of applications and Events, or refuses them all."""
+    """Fake API server that stores statuses and Events of applications, or refuses all of them."""
 
     def __init__(self) -> None:
         self.refusal: KubeError | None = None
@@ -43,7 +43,7 @@ class Statuses:
 
 
 def new() -> tuple[Statuses, ClusterCache, StatusReporter, Submitted]:
-    """An application without a status."""
+    """Application without a status."""
     api = Statuses()
     cache = ClusterCache(cast(Store, None))
     submitted = parse_application({k: v for k, v in INPUT["application"].items() if k != "status"})
@@ -54,12 +54,12 @@ def new() -> tuple[Statuses, ClusterCache, StatusReporter, Submitted]:
 async def test_queued_rollout_is_reported() -> None:
     api, _, reporter, submitted = new()
     await reporter.report_queued(submitted, PLAN, 1)
-    assert not api.written, "its first status comes soon enough"
+    assert not api.written, "the rollout writes the first status soon"
     await reporter.report_queued(submitted, PLAN, 20)
-    (said,) = api.written
-    assert (said["phase"], said["conditions"][0]["reason"]) == ("Pending", "OperatorBusy")
-    assert "20 other Applications" in said["message"]
-    assert not api.events, "an Event would be another request"
+    (status,) = api.written
+    assert (status["phase"], status["conditions"][0]["reason"]) == ("Pending", "OperatorBusy")
+    assert "20 other Applications" in status["message"]
+    assert not api.events, "no Event is posted, which would cost another request"
     await reporter.report_queued(submitted, PLAN, 21)
     assert len(api.written) == 1, "an Application with a status is not reported as queued"
 
@@ -72,7 +72,7 @@ async def test_refused_first_status_is_ignored() -> None:
 
 
 async def test_conflicting_outcome_is_not_taken_for_recorded() -> None:
-    """The next step deletes the Grants, the only other record of the outcome, so that the mission would be flown again."""
+    """The next step deletes the Grants. Without the status the outcome would be lost, and the mission would be flown again."""
     api, cache, reporter, submitted = new()
     api.refusal = Conflict(409, "Conflict", "it changed meanwhile")
     with pytest.raises(Conflict):
@@ -83,23 +83,23 @@ async def test_conflicting_outcome_is_not_taken_for_recorded() -> None:
 
 
 async def test_persistent_failure_replaces_outdated_message() -> None:
-    """Example: the status reports a queue, while a webhook refuses each of its Deployments."""
+    """Example: the status still reports a queue, although a webhook refuses all Deployments."""
     api, _, reporter, submitted = new()
     await reporter.report_queued(submitted, PLAN, 20)
     error = KubeError(500, "InternalError", "failed calling webhook")
     for attempts in (1, 2):
         await reporter.report_failure(submitted, attempts, error)
-    assert len(api.written) == 1, "a moment's failure costs no request"
+    assert len(api.written) == 1, "a short failure causes no request"
     for attempts in (3, 4):
         await reporter.report_failure(
             submitted, attempts, KubeError(500, "InternalError", f"failed calling webhook in {attempts} s")
         )
-    _, said = api.written
-    assert (said["phase"], [(c["type"], c["reason"]) for c in said["conditions"]]) == (
+    _, status = api.written
+    assert (status["phase"], [(c["type"], c["reason"]) for c in status["conditions"]]) == (
         "Pending",
         [("Deployed", "InternalError"), ("Ready", "InternalError")],
     )
-    assert "failed calling webhook" in said["message"]
+    assert "failed calling webhook" in status["message"]
     assert api.events == ["InternalError"]
 
 
@@ -116,4 +116,4 @@ async def test_failure_report_keeps_flight_phase() -> None:
     await reporter.report(submitted, DONE)
     await reporter.report_failure(submitted, 5, error)
     await reporter.report_failure(None, 5, error)
-    assert len(api.written) == 3, "the outcome of a mission has no other record"
+    assert len(api.written) == 3, "the outcome of a mission is always written"

@@ -26,17 +26,17 @@ def test_uninstall_is_allowed_when_all_drones_are_on_the_ground() -> None:
 
 
 def test_uninstall_names_remaining_applications() -> None:
-    said = objection([application("patrol", "fractus.dev/teardown"), application("new")], [])
-    assert "default/patrol" in said
-    assert "default/new" not in said
-    assert "kubectl delete applications" in said
+    message = objection([application("patrol", "fractus.dev/teardown"), application("new")], [])
+    assert "default/patrol" in message
+    assert "default/new" not in message
+    assert "kubectl delete applications" in message
 
 
 @pytest.mark.parametrize("state", ["flying", "returning"])
 def test_uninstall_names_drones_in_flight(state: str) -> None:
-    said = objection([], [drone("drone-1", state), drone("drone-2", "inactive")])
-    assert f"drone-1 ({state})" in said
-    assert "drone-2" not in said
+    message = objection([], [drone("drone-1", state), drone("drone-2", "inactive")])
+    assert f"drone-1 ({state})" in message
+    assert "drone-2" not in message
 
 
 def test_uninstall_uses_last_state_of_stale_drone() -> None:
@@ -47,22 +47,22 @@ def test_uninstall_uses_last_state_of_stale_drone() -> None:
 
 
 def test_uninstall_shortens_long_lists() -> None:
-    said = objection([], [drone(f"d{i}", "flying") for i in range(9)])
-    assert "d4 (flying) and 4 more" in said
+    message = objection([], [drone(f"d{i}", "flying") for i in range(9)])
+    assert "d4 (flying) and 4 more" in message
 
 
 def test_uninstall_names_drone_that_may_have_taken_off() -> None:
-    seen = "2026-01-01T00:00:00Z"
+    last_seen = "2026-01-01T00:00:00Z"
     doubtful = drone("drone-1", "inactive")
-    doubtful["status"] |= {"lastSeen": seen, "conditions": [{"type": "OnMission", "status": "Unknown"}]}
+    doubtful["status"] |= {"lastSeen": last_seen, "conditions": [{"type": "OnMission", "status": "Unknown"}]}
     assert "drone-1 may have taken off" in objection([], [doubtful])
     flying = drone("drone-2", "flying")
-    flying["status"]["lastSeen"] = seen
+    flying["status"]["lastSeen"] = last_seen
     for body in (doubtful, flying):
         body["metadata"]["annotations"] = {"fractus.dev/grounded": "2025-12-31T00:00:00Z"}
     assert "drone-2" in objection([], [doubtful, flying])
     for body in (doubtful, flying):
-        body["metadata"]["annotations"] = {"fractus.dev/grounded": seen}
+        body["metadata"]["annotations"] = {"fractus.dev/grounded": last_seen}
     assert objection([], [doubtful, flying]) == ""
 
 
@@ -82,8 +82,8 @@ async def test_uninstall_is_refused_without_response(monkeypatch: pytest.MonkeyP
     assert "the API server did not respond" in await check()
 
 
-class Answers:
-    """An API server that answers a list of each kind with what it is told, an error among it."""
+class Lists:
+    """Fake API server with a scripted response, or an error, for the list of each kind."""
 
     def __init__(self, **of: Any) -> None:
         self.of = of
@@ -99,17 +99,17 @@ class Answers:
 
 
 async def test_uninstall_is_allowed_without_kinds(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Removed before the chart that makes use of them, they would keep it indefinitely."""
-    gone = NotFound(404, "NotFound", "the server could not find the requested resource")
-    answers = Answers(Application=gone, Drone=gone)
+    """If the CRDs are removed before the chart, the missing kinds must not block its removal."""
+    missing = NotFound(404, "NotFound", "the server could not find the requested resource")
+    lists = Lists(Application=missing, Drone=missing)
 
-    async def connect() -> Answers:
-        return answers
+    async def connect() -> Lists:
+        return lists
 
     monkeypatch.setattr(Store, "connect", connect)
     assert await check() == ""
-    answers.of["Drone"] = [drone("drone-1", "flying")]
+    lists.of["Drone"] = [drone("drone-1", "flying")]
     assert "drone-1 (flying)" in await check()
-    answers.of["Drone"] = KubeError(403, "Forbidden", "it may not list drones")
+    lists.of["Drone"] = KubeError(403, "Forbidden", "it may not list drones")
     with pytest.raises(KubeError):
         await check()

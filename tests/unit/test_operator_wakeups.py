@@ -1,4 +1,4 @@
-"""Wake-ups of Applications by changes of others, and state that is kept for each Application."""
+"""Wake-ups of Applications by changes of other objects, and the state kept for each Application."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ async def test_released_drone_wakes_applications_without_suitable_plan() -> None
         assert not await placed.changed(0)
         cache.subscriptions.set_placed(("ns", "placed"), placed=False)
         cache.drones.record_write(("", "d"), drone_body(3, "flying"))
-        assert not await placed.changed(0), "a drone that takes off leaves nothing"
+        assert not await placed.changed(0), "a takeoff releases no capacity"
         assert not await new.changed(0)
         cache.drones.record_write(("", "d"), drone_body(4, "inactive"))
         assert await placed.changed(1)
@@ -74,27 +74,27 @@ async def test_wake_all_wakes_applications_in_flight_first() -> None:
 async def test_changed_spec_ends_pause_but_changed_status_does_not() -> None:
     cache = ClusterCache(cast(Store, None))
 
-    def seen(version: int, generation: int, phase: str) -> None:
+    def deliver(version: int, generation: int, phase: str) -> None:
         names = {"namespace": "ns", "name": "a", "uid": "a"}
         metadata = {**names, "resourceVersion": str(version), "generation": generation}
         cache.applications.record_write(("ns", "a"), {**APPLICATION, "metadata": metadata, "status": {"phase": phase}})
 
-    seen(1, 1, "Deploying")
+    deliver(1, 1, "Deploying")
     with cache.subscriptions.subscribe(("ns", "a")) as inputs:
-        seen(2, 1, "Running")
+        deliver(2, 1, "Running")
         assert await inputs.changed(0)
         assert not inputs._urgent.is_set()
-        seen(3, 2, "Running")
+        deliver(3, 2, "Running")
         assert await inputs.changed(0)
-        assert inputs._urgent.is_set(), "who applies it waits for the answer"
+        assert inputs._urgent.is_set(), "a changed spec is urgent"
 
 
 async def test_planning_inputs_of_node_wake_all_but_labels_do_not() -> None:
-    """A drone that flies along gets another geohash every minute."""
+    """A flying drone gets a new geohash every minute."""
     cache = ClusterCache(cast(Store, None))
     version = iter(range(1, 100))
 
-    def seen(labels: dict[str, str], ready: str = "True", unschedulable: bool = False, cpu: str = "4") -> None:
+    def deliver(labels: dict[str, str], ready: str = "True", unschedulable: bool = False, cpu: str = "4") -> None:
         metadata = {"name": "n", "labels": labels, "resourceVersion": str(next(version))}
         status = {"conditions": [{"type": "Ready", "status": ready}], "allocatable": {"cpu": cpu}}
         cache.hosts.record_write(
@@ -102,19 +102,19 @@ async def test_planning_inputs_of_node_wake_all_but_labels_do_not() -> None:
         )
 
     edge_class = {"fractus.dev/class": "edge"}
-    seen(edge_class)
+    deliver(edge_class)
     with cache.subscriptions.subscribe(("ns", "a")) as inputs:
-        seen({**edge_class, "fractus.dev/geohash": "u1"})
-        seen({**edge_class, "fractus.dev/geohash": "u2", "some": "label"})
+        deliver({**edge_class, "fractus.dev/geohash": "u1"})
+        deliver({**edge_class, "fractus.dev/geohash": "u2", "some": "label"})
         assert not await inputs.changed(0)
-        seen({**edge_class, "fractus.dev/cloud": "true"})
+        deliver({**edge_class, "fractus.dev/cloud": "true"})
         assert await inputs.changed(0)
-        seen(edge_class)
+        deliver(edge_class)
         assert await inputs.changed(0)
         for change in ({"ready": "False"}, {"unschedulable": True}, {"cpu": "8"}):
-            seen(edge_class, **cast(Any, change))
+            deliver(edge_class, **cast(Any, change))
             assert await inputs.changed(0), change
-            seen(edge_class)
+            deliver(edge_class)
             assert await inputs.changed(0)
         cache.hosts._drop(("", "n"))
         assert await inputs.changed(0)
@@ -128,24 +128,27 @@ def pod_body(version: int, node: str | None, phase: str = "Running") -> dict[str
 async def test_released_capacity_wakes_applications_that_need_the_node() -> None:
     cache = ClusterCache(cast(Store, None))
     key = ("ns", "p")
-    with cache.subscriptions.subscribe(("ns", "here")) as here, cache.subscriptions.subscribe(("ns", "there")) as there:
+    with (
+        cache.subscriptions.subscribe(("ns", "here")) as woken,
+        cache.subscriptions.subscribe(("ns", "there")) as unaffected,
+    ):
         cache.subscriptions.set_placed(("ns", "here"), placed=False, full={"n", "m"})
         cache.subscriptions.set_placed(("ns", "there"), placed=False, full={"m"})
         cache.pods.record_write(key, pod_body(1, None, "Pending"))
         cache.pods.record_write(key, pod_body(2, "n"))
-        assert not await here.changed(0), "what comes leaves no room"
+        assert not await woken.changed(0), "a new pod releases no capacity"
         cache.pods.record_write(key, pod_body(3, "n", "Succeeded"))
-        assert await here.changed(0)
+        assert await woken.changed(0)
         cache.pods._drop(key)
-        assert not await here.changed(0), "its capacity was exhausted"
+        assert not await woken.changed(0), "the node has no free capacity"
         cache.pods.record_write(key, pod_body(4, "n"))
         cache.pods._drop(key)
-        assert await here.changed(0), "a killed pod releases capacity as well"
+        assert await woken.changed(0), "a killed pod releases capacity as well"
         cache.subscriptions.set_placed(("ns", "here"), placed=True)
         cache.pods.record_write(key, pod_body(5, "n"))
         cache.pods._drop(key)
-        assert not await here.changed(0), "it has all it wants by now"
-        assert not await there.changed(0)
+        assert not await woken.changed(0), "the application is placed completely"
+        assert not await unaffected.changed(0)
     assert not cache.subscriptions._full_nodes
 
 
@@ -170,7 +173,7 @@ def test_application_is_validated_again_when_it_or_rules_change() -> None:
 
 
 def full_node() -> Inventory:
-    """An edge node with too little left for the components of tests."""
+    """Edge node with too little free capacity for the test components."""
     return inventory([], [edge("e1", (0, 0))], [host("e1", "edge", cpu=0.01)])
 
 
@@ -182,15 +185,15 @@ async def test_infeasible_application_wakes_when_capacity_is_released(monkeypatc
     submitted = parse_application(body)
     cache.applications.record_write(submitted.key, body)
     monkeypatch.setattr(cache, "snapshot", lambda *_: full_node())
-    said: list[StatusUpdate] = []
+    updates: list[StatusUpdate] = []
 
     async def report(_submitted: object, update: StatusUpdate, *_: object) -> None:
-        said.append(update)
+        updates.append(update)
 
     monkeypatch.setattr(applications._reporter, "report", report)
     with cache.subscriptions.subscribe(submitted.key) as waits:
         await applications._step(cache.observe(submitted), _ApplicationState())
-        assert [update.phase for update in said] == ["Pending"]
+        assert [update.phase for update in updates] == ["Pending"]
         cache.subscriptions.wake_for_capacity("e2")
         assert not await waits.changed(0)
         cache.subscriptions.wake_for_capacity("e1")
@@ -227,7 +230,7 @@ def decide(cache: ClusterCache, key: tuple[str, str], **drone: Any) -> None:
 
 @pytest.fixture
 def shared() -> ClusterCache:
-    """Two applications on one drone."""
+    """Two applications that share one drone."""
     cache = ClusterCache(cast(Store, None))
     cache.drones.record_write(("", "d"), drone_body(1, "flying"))
     for namespace, name in (HOST, SHARING):
@@ -260,7 +263,7 @@ async def test_guest_wakes_when_plan_of_host_changes(shared: ClusterCache) -> No
         stored.record_write(HOST, plan_body("d", 1))
         assert await sharing.changed(0), "stored"
         stored.record_write(HOST, plan_body("other", 2))
-        assert await sharing.changed(0), "stored for another drone"
+        assert await sharing.changed(0), "the guest is woken because the stored plan has another drone"
         stored._drop(HOST)
         assert await sharing.changed(0), "removed"
         decide(shared, ("ns", "stranger"), node="e")
@@ -294,9 +297,9 @@ async def test_placed_application_wakes_only_for_capacity(instances: int | str, 
     hosts = [host("e1", "edge"), host("e2", "edge", cpu=0.01)]
     stock = inventory([], [edge("e1", (0, 0)), edge("e2", (0, 0))], hosts)
     with cache.subscriptions.subscribe(submitted.key) as grows:
-        for _new_plan_then_kept in range(2):
-            seen = cache.observe(submitted)
-            applications._plan(submitted.application, seen, stock, _ApplicationState())
+        for _ in range(2):
+            observation = cache.observe(submitted)
+            applications._plan(submitted.application, observation, stock, _ApplicationState())
             cache.subscriptions.wake_waiting()
             assert not await grows.changed(0)
             cache.subscriptions.wake_for_capacity("e2")

@@ -33,11 +33,11 @@ async def test_unexpected_failure_does_not_stop_queue(monkeypatch: pytest.Monkey
 
 
 async def test_key_is_reconciled_once_for_many_changes() -> None:
-    seen: list[Key] = []
+    reconciled: list[Key] = []
     done = asyncio.Event()
 
     async def reconcile(key: Key) -> None:
-        seen.append(key)
+        reconciled.append(key)
         if key == ("", "last"):
             done.set()
 
@@ -49,17 +49,17 @@ async def test_key_is_reconciled_once_for_many_changes() -> None:
     async with asyncio.timeout(5):
         await done.wait()
     task.cancel()
-    assert seen == [("", "a"), ("", "last")]
+    assert reconciled == [("", "a"), ("", "last")]
 
 
 async def test_change_during_reconcile_is_not_lost() -> None:
-    seen: list[int] = []
+    reconciled: list[int] = []
     done = asyncio.Event()
     value = 1
 
     async def reconcile(key: Key) -> None:
         nonlocal value
-        seen.append(value)
+        reconciled.append(value)
         if value == 1:
             value = 2
             work_queue.add(key)
@@ -73,7 +73,7 @@ async def test_change_during_reconcile_is_not_lost() -> None:
     async with asyncio.timeout(5):
         await done.wait()
     task.cancel()
-    assert seen == [1, 2]
+    assert reconciled == [1, 2]
 
 
 async def test_failed_key_is_retried_and_delays_no_other(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,7 +6,7 @@ from fractus_core.planning import Infeasible, Settings, flight_of, plan
 from fractus_core.planning.mission import misses, remaining_flight
 from fractus_core.planning.scale_up import full_nodes, next_free_node
 from test_plan_drones import flown_by_other, passenger, shared
-from test_plan_properties import where
+from test_plan_properties import component_and_node
 from test_planning import PATH, application, at, component, drone, edge, host, inventory, navigator
 
 CAMERA = [{"service": "camera", "methods": ["CaptureImage"]}]
@@ -32,7 +32,7 @@ def test_plan_scales_up_to_new_node_when_location_has_too_few_instances(instance
     more = inventory([drone("d")], [edge("e1", (0, 0)), edge("e2", (50, 0)), edge("e3", (10, 0)), edge("x", (900, 0))])
     assert next_free_node(app, more, Settings(), before) == "e3"
     after = plan(app, more, previous=before)
-    assert set(map(where, before.placements)) < set(map(where, after.placements))
+    assert set(map(component_and_node, before.placements)) < set(map(component_and_node, after.placements))
     assert next_free_node(app, more, Settings(), after) is None
 
 
@@ -56,10 +56,10 @@ def test_plan_keeps_running_instance_when_earlier_component_needs_node():
     nodes = [edge("e1", (0, 0)), edge("e2", (90, 0))]
     taken = [host("e1", "edge", cpu=0.15), host("e2", "edge", cpu=0.01)]
     before = plan(application(second), inventory([], nodes, taken))
-    assert set(map(where, before.placements)) == {("Second", "e1")}
+    assert set(map(component_and_node, before.placements)) == {("Second", "e1")}
     roomy = [host("e1", "edge", cpu=0.15), host("e2", "edge", cpu=0.15)]
     after = plan(app, inventory([], nodes, roomy), previous=before)
-    assert set(map(where, after.placements)) == {("Second", "e1"), ("First", "e2")}
+    assert set(map(component_and_node, after.placements)) == {("Second", "e1"), ("First", "e2")}
 
 
 def test_plan_moves_running_instance_when_no_other_plan_exists():
@@ -68,7 +68,7 @@ def test_plan_moves_running_instance_when_no_other_plan_exists():
     stock = inventory([], [edge("e1", (0, 0))], [host("e1", "edge", cpu=0.15)])
     before = plan(application(second), stock)
     after = plan(application(first, second), stock, previous=before)
-    assert set(map(where, after.placements)) == {("First", "e1")}
+    assert set(map(component_and_node, after.placements)) == {("First", "e1")}
 
 
 def test_plan_checks_shared_drone_again_when_passenger_flies_alone():
@@ -92,8 +92,8 @@ def test_remaining_flight_contains_only_path_ahead():
 
 
 def test_remaining_flight_starts_at_last_passage_of_position():
-    there_and_back = application(navigator([at(0, 0), at(200, 0), at(0, 0)]))
-    whole = flight_of(there_and_back, inventory().depots)
+    out_and_back = application(navigator([at(0, 0), at(200, 0), at(0, 0)]))
+    whole = flight_of(out_and_back, inventory().depots)
     rest = remaining_flight(whole, Position(**at(100, 0)), 7.0)
     assert misses(passenger([at(50, 0)]), rest, 7.0) is None
     assert misses(passenger([at(150, 0)]), rest, 7.0) == 0

@@ -1,4 +1,4 @@
-"""Legality of a planned path before takeoff, judged by the policy engine that also judges the flight."""
+"""Legality of a planned path before takeoff, judged by the same policy engine as the flight."""
 
 import math
 import random
@@ -65,13 +65,13 @@ def test_legality_reports_leg_through_zone_before_takeoff():
 
 def test_legality_matches_engine_verdict_in_flight():
     inventory_ = fenced(200, 0)
-    found = plan(APP, inventory_, WARN)
-    (grant,) = compile_grants(APP, found, inventory_)
+    chosen = plan(APP, inventory_, WARN)
+    (grant,) = compile_grants(APP, chosen, inventory_)
     start, end = (at(x, 0, 10) for x in (100, 300))
     home = Home(at(0, 0)["lat"], at(0, 0)["lon"], 0.0)
     now = Situation(NOW, start["lat"], start["lon"], 10.0, home=home, in_air=True, airframe=Airframe(retraces=True))
     verdict = judge(Call("Goto", GotoArgs(end["lat"], end["lon"], 10.0)), now, compile_grant(grant))
-    leg = found.drone.legality[0]
+    leg = chosen.drone.legality[0]
     assert (verdict.code, verdict.reason) == (leg.reason, leg.message)
 
 
@@ -120,15 +120,15 @@ def test_legality_reports_altitude_limit_without_conflict():
     assert plan(APP, stock(refusing), WARN).drone.policy_conflict is not None
 
 
-@pytest.mark.parametrize("how", [WARN, FORBID])
-def test_plan_prefers_drone_without_policy_conflict(how):
+@pytest.mark.parametrize("settings", [WARN, FORBID])
+def test_plan_prefers_drone_without_policy_conflict(settings):
     fleet = [drone("a", minutes=30), drone("b", battery=0.9, minutes=30)]
     banned = policy("ban", zones=["z"], nodes=[{"key": "name", "operator": "In", "values": ["a"]}], **FENCE)
     inventory_ = stock(banned, zones=[zone("z", (200, 0))], drones=fleet)
-    found = plan(APP, inventory_, how)
-    assert found.drone.node == "b"
-    assert found.drone.alternatives == ()
-    assert [(r.node, r.reason) for r in found.rejected] == [("a", "PolicyConflict")]
+    chosen = plan(APP, inventory_, settings)
+    assert chosen.drone.node == "b"
+    assert chosen.drone.alternatives == ()
+    assert [(r.node, r.reason) for r in chosen.rejected] == [("a", "PolicyConflict")]
     assert plan(APP, inventory_).drone.node == "a"
 
 
@@ -178,8 +178,8 @@ def test_legality_of_active_plan_follows_policies_and_zones():
     assert after.drone.policy_conflict is not None
     assert after.placements == before.placements
     assert with_legality(APP, after, stock(), WARN) == before
-    gone = with_legality(APP, before, stock(drones=[]), WARN)
-    assert gone is before
+    without_drone = with_legality(APP, before, stock(drones=[]), WARN)
+    assert without_drone is before
 
 
 def test_legality_lists_limited_number_of_legs():

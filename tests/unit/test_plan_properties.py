@@ -52,18 +52,20 @@ interfaces = st.lists(
 
 
 @given(interfaces, interfaces)
-def test_direct_reach_is_smaller_range_of_matching_interfaces(ours, theirs):
-    """An agent links over one interface, and only over an interface with a device."""
-    firsts = [[i for i in each if i.device and i.range and i.pairing][:1] for each in (ours, theirs)]
+def test_direct_reach_is_smaller_range_of_matching_interfaces(first, second):
+    """An agent links only over its first interface with a device, range and pairing."""
+    firsts = [
+        [i for i in node_interfaces if i.device and i.range and i.pairing][:1] for node_interfaces in (first, second)
+    ]
     reaches = [
         min(a.range, b.range)
         for a, b in itertools.product(*firsts)
         if (a.technology, a.pairing.mode) == (b.technology, b.pairing.mode)
     ]
-    reach = direct_reach_m(ours, theirs)
+    reach = direct_reach_m(first, second)
     assert reach == (reaches[0] if reaches else None)
-    assert reach == direct_reach_m(theirs, ours)
-    assert reach is None or reach <= direct_range_m(ours)
+    assert reach == direct_reach_m(second, first)
+    assert reach is None or reach <= direct_range_m(first)
 
 
 VIEWERS = component(
@@ -103,8 +105,8 @@ def scene(seed, count=14):
 def test_plan_of_random_scene_does_not_depend_on_order(seed, shuffler):
     fleet, edges, hosts = scene(seed)
     first = plan(TRAFFIC, inventory(fleet, edges, hosts))
-    for things in (fleet, edges, hosts):
-        shuffler.shuffle(things)
+    for objects in (fleet, edges, hosts):
+        shuffler.shuffle(objects)
     assert plan(TRAFFIC, inventory(fleet, edges, hosts)) == first
 
 
@@ -124,10 +126,10 @@ def test_static_instances_are_placed_on_nearest_suitable_nodes(seed):
             and stock.hosts[e.name].allocatable["cpu"] >= 0.1
             and e.name not in taken
         )
-        wanted = [name for _, name in suitable][: location.instances if location.instances != "*" else None]
+        expected = [name for _, name in suitable][: location.instances if location.instances != "*" else None]
         chosen = [p.node for p in result.placements if p.component == "GroundViewer" and p.location == i]
-        assert chosen == wanted
-        taken += wanted
+        assert chosen == expected
+        taken += expected
 
 
 @given(st.integers(0, 10_000))
@@ -154,22 +156,29 @@ def test_rejected_candidates_have_correct_reasons(seed):
 def test_replanning_random_scene_keeps_placements_that_still_fit(seed, data):
     fleet, edges, hosts = scene(seed)
     before = plan(TRAFFIC, inventory(fleet, edges, hosts))
-    again = plan(TRAFFIC, inventory(fleet, edges, hosts), previous=before)
-    assert (again.placements, again.drone) == (before.placements, before.drone)
+    repeated = plan(TRAFFIC, inventory(fleet, edges, hosts), previous=before)
+    assert (repeated.placements, repeated.drone) == (before.placements, before.drone)
     newcomers = [edge(f"new{i}", (140 + 40 * i, 1)) for i in range(4)]
     more = [drone("better", battery=1.0, minutes=60)]
     assert set(
-        map(where, plan(TRAFFIC, inventory(fleet + more, edges + newcomers, hosts), previous=before).placements)
-    ) >= set(map(where, before.placements))
-    lost = data.draw(st.sampled_from(sorted({p.node for p in before.placements if p.node and p.role != "drone"})))
-    left = [e for e in edges if e.name != lost]
-    after = plan(TRAFFIC, inventory(fleet, left + newcomers, hosts), previous=before)
-    stay = {where(p) for p in before.placements if p.node != lost and (p.serves is None or p.serves.node != lost)}
-    assert stay <= {where(p) for p in after.placements}
-    assert lost not in {p.node for p in after.placements}
+        map(
+            component_and_node,
+            plan(TRAFFIC, inventory(fleet + more, edges + newcomers, hosts), previous=before).placements,
+        )
+    ) >= set(map(component_and_node, before.placements))
+    removed = data.draw(st.sampled_from(sorted({p.node for p in before.placements if p.node and p.role != "drone"})))
+    remaining = [e for e in edges if e.name != removed]
+    after = plan(TRAFFIC, inventory(fleet, remaining + newcomers, hosts), previous=before)
+    stay = {
+        component_and_node(p)
+        for p in before.placements
+        if p.node != removed and (p.serves is None or p.serves.node != removed)
+    }
+    assert stay <= {component_and_node(p) for p in after.placements}
+    assert removed not in {p.node for p in after.placements}
 
 
-def where(placed):
+def component_and_node(placed):
     return (placed.component, placed.node)
 
 
@@ -192,28 +201,28 @@ def test_plan_with_incremental_node_locations_equals_new_plan(seed):
     stock = inventory(fleet, edges, hosts)
     rng = random.Random(seed)
     followed = NodeLocations()
-    for thing in rng.sample([*fleet, *edges], k=len(fleet) + len(edges)):
-        away = {"home": at(9000, 9000)} if isinstance(thing, Drone) else {"location": at(9000, 9000)}
-        moved = type(thing).from_body(manifest(thing.KIND, thing.name, thing.spec.to_dict() | away))
-        for version in (moved, thing):
-            (followed.upsert_drone if isinstance(thing, Drone) else followed.upsert_edge_node)(version)
+    for node in rng.sample([*fleet, *edges], k=len(fleet) + len(edges)):
+        distant = {"home": at(9000, 9000)} if isinstance(node, Drone) else {"location": at(9000, 9000)}
+        relocated = type(node).from_body(manifest(node.KIND, node.name, node.spec.to_dict() | distant))
+        for version in (relocated, node):
+            (followed.upsert_drone if isinstance(node, Drone) else followed.upsert_edge_node)(version)
     followed.upsert_edge_node(edge("gone", (150, 0)))
     followed.remove_edge_node("gone")
     followed.upsert_drone(drone("gone"))
     followed.remove_drone("gone")
     for depot in stock.depots.values():
         followed.upsert_depot(depot)
-    for one in stock.hosts.values():
-        followed.upsert_host(one.name, one.is_cloud)
+    for host_ in stock.hosts.values():
+        followed.upsert_host(host_.name, host_.is_cloud)
     assert plan(TRAFFIC, dataclasses.replace(stock, locations=followed)) == plan(TRAFFIC, stock)
 
 
 def test_drone_without_home_is_located_at_its_depot():
-    kept = Drone.from_body(
+    known_drone = Drone.from_body(
         manifest("Drone", "d", drone("d").spec.to_dict() | {"home": None}, status=drone("d").status.to_dict())
     )
     known = NodeLocations()
-    known.upsert_drone(kept)
+    known.upsert_drone(known_drone)
     assert known.homeless == {"d"}
     known.upsert_depot(inventory().depots["base"])
     assert known.homeless == set()
@@ -221,7 +230,7 @@ def test_drone_without_home_is_located_at_its_depot():
     known.remove_depot("base")
     assert known.homeless == {"d"}
     assert len(known.stands) == 0
-    assert plan(application(navigator(PATH)), inventory([kept])).drone.node == "d"
+    assert plan(application(navigator(PATH)), inventory([known_drone])).drone.node == "d"
 
 
 # -- plug-ins and bounds --
@@ -235,12 +244,12 @@ def test_plugins_replace_drone_score_and_coverage():
     assert chosen.drone.node == "c"
     assert [a.node for a in chosen.drone.alternatives] == ["a", "b"]
 
-    def nothing(found, fits):
+    def no_coverage(scene, fits):
         return []
 
     app = application(navigator(PATH), VIEWER, CHECKER)
     stock = inventory([drone("d")], [edge("e1", (150, 0))])
-    assert nodes_of(plan(app, stock, Settings(cover=nothing)), "ImageChecker") == [None]
+    assert nodes_of(plan(app, stock, Settings(cover=no_coverage)), "ImageChecker") == [None]
     assert nodes_of(plan(app, stock), "ImageChecker") == [None, "e1"]
 
 
@@ -277,7 +286,7 @@ def test_plan_at_80_degrees_across_the_antimeridian():
 
     frame = LocalFrame(80.0, 179.9995)
 
-    def there(x, y):
+    def position(x, y):
         lat, lon = frame.latlon(x, y)
         return {"lat": lat, "lon": lon}
 
@@ -285,18 +294,18 @@ def test_plan_at_80_degrees_across_the_antimeridian():
         manifest(
             "Drone",
             "d",
-            drone("d").spec.to_dict() | {"home": there(0, 0), "depot": None},
+            drone("d").spec.to_dict() | {"home": position(0, 0), "depot": None},
             status=drone("d").status.to_dict(),
         )
     )
     nodes = [
         type(edge("x", (0, 0))).from_body(
-            manifest("EdgeNode", name, edge(name, (0, 0)).spec.to_dict() | {"location": there(x, 0)})
+            manifest("EdgeNode", name, edge(name, (0, 0)).spec.to_dict() | {"location": position(x, 0)})
         )
         for name, x in (("west", 0), ("east", 130), ("far", 400))
     ]
-    route = navigator([there(0, 0), there(150, 0)], point={"position": there(0, 0)})
-    viewer = VIEWERS | {"egress": [], "locations": [{"center": there(60, 0), "radius": 80, "instances": "*"}]}
+    route = navigator([position(0, 0), position(150, 0)], point={"position": position(0, 0)})
+    viewer = VIEWERS | {"egress": [], "locations": [{"center": position(60, 0), "radius": 80, "instances": "*"}]}
     result = plan(application(route, VIEWER, CHECKER, viewer), inventory([flying], nodes))
     assert nodes_of(result, "GroundViewer") == ["west", "east"]
     assert sorted(nodes_of(result, "ImageChecker")[1:]) == ["east", "west"]
@@ -310,25 +319,25 @@ def anywhere(rng, lat, lon):
     Near a pole, the longitude is arbitrary.
     """
     spread = rng.choice([0, 1e-6, 1e-4, 1e-2, 0.1, 1])
-    there = rng.choice([lon + rng.uniform(-spread, spread), rng.uniform(-180, 180) if abs(lat) > 80 else lon])
+    position = rng.choice([lon + rng.uniform(-spread, spread), rng.uniform(-180, 180) if abs(lat) > 80 else lon])
     return {
         "lat": min(max(lat + rng.uniform(-spread, spread), -90), 90),
-        "lon": (there + 180) % 360 - 180,
+        "lon": (position + 180) % 360 - 180,
     }
 
 
 def random_components(rng, place):
     """Return components that use the drone, with a random kind of control point or points of interest."""
     path = [place() | {"alt": 10} for _ in range(rng.randint(1, 5))]
-    way = rng.choice(["depot", "path", "circle", "polygon", "points"])
-    if way == "points":
+    kind = rng.choice(["depot", "path", "circle", "polygon", "points"])
+    if kind == "points":
         points = {"points": path, "serviceAccess": rng.choice(["points", "path"]), "ordered": rng.random() < 0.5}
         return [VIEWER | {"pointsOfInterest": points}, CHECKER]
-    driver = navigator(path, point={"depot": "base"} if way == "depot" else {"position": path[0]})
-    if way in {"circle", "polygon"}:
+    driver = navigator(path, point={"depot": "base"} if kind == "depot" else {"position": path[0]})
+    if kind in {"circle", "polygon"}:
         circle = {"circle": {"center": place(), "radius": rng.choice([1, 50, 5000])}}
         ring = {"polygon": {"exterior": [place() for _ in range(rng.randint(3, 5))]}}
-        region = circle if way == "circle" else ring
+        region = circle if kind == "circle" else ring
         driver["controlPoints"] = [{"point": {"position": path[0]}, "navigation": "regionBased", "region": region}]
     return [driver, VIEWER, CHECKER]
 

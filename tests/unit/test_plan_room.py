@@ -25,8 +25,8 @@ from test_planning import (
 
 
 def component_requesting(name, placement, milli, **more):
-    made = component(name, placement, **more)
-    return made | {"container": made["container"] | {"resources": {"requests": {"cpu": f"{milli}m"}}}}
+    base = component(name, placement, **more)
+    return base | {"container": base["container"] | {"resources": {"requests": {"cpu": f"{milli}m"}}}}
 
 
 millis = st.integers(1, 12).map(lambda tenths: 100 * tenths)
@@ -59,28 +59,28 @@ def test_error_names_components_that_do_not_fit_together():
 
 @given(st.lists(st.tuples(millis, st.booleans()), min_size=1, max_size=4), st.lists(millis, min_size=1, max_size=4))
 @settings(max_examples=examples(60), deadline=None)
-def test_edge_nodes_are_filled_but_never_overbooked(wanted, rooms):
-    statics = [(f"S{i}", milli) for i, (milli, _) in enumerate(wanted)]
-    hybrids = [(f"H{i}", 200, f"S{i}") for i, (_, beside) in enumerate(wanted) if beside]
-    where_to = {"locations": [{"center": at(0, 0), "radius": 50, "instances": "*"}]}
-    spec = [component_requesting(name, "edge", milli, **where_to) for name, milli in statics]
+def test_edge_nodes_are_filled_but_never_overbooked(demands, rooms):
+    statics = [(f"S{i}", milli) for i, (milli, _) in enumerate(demands)]
+    hybrids = [(f"H{i}", 200, f"S{i}") for i, (_, beside) in enumerate(demands) if beside]
+    locations = {"locations": [{"center": at(0, 0), "radius": 50, "instances": "*"}]}
+    spec = [component_requesting(name, "edge", milli, **locations) for name, milli in statics]
     spec += [component_requesting(name, "hybrid", milli, hybridTo=[other]) for name, milli, other in hybrids]
     edges = [edge(f"e{i}", (i, 0)) for i in range(len(rooms))]
     hosts = [host(f"e{i}", "edge", cpu=milli / 1000) for i, milli in enumerate(rooms)]
     result = plan(application(*spec), inventory(edges=edges, hosts=hosts))
-    asked = dict(statics) | {name: milli for name, milli, _ in hybrids}
-    left = {f"e{i}": milli for i, milli in enumerate(rooms)}
+    requested = dict(statics) | {name: milli for name, milli, _ in hybrids}
+    free = {f"e{i}": milli for i, milli in enumerate(rooms)}
     for placed in result.placements:
         if placed.node is not None:
-            left[placed.node] -= asked[placed.component]
-    assert min(left.values()) >= 0
+            free[placed.node] -= requested[placed.component]
+    assert min(free.values()) >= 0
     for r in result.rejected:
         assert r.reason == "InsufficientResources"
-        assert asked[r.component] > left[r.node]
-    # Each component is tried on every node. A node with room at the end also had room at that time.
+        assert requested[r.component] > free[r.node]
+    # The planner tries each component on every node. A node with room at the end also had room before.
     placed = {(p.component, p.node) for p in result.placements}
     for name, milli in statics:
-        assert all((name, node) in placed or milli > room for node, room in left.items())
+        assert all((name, node) in placed or milli > room for node, room in free.items())
 
 
 # -- locations that compete for nodes --
@@ -100,10 +100,10 @@ def hosted(app, stock):
         result = plan(app, stock)
     except Infeasible as error:
         return error.component
-    found = {(c.name, i): [] for c in app.spec.components for i in range(len(c.locations))}
+    placed_nodes = {(c.name, i): [] for c in app.spec.components for i in range(len(c.locations))}
     for placed in result.placements:
-        found[placed.component, placed.location].append(placed.node)
-    return found
+        placed_nodes[placed.component, placed.location].append(placed.node)
+    return placed_nodes
 
 
 def most_that_can_be_hosted(app, stock, rooms):
@@ -122,13 +122,13 @@ def most_that_can_be_hosted(app, stock, rooms):
             return 0
         name, spot = slots[i]
         free = [n for n in inside[i] if (name, n) not in used and sum(m == n for _, m in used) < rooms[n]]
-        found = None
+        placed_nodes = None
         for count in range(1, spot.instances + 1):
             for chosen in itertools.combinations(free, count):
                 rest = best(i + 1, used | {(name, n) for n in chosen})
                 if rest is not None:
-                    found = max(found or 0, count + rest)
-        return found
+                    placed_nodes = max(placed_nodes or 0, count + rest)
+        return placed_nodes
 
     return best(0, frozenset())
 
@@ -140,21 +140,26 @@ spots = st.tuples(st.tuples(st.integers(0, 4).map(lambda i: 10 * i), st.just(0))
     st.lists(st.lists(st.tuples(spots, st.integers(1, 2)), min_size=1, max_size=3), min_size=1, max_size=2), st.data()
 )
 @settings(max_examples=examples(600), deadline=None)
-def test_locations_share_nodes_for_most_instances(wanted, data):
+def test_locations_share_nodes_for_most_instances(demands, data):
     edges = [edge(f"e{i}", (10 * i, 0)) for i in range(5)]
     rooms = {e.name: data.draw(st.integers(0, 2)) for e in edges}
     stock = inventory(edges=edges, hosts=[host(n, "edge", cpu=room / 10) for n, room in rooms.items()])
-    app = application(*(component_at(f"S{i}", *[(*spot, k) for spot, k in some]) for i, some in enumerate(wanted)))
-    found = hosted(app, stock)
+    app = application(
+        *(
+            component_at(f"S{i}", *[(*spot, k) for spot, k in component_locations])
+            for i, component_locations in enumerate(demands)
+        )
+    )
+    placed_nodes = hosted(app, stock)
     most = most_that_can_be_hosted(app, stock, rooms)
     if most is None:
-        assert isinstance(found, str)
+        assert isinstance(placed_nodes, str)
         return
-    assert sum(map(len, found.values())) == most
+    assert sum(map(len, placed_nodes.values())) == most
     for name, room in rooms.items():
-        used = [owner for (owner, _), nodes in found.items() for node in nodes if node == name]
+        used = [owner for (owner, _), nodes in placed_nodes.items() for node in nodes if node == name]
         assert len(used) == len(set(used)) <= room
-    for (owner, i), nodes in found.items():
+    for (owner, i), nodes in placed_nodes.items():
         spot = app.spec.component(owner).locations[i]
         assert 1 <= len(nodes) <= spot.instances
         assert all(geodesic_m(spot.center, stock.edge_nodes[n].spec.location) <= spot.radius for n in nodes)
@@ -164,20 +169,22 @@ def test_location_yields_node_that_another_location_needs():
     edges = [edge("a", (0, 0)), edge("b", (30, 0))]
     both = ((0, 0), 50, 1)
     only = ((0, 0), 10, 1)
-    found = hosted(application(component_at("S", both, only)), inventory(edges=edges))
-    assert found == {("S", 0): ["b"], ("S", 1): ["a"]}
+    placed_nodes = hosted(application(component_at("S", both, only)), inventory(edges=edges))
+    assert placed_nodes == {("S", 0): ["b"], ("S", 1): ["a"]}
     assert hosted(application(component_at("S", both), component_at("T", only)), inventory(edges=edges))["S", 0] == [
         "a"
     ]
     small = [host(e.name, "edge", cpu=0.1) for e in edges]
-    found = hosted(application(component_at("S", both), component_at("T", only)), inventory(edges=edges, hosts=small))
-    assert found == {("S", 0): ["b"], ("T", 0): ["a"]}
+    placed_nodes = hosted(
+        application(component_at("S", both), component_at("T", only)), inventory(edges=edges, hosts=small)
+    )
+    assert placed_nodes == {("S", 0): ["b"], ("T", 0): ["a"]}
 
 
 def test_location_with_all_nodes_yields_node_that_another_location_needs():
     edges = [edge("a", (0, 0)), edge("b", (30, 0))]
-    found = hosted(application(component_at("S", ((0, 0), 50, "*"), ((0, 0), 10, 1))), inventory(edges=edges))
-    assert found == {("S", 0): ["b"], ("S", 1): ["a"]}
+    placed_nodes = hosted(application(component_at("S", ((0, 0), 50, "*"), ((0, 0), 10, 1))), inventory(edges=edges))
+    assert placed_nodes == {("S", 0): ["b"], ("S", 1): ["a"]}
 
 
 def test_additional_instance_moves_no_running_instance():

@@ -58,13 +58,13 @@ def drone(name, home=(0, 0), battery=1.0, ready="True", minutes=15, methods=ALL,
     )
 
 
-def edge(name, where, wifi=80, camera=True):
+def edge(name, location, wifi=80, camera=True):
     interfaces = [{"technology": "Ethernet"}]
     if wifi:
         interfaces.append({"technology": "WiFi", "device": "wlan0", "range": wifi, "pairing": {"networkId": name}})
     services = {"camera": {"methods": CAMERA}} if camera else {}
     return EdgeNode.from_body(
-        manifest("EdgeNode", name, {"location": at(*where), "interfaces": interfaces, "services": services})
+        manifest("EdgeNode", name, {"location": at(*location), "interfaces": interfaces, "services": services})
     )
 
 
@@ -108,11 +108,11 @@ def application(*components):
 
 
 def inventory(drones=(), edges=(), hosts=(), **more):
-    found = {d.name: host(d.name, "drone") for d in drones} | {e.name: host(e.name, "edge") for e in edges}
-    found |= {"cloud-1": host("cloud-1", "cloud")} | {h.name: h for h in hosts}
+    hosts_by_name = {d.name: host(d.name, "drone") for d in drones} | {e.name: host(e.name, "edge") for e in edges}
+    hosts_by_name |= {"cloud-1": host("cloud-1", "cloud")} | {h.name: h for h in hosts}
     depot = Depot.from_body(manifest("Depot", "base", {"location": at(0, 0), "radius": 20}))
     return Inventory(
-        hosts=found,
+        hosts=hosts_by_name,
         drones={d.name: d for d in drones},
         edge_nodes={e.name: e for e in edges},
         depots={"base": depot},
@@ -392,8 +392,8 @@ def test_operation_area_contains_whole_depot():
 
 
 def test_instance_name_is_label_of_bounded_length():
-    thing = application(STORE).spec.component("DataStore")
-    assert instance_name("traffic", thing) == "traffic-data-store"
-    long = instance_name("a" * 63, thing, "node-1")
-    assert len(long) <= 57
-    assert long != instance_name("a" * 63, thing, "node-2")
+    data_store = application(STORE).spec.component("DataStore")
+    assert instance_name("traffic", data_store) == "traffic-data-store"
+    shortened = instance_name("a" * 63, data_store, "node-1")
+    assert len(shortened) <= 57
+    assert shortened != instance_name("a" * 63, data_store, "node-2")

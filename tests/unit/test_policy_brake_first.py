@@ -26,12 +26,12 @@ def test_goto_turning_back_in_narrow_corridor_brakes_first() -> None:
     grant = lane(7.0, (0, 0), (0, 80), (60, 80))
     assert judge(goto(50, 80), at(0.5, 79), grant).brake_first is False
     hot = judge(goto(50, 80), at(0.5, 74, north_mps=5), grant)
-    assert (hot.action, hot.brake_first) == ("allow", True), "straight across it would cut the corner"
+    assert (hot.action, hot.brake_first) == ("allow", True), "a turn onto the leg would cut the corner"
     beyond = judge(goto(50, 80), at(0.5, 78, north_mps=5), grant)
-    assert (beyond.action, beyond.brake_first) == ("deny", False), "it cannot even stop inside"
+    assert (beyond.action, beyond.brake_first) == ("deny", False), "the drone cannot even stop inside"
     earlier = at(0.5, 64, north_mps=5)
-    back = judge(goto(0, 10), earlier, grant)
-    assert (back.action, back.brake_first) == ("allow", False), "straight back is no turn"
+    straight_back = judge(goto(0, 10), earlier, grant)
+    assert (straight_back.action, straight_back.brake_first) == ("allow", False), "a leg straight back needs no turn"
     turning = judge(goto(40, 80), at(0, 68, north_mps=5, east_mps=0.3), grant)
     assert turning.permits
     assert turning.brake_first
@@ -88,7 +88,7 @@ def test_brake_first_stops_end_at_legal_positions(speed: float) -> None:
 
 
 RETRACES = Airframe(retraces=True)
-"""Airframe that returns along its path, so that no request here is denied because of its return."""
+"""Airframe that returns along its path, so that no request is denied because of its return."""
 
 
 @pytest.mark.parametrize(
@@ -118,8 +118,12 @@ def test_goto_outside_area_is_denied_when_the_drone_may_stop_inside() -> None:
     area = box(-50, -50, 20, 50)
     for grant in (compiled(operationArea=[area]), compiled(inclusion(area), operationArea=[])):
         leg = goto(10, 40, speed_mps=9.0)
-        assert not ask(grant, leg, at(6, 0, east_mps=5)).permits, "it may already accelerate, or be stopped in time"
-        assert ask(grant, leg, at(14, 0, east_mps=5)).permits, "it comes too close whatever it does, and leads back"
+        assert not ask(grant, leg, at(6, 0, east_mps=5)).permits, (
+            "the drone may already accelerate, or may be stopped in time"
+        )
+        assert ask(grant, leg, at(14, 0, east_mps=5)).permits, (
+            "the drone comes too close in any case, and the leg leads back"
+        )
 
 
 def test_goto_at_higher_speed_needs_wider_turn() -> None:
@@ -165,7 +169,7 @@ def test_stop_before_leg_enters_no_zone_at_forbidden_altitude(target: tuple[floa
     low = compiled(altitude("low", [zone("ahead", box(-20, 12, 20, 60))], upperLimit=10))
     flying = at(alt=20, north_mps=8, speed_setpoint_mps=8)
     assert ask(low, goto(*target, 20), flying).code == "AltitudeAboveLimit"
-    assert not ask(low, goto(*target, 20), flying).permits, "it would come to rest in the zone"
+    assert not ask(low, goto(*target, 20), flying).permits, "the drone would stop in the zone"
     assert ask(low, goto(*target, 20), at(alt=20)).action == "allow"
     assert ask(low, goto(*target, 8), at(alt=8, north_mps=8, speed_setpoint_mps=8)).permits
     terrain = altitude("terrain", [zone("ahead", box(-20, 12, 20, 60))], upperLimit=10, altitudeReference="terrain")

@@ -1,4 +1,4 @@
-"""Corrections are allowed unchanged, and comply with every limit, band and fence by a plain reading of the policies."""
+"""Corrected calls are allowed unchanged, and comply with all policies according to a separate plain implementation."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def holds(grant: CompiledGrant, call: Call, verdict: Verdict, now: Situation) ->
     return again.action == "allow" and again.args == verdict.args
 
 
-# Corrections are judged again
+# Corrected calls are judged again
 
 
 def test_altitude_correction_into_slower_zone_also_corrects_speed() -> None:
@@ -94,8 +94,10 @@ def test_correction_never_causes_takeover() -> None:
     grant = compiled(altitude(upperLimit=50), below)
     over = ask(grant, goto(150, 0, 90), at(alt=90))
     assert (over.action, over.code, over.policies) == ("deny", "ConflictingLimits", ("altitudes", "no-fly"))
-    assert ask(grant, goto(150, 0, 45), at(alt=45)).takeover == "revoke", "that was asked for"
-    assert ask(grant, goto(150, 0, 55), at(alt=55)).takeover == "revoke", "with and without correction"
+    assert ask(grant, goto(150, 0, 45), at(alt=45)).takeover == "revoke", "the requested leg enters the zone"
+    assert ask(grant, goto(150, 0, 55), at(alt=55)).takeover == "revoke", (
+        "the leg enters the zone with and without correction"
+    )
     climb = ask(
         compiled(altitude(lowerLimit=30), exclusion(EVERYWHERE, lower=20)), Call("Takeoff", TakeoffArgs(5)), at(alt=0.0)
     )
@@ -105,15 +107,19 @@ def test_correction_never_causes_takeover() -> None:
 def test_velocity_corrected_into_fence_is_denied() -> None:
     below = exclusion(box(40, -50, 90, 50), "land", upper=55)
     grant = compiled(altitude(upperLimit=50), below, services=SERVICES)
-    back = ask(grant, Call("SetVelocity", VelocityArgs(0, 0, 0, hold_s=2.0)), at(65, alt=59.0))
-    assert (back.action, back.code, back.policies) == ("deny", "ConflictingLimits", ("altitudes", "no-fly"))
+    return_velocity = ask(grant, Call("SetVelocity", VelocityArgs(0, 0, 0, hold_s=2.0)), at(65, alt=59.0))
+    assert (return_velocity.action, return_velocity.code, return_velocity.policies) == (
+        "deny",
+        "ConflictingLimits",
+        ("altitudes", "no-fly"),
+    )
 
 
 @pytest.mark.parametrize("limit", [0.05, 0.0, -5.0, math.nan, -math.inf])
 def test_speed_is_not_corrected_to_unachievable_speed(limit: float) -> None:
     grant = compiled(speed(upperLimit=5), services=SERVICES)
     for rule in grant.speed_limits.everywhere:
-        # This passes the schema, on which the engine does not rely.
+        # The schema accepts this value, but the engine must not rely on the schema.
         rule.spec.__dict__["upper_limit"] = limit
     for call in (Call("SetSpeed", SetSpeedArgs(3)), goto(50, 0), goto(50, 0, speed_mps=4)):
         verdict = ask(grant, call)
@@ -130,12 +136,12 @@ def test_speed_is_not_corrected_to_infinity(limit: float) -> None:
     assert ask(grant, Call("SetSpeed", SetSpeedArgs(3))).action == "deny"
 
 
-# Random policies, and a plain reading of them
+# Random policies and their plain implementation
 
 
 @dataclass
 class Plain:
-    """A zoned rule as the oracle reads it. Without corners it holds everywhere."""
+    """Rule in the representation of the oracle. Without corners it holds everywhere."""
 
     kind: str
     corners: Corners
@@ -158,7 +164,7 @@ class Plain:
 
 @dataclass
 class World:
-    """Random policies in two forms: compiled for the engine, and plain."""
+    """Random policies, compiled for the engine and as plain rules for the oracle."""
 
     seed: int
     rules: list[Plain] = field(default_factory=list)
@@ -233,7 +239,7 @@ class World:
         self.rules.append(Plain("inclusion", corners, band))
 
     def call(self) -> tuple[Call, Situation]:
-        """Return a request in some situation."""
+        """Return a random request and situation."""
         draw = self.draw
         method = draw.choice(("Goto", "Goto", "Goto", "Takeoff", "SetSpeed", "SetVelocity"))
         x = draw.uniform(-80, 80)
@@ -264,9 +270,9 @@ class World:
 
 @dataclass(frozen=True)
 class Motion:
-    """Effect of arguments in plain form: points on the ground, altitude range, end, and speed."""
+    """Motion that results from arguments: points on the ground, altitude range, and speed."""
 
-    way: list[tuple[float, float]]
+    points: list[tuple[float, float]]
     heights: tuple[float, float]
     fast: float | None
     method: str
@@ -276,32 +282,32 @@ def motion(args: Args, now: Situation) -> Motion:
     assert now.lat is not None
     assert now.lon is not None
     x, y = FRAME.xy(now.lat, now.lon)
-    here = now.altitude_m
+    altitude_now_m = now.altitude_m
     match args:
         case GotoArgs(lat, lon, alt, _, _, speed_mps):
             to = FRAME.xy(lat, lon)
-            way = [(x + (to[0] - x) * n / 60, y + (to[1] - y) * n / 60) for n in range(61)]
+            points = [(x + (to[0] - x) * n / 60, y + (to[1] - y) * n / 60) for n in range(61)]
             fast = now.speed_setpoint_mps if speed_mps is None else speed_mps
-            return Motion(way, (here, here if alt is None else alt), fast, "Goto")
+            return Motion(points, (altitude_now_m, altitude_now_m if alt is None else alt), fast, "Goto")
         case TakeoffArgs(altitude_m):
-            return Motion([(x, y)], (here, altitude_m), None, "Takeoff")
+            return Motion([(x, y)], (altitude_now_m, altitude_m), None, "Takeoff")
         case SetSpeedArgs(speed_mps):
-            return Motion([(x, y)], (here, here), speed_mps, "SetSpeed")
+            return Motion([(x, y)], (altitude_now_m, altitude_now_m), speed_mps, "SetSpeed")
         case VelocityArgs(north, east, _, _, hold_s):
             # A moving drone drifts off this line. tests/component/policy_flights.py flies such cases.
             resting = math.hypot(now.north_mps, now.east_mps) == 0
-            way = [(x + east * hold_s * n / 10, y + north * hold_s * n / 10) for n in range(11 if resting else 1)]
-            return Motion(way, (here, here), math.hypot(north, east), "SetVelocity")
+            points = [(x + east * hold_s * n / 10, y + north * hold_s * n / 10) for n in range(11 if resting else 1)]
+            return Motion(points, (altitude_now_m, altitude_now_m), math.hypot(north, east), "SetVelocity")
     raise AssertionError(args)
 
 
 def broken(rules: list[Plain], args: Args, now: Situation) -> Iterator[str]:
-    """Return the policies that arguments break by a plain reading."""
+    """Return the policies that arguments break according to the oracle."""
     done = motion(args, now)
     if done.fast is not None and not (0 <= done.fast < math.inf and (done.fast > 0 or done.method == "SetVelocity")):
         yield f"flies at {done.fast}"
     for rule in rules:
-        along = [rule.around(*point) for point in done.way]
+        along = [rule.around(*point) for point in done.points]
         if _breaks(rule, done, along):
             yield f"{done} breaks {rule}"
 

@@ -1,4 +1,4 @@
-"""The engine with unusual and hostile input: places, zones, numbers and clocks."""
+"""The engine with unusual and malicious input: positions, zones, numbers and clocks."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ RETRACING = Airframe(retraces=True)
 def test_judge_is_fast_near_outline_with_many_corners() -> None:
     """Any application may have a region with ten thousand corners.
 
-    Motion monitor and heartbeats wait during a judgement.
+    Motion monitor and heartbeats wait while the engine judges.
     """
     corners = [
         ((300.0 if i % 2 else 150.0) * math.sin(math.tau * i / 10_000), (300.0 if i % 2 else 150.0) * math.cos(math.tau * i / 10_000))
@@ -52,10 +52,10 @@ def test_judge_is_fast_near_outline_with_many_corners() -> None:
     zones = compiled(exclusion(ring(corners), "adjust"), operationArea=[box(-900, -900, 900, 900)], home=None)
     away = Home(*FRAME.latlon(0.0, 500.0), 100.0)
     begun_s = time.process_time()
-    assert ask(region, goto(0, 0), at(0, 149)).action == "allow", "back from the border"
-    assert ask(region, goto(0, 0), at(0, 315)).action == "allow", "from outside"
+    assert ask(region, goto(0, 0), at(0, 149)).action == "allow", "the leg leads back from the border"
+    assert ask(region, goto(0, 0), at(0, 315)).action == "allow", "the leg leads in from outside"
     assert ask(zones, goto(0, 0), at(0, 400, home=away)).code == "LegShortened"
-    assert ask(zones, goto(0, 400), at(0, 301, home=away)).action == "allow", "out of its margin"
+    assert ask(zones, goto(0, 400), at(0, 301, home=away)).action == "allow", "the leg leads out of the margin"
     assert time.process_time() - begun_s < 1.0
 
 
@@ -77,9 +77,9 @@ def test_engine_works_anywhere_on_the_globe(lat: float, lon: float) -> None:
     for x, y, code in ((45, 0, "InsideExclusionZone"), (100, 0, "LegThroughExclusionZone"), (0, 100, "")):
         assert judge(Call("Goto", GotoArgs(*frame.latlon(x, y), 10)), now, grant).code == code
     assert judge(Call("SetVelocity", VelocityArgs(0, 9, hold_s=2)), replace(now, east_mps=9), grant).action == "deny"
-    way = find_route((0, 0), (100, 0), now, grant, 10)
-    assert way is not None
-    assert len(way) == 3
+    route = find_route((0, 0), (100, 0), now, grant, 10)
+    assert route is not None
+    assert len(route) == 3
     assert monitor(replace(now, east_mps=9), grant) is None
     assert monitor(replace(now, east_mps=14), grant) is not None
 
@@ -129,19 +129,19 @@ def test_goto_into_hole_of_zone_is_judged_by_the_ring() -> None:
     assert ask(grant, goto(50, 0)).code == "InsideExclusionZone"
     assert ask(grant, goto(100, 0)).code == "LegThroughExclusionZone"
     assert find_route((0, 0), (100, 0), at(airframe=RETRACING), grant, 10) is None
-    kept = compiled(inclusion(_court()), operationArea=[])
-    assert ask(kept, goto(50, 20), at(50, 0)).code == "WayHomeBlocked", "home lies in the hole"
-    assert ask(kept, goto(30, 0), at(50, 0)).action == "deny"
+    inclusion_grant = compiled(inclusion(_court()), operationArea=[])
+    assert ask(inclusion_grant, goto(50, 20), at(50, 0)).code == "WayHomeBlocked", "home lies in the hole"
+    assert ask(inclusion_grant, goto(30, 0), at(50, 0)).action == "deny"
 
 
 def test_touching_zones_leave_no_gap() -> None:
     two = (exclusion(box(-100, 20, 0, 40), name="a"), exclusion(box(0, 20, 100, 40), name="b"))
-    for way in ((0, 60), (0.001, 60), (-0.001, 60)):
-        assert ask(compiled(*two), goto(*way)).action == "deny"
+    for target in ((0, 60), (0.001, 60), (-0.001, 60)):
+        assert ask(compiled(*two), goto(*target)).action == "deny"
     union = policy(
         "in", "GeofenceControl", "inclusion", [zone("a", box(-50, -50, 0, 50)), zone("b", box(0, -50, 50, 50))]
     )
-    assert ask(compiled(union), goto(30, 0), at(-30, 0)).action == "allow", "their common border is no gap"
+    assert ask(compiled(union), goto(30, 0), at(-30, 0)).action == "allow", "there is no gap at the common border"
 
 
 def test_goto_to_present_position_is_allowed() -> None:
@@ -159,26 +159,26 @@ def test_engine_handles_home_inside_a_zone() -> None:
     assert ask(grant, Call("Takeoff"), at(alt=0)).action == "deny"
     assert ask(grant, goto(100, 0), at(60, 0)).code == "WayHomeBlocked"
     assert ask(grant, goto(100, 0), at(60, 0, airframe=RETRACING)).code == "WayHomeBlocked"
-    assert ask(grant, goto(40, 0), at(15, 0)).action == "allow", "it may leave the zone regardless of home"
+    assert ask(grant, goto(40, 0), at(15, 0)).action == "allow", "the drone may leave the zone regardless of home"
     assert ask(grant, Call("ReturnToLaunch"), at(60, 0)).action == "allow"
 
 
 NANS = [math.nan, math.inf, -math.inf, 1e300, -1e300]
 
 
-@pytest.mark.parametrize("odd", NANS)
-def test_non_finite_arguments_are_denied(odd: float) -> None:
+@pytest.mark.parametrize("invalid", NANS)
+def test_non_finite_arguments_are_denied(invalid: float) -> None:
     grant = compiled(exclusion(box(-20, 20, 20, 60)), altitude(upperLimit=30), services=SERVICES)
     calls = [
-        Call("SetVelocity", VelocityArgs(odd, 0)), Call("SetVelocity", VelocityArgs(0, 0, odd)),
-        Call("SetVelocity", VelocityArgs(0, 1, hold_s=odd)), Call("Goto", GotoArgs(odd, 22.95)),
-        Call("Goto", GotoArgs(39.36, 22.95, speed_mps=odd)),
+        Call("SetVelocity", VelocityArgs(invalid, 0)), Call("SetVelocity", VelocityArgs(0, 0, invalid)),
+        Call("SetVelocity", VelocityArgs(0, 1, hold_s=invalid)), Call("Goto", GotoArgs(invalid, 22.95)),
+        Call("Goto", GotoArgs(39.36, 22.95, speed_mps=invalid)),
     ]  # fmt: skip
     assert {ask(grant, call).code for call in calls} == {"InvalidArgument"}
     fine = Call("SetVelocity", VelocityArgs(1, 0))
     for field in ("altitude_m", "down_mps", "forward_mps2", "latency_s", "position_error_m", "altitude_error_m"):
-        assert ask(grant, fine, replace(at(), **{field: odd})).code == "PositionUnknown", field
-        assert ask(grant, goto(0, 10), replace(at(), **{field: odd})).code == "PositionUnknown", field
+        assert ask(grant, fine, replace(at(), **{field: invalid})).code == "PositionUnknown", field
+        assert ask(grant, goto(0, 10), replace(at(), **{field: invalid})).code == "PositionUnknown", field
 
 
 def test_clock_set_back_in_flight_keeps_restrictions() -> None:
@@ -186,10 +186,10 @@ def test_clock_set_back_in_flight_keeps_restrictions() -> None:
     fence = exclusion(box(-20, 20, 20, 60), "land")
     fence["spec"] |= shut
     grant = compiled(fence, services=SERVICES)
-    back = replace(at(0, 10, north_mps=5), time_s=UncertainTime(NOW, NOW - 7200.0))
-    assert monitor(back, grant) is not None, "it may be any time in between"
-    assert not ask(grant, Call("SetVelocity", VelocityArgs(5, 0)), back).permits
-    assert not ask(grant, goto(0, 40), replace(back, time_s=UncertainTime(NOW + 7200, NOW))).permits
+    after_step = replace(at(0, 10, north_mps=5), time_s=UncertainTime(NOW, NOW - 7200.0))
+    assert monitor(after_step, grant) is not None, "the time may be any time in between"
+    assert not ask(grant, Call("SetVelocity", VelocityArgs(5, 0)), after_step).permits
+    assert not ask(grant, goto(0, 40), replace(after_step, time_s=UncertainTime(NOW + 7200, NOW))).permits
 
 
 def test_empty_grant_denies_everything() -> None:
@@ -209,7 +209,7 @@ def test_judge_handles_thousands_of_policies_at_one_place() -> None:
     assert (verdict.action, verdict.takeover, verdict.policies[0]) == ("takeover", "land", "p0000")
     assert len(verdict.policies) == 500
     sixth = [f"p{i:04}" for i in range(1, 500) if i % 7 == 6]
-    assert list(verdict.policies[1 : len(sixth) + 1]) == sixth, "then by priority, then by name"
+    assert list(verdict.policies[1 : len(sixth) + 1]) == sixth, "further policies are sorted by priority, then by name"
 
 
 def test_altitude_bands_of_every_datum_are_respected() -> None:
@@ -220,7 +220,7 @@ def test_altitude_bands_of_every_datum_are_respected() -> None:
     assert ask(amsl, push, low).action == "deny", "home lies at 100 m"
     assert ask(amsl, push, high).action == "allow"
     sunk = replace(high, home=Home(39.36, 22.95, 80.0))
-    assert ask(amsl, push, sunk).action == "deny", "home lies lower, and so does the drone"
+    assert ask(amsl, push, sunk).action == "deny", "home is lower, so the drone is lower too"
     terrain = exclusion(box(50, -20, 80, 20), lower=0, upper=15, reference="terrain")
     assert ask(compiled(terrain, services=SERVICES), push, high).action == "deny", "the terrain is unknown"
     assert ask(compiled(terrain, services=SERVICES, flat_terrain=True), push, high).action == "allow"
@@ -229,17 +229,17 @@ def test_altitude_bands_of_every_datum_are_respected() -> None:
 def test_leg_out_of_zone_may_not_climb_into_it() -> None:
     above = compiled(exclusion(box(-30, -30, 30, 30), lower=14), operationArea=[])
     under = at(25, 0, alt=12.5, airframe=RETRACING)
-    assert ask(above, goto(60, 0, 11), under).action == "allow", "out from under it"
-    assert ask(above, goto(60, 0, 30), under).action == "deny", "it would climb into it on its way out"
-    assert ask(above, goto(60, 0, 12.7), under).action == "allow", "on at its height, as well as that is known"
-    assert ask(above, goto(60, 0, 13.6), under).action == "deny", "even closer below it"
+    assert ask(above, goto(60, 0, 11), under).action == "allow", "the leg leads out from under the zone"
+    assert ask(above, goto(60, 0, 30), under).action == "deny", "the drone would climb into the zone on its way out"
+    assert ask(above, goto(60, 0, 12.7), under).action == "allow", "the leg keeps the height within its error"
+    assert ask(above, goto(60, 0, 13.6), under).action == "deny", "the leg comes even closer to the zone above"
     for alt in (13.2, 13.6):
         close = replace(under, altitude_m=alt)
-        assert ask(above, goto(60, 0, alt), close).action == "allow", "on at its height"
-        assert ask(above, goto(60, 0, alt + 0.1), close).action == "deny", "closer with each leg"
+        assert ask(above, goto(60, 0, alt), close).action == "allow", "the leg keeps the height"
+        assert ask(above, goto(60, 0, alt + 0.1), close).action == "deny", "repeated legs would come closer and closer"
     lower = replace(under, altitude_m=10.0)
     assert ask(above, goto(60, 0, 11.9), lower).action == "allow"
-    assert ask(above, goto(60, 0, 12.5), lower).action == "deny", "into its margin of height"
+    assert ask(above, goto(60, 0, 12.5), lower).action == "deny", "the leg enters the height margin"
     assert ask(above, goto(60, 0, 12.1), replace(lower, altitude_m=11.9)).action == "deny"
     inside = at(25, 0, alt=20)
     assert ask(above, goto(60, 0, 30), replace(inside, airframe=RETRACING)).action == "allow"
@@ -253,5 +253,7 @@ def test_leg_may_not_sink_out_of_inclusion_zone() -> None:
     grant = compiled(two, operationArea=[])
     assert ask(grant, goto(-30, 0, 5), at(-20, 0, alt=25)).action == "allow"
     sinking = ask(grant, goto(-30, 0, 5), at(30, 0, alt=25))
-    assert sinking.action == "deny", "it may sink below the high zone before it is over the ground zone"
-    assert ask(grant, goto(-30, 0, 5), at(30, 0, alt=8)).action == "allow", "already below: the way back in"
+    assert sinking.action == "deny", "the drone may sink below the high zone before it is above the ground zone"
+    assert ask(grant, goto(-30, 0, 5), at(30, 0, alt=8)).action == "allow", (
+        "the drone is already below, so the leg leads back in"
+    )

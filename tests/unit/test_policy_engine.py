@@ -1,4 +1,4 @@
-"""Rules of the engine, one by one."""
+"""Single rules of the policy engine."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def test_method_that_is_not_granted_is_denied() -> None:
     grant = compiled(services=[{"service": "mobility", "methods": ["GetPosition"]}])
     assert ask(grant, Call("Hover")).code == "MethodNotGranted"
     assert ask(grant, Call("GetPosition")).action == "allow"
-    assert ask(grant, Call("GetControl")).action == "allow", "a driver may always ask for control"
+    assert ask(grant, Call("GetControl")).action == "allow", "a driver may always request control"
     passenger = compiled(services=[{"service": "mobility", "methods": ["GetPosition"]}], **{"class": "passenger"})
     assert ask(passenger, Call("GetControl")).code == "MethodNotGranted"
     assert ask(grant, Call("Explode")).code == "MethodNotGranted"
@@ -62,17 +62,21 @@ def test_denial_holds_only_in_its_zone_and_validity_window() -> None:
     grant = compiled(denial)
     assert ask(grant, Call("Hover"), at(20, 20)).code == "MethodDenied"
     assert ask(grant, Call("Hover"), at(20, 20)).policies == ("quiet",)
-    assert ask(grant, Call("Hover"), at(9, 20)).code == "MethodDenied", "inside the position error"
+    assert ask(grant, Call("Hover"), at(9, 20)).code == "MethodDenied", (
+        "the drone may be in the zone because of the position error"
+    )
     assert ask(grant, Call("Hover"), at(0, 0)).action == "allow"
     assert ask(grant, Call("GetSpeed"), at(20, 20)).action == "allow"
-    assert ask(grant, Call("Hover"), _lost()).code == "MethodDenied", "unknown may be inside"
+    assert ask(grant, Call("Hover"), _unknown_position()).code == "MethodDenied", (
+        "a drone at an unknown position may be in the zone"
+    )
     late = {**denial, "spec": {**denial["spec"], "validFrom": "2026-06-01T13:00:00Z"}}
     assert ask(compiled(late), Call("Hover"), at(20, 20)).action == "allow"
     over = {**denial, "spec": {**denial["spec"], "validUntil": "2026-06-01T12:00:00Z"}}
-    assert ask(compiled(over), Call("Hover"), at(20, 20)).action == "allow", "until is exclusive"
+    assert ask(compiled(over), Call("Hover"), at(20, 20)).action == "allow", "validUntil is exclusive"
 
 
-def _lost() -> Any:
+def _unknown_position() -> Any:
     from dataclasses import replace
 
     return replace(at(), lat=None, lon=None)
@@ -85,14 +89,16 @@ def test_denial_holds_only_in_its_altitude_band() -> None:
     grant = compiled(banded)
     assert ask(grant, Call("Hover"), at(alt=10)).action == "allow"
     assert ask(grant, Call("Hover"), at(alt=40)).code == "MethodDenied"
-    assert ask(grant, Call("Hover"), at(alt=29.5)).code == "MethodDenied", "inside the altitude error"
+    assert ask(grant, Call("Hover"), at(alt=29.5)).code == "MethodDenied", (
+        "the drone may be in the band because of the altitude error"
+    )
 
 
 def test_grant_policy_limits_method_to_its_zone() -> None:
     grant = compiled(policy("here", "AccessControl", "grant", [zone("h", box(10, 10, 30, 30))], methods=["Hover"]))
     assert ask(grant, Call("Hover"), at(20, 20)).action == "allow"
     assert ask(grant, Call("Hover"), at(0, 0)).code == "MethodNotGrantedHere"
-    assert ask(grant, Call("Hover"), _lost()).code == "MethodNotGrantedHere"
+    assert ask(grant, Call("Hover"), _unknown_position()).code == "MethodNotGrantedHere"
     assert ask(grant, Call("GetSpeed"), at(0, 0)).action == "allow"
 
 
@@ -151,11 +157,14 @@ def test_motion_is_denied_when_position_is_unknown() -> None:
         Call("Land"),
         Call("SetSpeed", SetSpeedArgs(3)),
     ):
-        assert ask(compiled(), call, _lost()).code == "PositionUnknown"
+        assert ask(compiled(), call, _unknown_position()).code == "PositionUnknown"
         assert ask(compiled(), call, at(north_mps=NAN)).code == "PositionUnknown"
-    assert ask(compiled(), Call("Hover"), _lost()).action == "allow"
+    assert ask(compiled(), Call("Hover"), _unknown_position()).action == "allow"
     down = Call("PointGimbal", PointGimbalArgs(-90))
-    assert (ask(compiled(), down, _lost()).action, ask(compiled(), down, _lost()).args) == ("allow", down.args)
+    assert (ask(compiled(), down, _unknown_position()).action, ask(compiled(), down, _unknown_position()).args) == (
+        "allow",
+        down.args,
+    )
     assert ask(compiled(), goto(5, 5), at(home=None)).code == "HomeUnknown"
 
 
@@ -210,8 +219,10 @@ def test_zone_limit_applies_to_every_leg_that_touches_the_zone() -> None:
     assert ask(grant, goto(0, 100, 50)).action == "allow"
     assert ask(grant, goto(100, 0, 50)).args.alt == 15
     high = ask(grant, goto(50, 0, 10), at(alt=30))
-    assert (high.action, high.code) == ("deny", "AltitudeAboveLimit"), "it would enter at 30 m"
-    assert ask(grant, goto(45, 0, 10), at(50, 0, alt=30)).action == "allow", "already inside: leading back"
+    assert (high.action, high.code) == ("deny", "AltitudeAboveLimit"), "the drone would enter the zone at 30 m"
+    assert ask(grant, goto(45, 0, 10), at(50, 0, alt=30)).action == "allow", (
+        "the drone is already inside, and the leg leads to a permitted altitude"
+    )
 
 
 def test_altitude_limit_above_sea_level_is_converted() -> None:
@@ -249,7 +260,7 @@ def test_speed_is_corrected_or_denied_by_limits() -> None:
 def test_capture_is_denied_outside_the_operation_area() -> None:
     assert ask(compiled(), Call("CaptureImage", CaptureArgs())).action == "allow"
     assert ask(compiled(), Call("CaptureImage", CaptureArgs()), at(0, 250)).code == "OutsideOperationArea"
-    assert ask(compiled(), Call("CaptureImage", CaptureArgs()), _lost()).code == "PositionUnknown"
+    assert ask(compiled(), Call("CaptureImage", CaptureArgs()), _unknown_position()).code == "PositionUnknown"
 
 
 def test_privacy_policy_denies_or_returns_filters() -> None:
@@ -276,9 +287,9 @@ def test_zone_applies_only_while_its_schedule_is_active() -> None:
     shut = compiled(at_night("exclusion", 50, -20, 80, 20))
     assert ask(shut, goto(60, 0), noon).action == "allow"
     assert ask(shut, goto(60, 0), midnight).code == "InsideExclusionZone"
-    kept = compiled(at_night("inclusion", -100, -100, 100, 100))
-    assert ask(kept, goto(60, 0), midnight).action == "allow"
-    assert ask(kept, goto(60, 0), noon).action == "deny", "a zone that is not active allows nothing"
+    inclusion_grant = compiled(at_night("inclusion", -100, -100, 100, 100))
+    assert ask(inclusion_grant, goto(60, 0), midnight).action == "allow"
+    assert ask(inclusion_grant, goto(60, 0), noon).action == "deny", "an inactive inclusion zone permits nothing"
 
 
 def test_verdicts_are_deterministic() -> None:

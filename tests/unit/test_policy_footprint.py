@@ -1,4 +1,4 @@
-"""Camera footprint against a brute-force camera that is turned, moved and raised within the error bounds."""
+"""Camera footprint compared with rays of a camera that is turned, moved and raised within the error bounds."""
 
 from __future__ import annotations
 
@@ -44,9 +44,9 @@ def ray(lens: Lens, attitude: Attitude, u: float, v: float) -> np.ndarray:
 
 
 def view(now: Situation) -> Footprint:
-    found = footprint(now, FRAME)
-    assert found is not None
-    return found
+    shown = footprint(now, FRAME)
+    assert shown is not None
+    return shown
 
 
 part = st.floats(-1.0, 1.0)
@@ -66,7 +66,7 @@ def test_footprint_contains_everything_a_picture_may_show(
 ) -> None:
     now = at(0, 0, alt=alt, lens=lens, attitude=attitude, position_error_m=errors[0], altitude_error_m=errors[1],
              relief_m=errors[2])  # fmt: skip
-    # Roll and pitch share their bound. The mount's error is a turn about any axis, here the camera's.
+    # Roll and pitch have one common bound. The error of the mount is a turn about any axis, in this test about the camera axis.
     share = (1 + turn[5]) / 2
     actual = replace(
         attitude,
@@ -90,11 +90,11 @@ def test_footprint_contains_everything_a_picture_may_show(
         assert shown.sight.dwithin(point, shown.margin_m + 1e-6)
         assert shown.shows(point.buffer(1e-3), -math.inf, ground_m + 1e-3)
         assert math.dist((0, 0, 0), direction * reach) <= shown.farthest_m + errors[0] + 1e-6
-        # The same holds for the air that the ray passes on its way down.
-        for share_of_way in (0.3, 0.8):
-            height = above_m - share_of_way * (above_m - ground_m)
-            on_way = shapely.Point(x + east * share_of_way, y + north * share_of_way).buffer(1e-3)
-            assert shown.shows(on_way, height - 1e-3, height + 1e-3)
+        # The footprint also contains the air that the ray passes on its way down.
+        for share in (0.3, 0.8):
+            height = above_m - share * (above_m - ground_m)
+            passed = shapely.Point(x + east * share, y + north * share).buffer(1e-3)
+            assert shown.shows(passed, height - 1e-3, height + 1e-3)
 
 
 @pytest.mark.parametrize(
@@ -147,12 +147,12 @@ def test_footprint_shows_zones_with_altitude_bands() -> None:
 
     assert verdict(15, 25) == "PrivacyZone"
     assert verdict(5, 10) == "PrivacyZone", "the picture may show a house there"
-    assert verdict(5, 10, upper=3) == "", "a pool there does not"
+    assert verdict(5, 10, upper=3) == "", "the picture cannot show a pool there"
     assert verdict(5, 10, lower=8, upper=14) == "PrivacyZone"
     assert verdict(-30, -5) == "", "behind"
     assert verdict(40, 60) == "", "beyond"
     assert verdict(15, 25, lower=25) == "", "above the camera"
-    assert verdict(-5, 5) == "PrivacyZone", "the drone is there"
+    assert verdict(-5, 5) == "PrivacyZone", "the drone is in the zone"
 
 
 def test_footprint_of_exposure_covers_the_motion_between_its_ends() -> None:
@@ -181,10 +181,10 @@ _FILTERS = st.builds(
 def test_combined_filters_satisfy_each_filter(required: list[Filter], more: list[Filter]) -> None:
     composed = combine_filters(required)
     assert composed == combine_filters(reversed(required)) == combine_filters(composed)
-    done = {one.action for one in composed}
+    done = {filter_.action for filter_ in composed}
     hidden = {"blurAverage", "blurMedian", "black"}
-    for one in required:
-        assert one.action in done or "black" in done or (one.action == "blurFaces" and done & hidden)
+    for filter_ in required:
+        assert filter_.action in done or "black" in done or (filter_.action == "blurFaces" and done & hidden)
     assert remaining_filters(required, composed) == ()
     # Filters applied later replace missing or milder earlier filters.
     both = (*composed, *remaining_filters(more, composed))
@@ -228,7 +228,7 @@ def test_lens_is_read_from_camera_description() -> None:
         "lens": {"model": "pinhole"},
     }
     assert bounding_lens(None) is None
-    assert bounding_lens(CameraFeatures.model_validate(fields)) is None, "its direction is unknown"
+    assert bounding_lens(CameraFeatures.model_validate(fields)) is None, "the direction of the camera is unknown"
     lens = bounding_lens(CameraFeatures.model_validate({**fields, "mount": {"pitch": -60, "stabilised": True}}))
     assert lens is not None
     assert (lens.pitch_deg, lens.stabilised) == (-60, True)

@@ -36,7 +36,7 @@ def test_goto_outside_operation_area_is_denied() -> None:
     verdict = ask(compiled(), goto(0, 230))
     assert (verdict.action, verdict.code, verdict.takeover) == ("deny", "OutsideOperationArea", None)
     assert "30.0 m outside" in verdict.reason
-    assert ask(compiled(), goto(0, 198)).code == "OutsideOperationArea", "within the margin of the border"
+    assert ask(compiled(), goto(0, 198)).code == "OutsideOperationArea", "the target is inside the margin of the border"
     assert ask(compiled(), goto(0, 197)).action == "allow"
     assert ask(compiled(operationArea=[]), goto(0, 230)).action == "allow"
 
@@ -51,11 +51,13 @@ def test_goto_cutting_corner_of_operation_area_is_denied() -> None:
 def test_goto_along_corridor_and_home_is_allowed() -> None:
     grant = compiled(operationArea=[box(50, -20, 150, 20)], corridor=[box(-30, -30, 150, 30)])
     assert ask(grant, goto(100, 0), at(0, 0)).action == "allow"
-    assert ask(grant, goto(20, 0), at(0, 0)).code == "OutsideOperationArea", "the way is not a place to work"
+    assert ask(grant, goto(20, 0), at(0, 0)).code == "OutsideOperationArea", (
+        "the corridor is not part of the operation area"
+    )
     assert ask(grant, goto(0, 0), at(100, 0)).action == "allow", "home"
     assert ask(grant, Call("Takeoff", TakeoffArgs(10)), at(0, 0, 0)).action == "allow"
     partial = compiled(operationArea=[box(50, -20, 150, 20)], corridor=[box(-30, -30, 150, 30)], control="partial")
-    assert ask(partial, goto(100, 0), at(0, 0)).action == "allow", "leading in"
+    assert ask(partial, goto(100, 0), at(0, 0)).action == "allow", "the leg leads in"
     assert ask(partial, Call("Arm"), at(0, 0, 0)).code == "OutsideOperationArea"
 
 
@@ -63,9 +65,13 @@ def test_goto_from_home_may_leave_operation_area_into_corridor() -> None:
     bend = ring([(-10, -5), (60, -5), (60, 60), (50, 60), (50, 5), (-10, 5)])
     grant = compiled(operationArea=[bend], corridor=[box(-30, -30, 100, 100)])
     assert ask(grant, goto(55, 50), at(0, 0)).action == "allow"
-    assert ask(grant, goto(55, 50), at(20, 0)).code == "OutsideOperationArea", "at work it stays inside"
+    assert ask(grant, goto(55, 50), at(20, 0)).code == "OutsideOperationArea", (
+        "a driver in the operation area stays inside"
+    )
     partial = compiled(operationArea=[bend], corridor=[box(-30, -30, 100, 100)], control="partial")
-    assert ask(partial, goto(55, 50), at(0, 0)).code == "OutsideOperationArea", "the system flies there"
+    assert ask(partial, goto(55, 50), at(0, 0)).code == "OutsideOperationArea", (
+        "only the system may fly the leg to the control point"
+    )
 
 
 def test_partial_control_driver_may_fly_where_system_can_return_around_zone() -> None:
@@ -75,7 +81,9 @@ def test_partial_control_driver_may_fly_where_system_can_return_around_zone() ->
     across = exclusion(box(20, -70, 40, 70))
     assert ask(compiled(beside, **fields), goto(100, 0), retracing).action == "allow"
     assert ask(compiled(across, **fields), goto(100, 0), retracing).code == "WayHomeBlocked"
-    assert ask(compiled(beside, **fields), goto(100, 0), at(60, 0)).code == "WayHomeBlocked", "it flies home straight"
+    assert ask(compiled(beside, **fields), goto(100, 0), at(60, 0)).code == "WayHomeBlocked", (
+        "the drone returns straight"
+    )
 
 
 def test_goto_into_through_or_near_exclusion_zone_is_denied() -> None:
@@ -121,13 +129,17 @@ def test_reason_distinguishes_turn_from_leg_through_zone() -> None:
 def test_zone_with_altitude_band_may_be_overflown() -> None:
     grant = compiled(exclusion(box(50, -20, 80, 20), upper=20))
     assert ask(grant, goto(150, 0, 30), at(alt=30)).action == "allow"
-    assert ask(grant, goto(150, 0, 30), at(alt=10)).code == "LegThroughExclusionZone", "it may climb too late"
-    assert ask(grant, goto(150, 0, 21), at(alt=21)).code == "LegThroughExclusionZone", "within the altitude margin"
+    assert ask(grant, goto(150, 0, 30), at(alt=10)).code == "LegThroughExclusionZone", "the drone may climb too late"
+    assert ask(grant, goto(150, 0, 21), at(alt=21)).code == "LegThroughExclusionZone", (
+        "the leg is inside the altitude margin"
+    )
     high = compiled(exclusion(box(50, -20, 80, 20), lower=140, reference="amsl"))
     assert ask(high, goto(60, 0, 20)).action == "allow"
     assert ask(high, goto(60, 0, 39)).code == "InsideExclusionZone"
     unknown = compiled(exclusion(box(50, -20, 80, 20), upper=20, reference="terrain"))
-    assert ask(unknown, goto(60, 0, 90), at(alt=90)).code == "InsideExclusionZone", "unknown terrain reaches to the sky"
+    assert ask(unknown, goto(60, 0, 90), at(alt=90)).code == "InsideExclusionZone", (
+        "a zone above unknown terrain has no upper limit"
+    )
 
 
 @pytest.mark.parametrize("action", ["hover", "land", "returnToLaunch", "revoke"])
@@ -135,8 +147,8 @@ def test_geofence_action_determines_takeover(action: str) -> None:
     grant = compiled(exclusion(box(50, -20, 80, 20), action))
     verdict = ask(grant, goto(60, 0))
     assert (verdict.action, verdict.takeover, verdict.policies) == ("takeover", action, ("no-fly",))
-    assert ask(grant, goto(150, 0)).takeover == action, "a leg through it breaks it too"
-    assert ask(grant, goto(48, 0)).action == "deny", "coming close costs no more than the request"
+    assert ask(grant, goto(150, 0)).takeover == action, "a leg through the zone also breaks the policy"
+    assert ask(grant, goto(48, 0)).action == "deny", "a leg inside the margin is only denied"
 
 
 def test_most_restrictive_fence_decides() -> None:
@@ -155,7 +167,7 @@ def test_adjust_action_shortens_leg_before_exclusion_zone() -> None:
     assert y == pytest.approx(0, abs=1e-3)
     assert 46.5 < x < 47.5
     assert ask(grant, Call("Goto", verdict.args)).action == "allow", "the corrected target is legal"
-    assert ask(grant, goto(150, 0), at(47, 0)).action == "deny", "nothing is left of the leg"
+    assert ask(grant, goto(150, 0), at(47, 0)).action == "deny", "no legal part of the leg remains"
     both = compiled(exclusion(box(50, -20, 80, 20), "adjust"), exclusion(box(20, -20, 30, 20), "ignore", "other"))
     assert ask(both, goto(150, 0)).action == "deny"
 
@@ -174,7 +186,7 @@ def test_adjust_action_shortens_leg_inside_inclusion_zone() -> None:
 def test_inclusion_circle_of_large_radius_is_not_left(radius_m: float) -> None:
     """The border is 100 m north of home, and the center far to the south."""
     lat, lon = FRAME.latlon(0.0, -(radius_m - 100.0))
-    # Unlike the frame, this is true to scale.
+    # Unlike the local frame, geodesics are true to scale.
     south_m = distance_m(Point(lat=lat, lon=lon), Point(lat=HOME.lat, lon=HOME.lon))
     circle = {"circle": {"center": {"lat": lat, "lon": lon}, "radius": south_m + 100.0}}
     grant = compiled(inclusion(circle))
@@ -192,7 +204,7 @@ def test_inclusion_area_is_union_of_the_zones_of_a_policy() -> None:
     )  # fmt: skip
     assert ask(compiled(two), goto(100, 0)).action == "allow"
     apart = (inclusion(box(-30, -30, 50, 30), name="a"), inclusion(box(49, -30, 120, 30), name="b"))
-    assert ask(compiled(*apart), goto(100, 0)).action == "deny", "two policies hold both"
+    assert ask(compiled(*apart), goto(100, 0)).action == "deny", "both policies apply"
 
 
 def test_goto_of_moving_drone_needs_room_to_turn() -> None:
@@ -200,7 +212,9 @@ def test_goto_of_moving_drone_needs_room_to_turn() -> None:
     assert ask(grant, goto(0, 60), at(0, 0)).action == "allow"
     assert ask(grant, goto(0, 60), at(0, 0, east_mps=9)).code == "LegThroughExclusionZone"
     ahead = compiled(exclusion(box(15, -20, 30, 20)))
-    assert ask(ahead, goto(0, 60), at(0, 0, east_mps=9)).action == "allow", "it leads away from what cannot be avoided"
+    assert ask(ahead, goto(0, 60), at(0, 0, east_mps=9)).action == "allow", (
+        "the leg leads away from a zone that the drone cannot avoid"
+    )
     assert ask(ahead, goto(60, 60), at(0, 0, east_mps=9)).action == "deny"
     assert stopping_distance_m(9, 2.5, 1.0) == pytest.approx(2.5 / 2 + 81 / 5)
     assert stopping_distance_m(2, 2.5, 1.0) == pytest.approx(2.0)
@@ -211,9 +225,11 @@ def test_goto_from_inside_zone_may_only_lead_out() -> None:
     inside = at(60, 0)
     assert ask(grant, goto(40, 0), inside).action == "allow"
     assert ask(grant, goto(80, 0), inside).action != "allow"
-    assert ask(grant, goto(100, 0), inside).action != "allow", "the long way out leads deeper first"
-    assert ask(grant, goto(49, 0), inside).action != "allow", "out, but not far enough"
-    assert ask(grant, goto(80, 0), inside).action == "deny", "no second takeover for what the monitor handles"
+    assert ask(grant, goto(100, 0), inside).action != "allow", "the longer leg out leads deeper first"
+    assert ask(grant, goto(49, 0), inside).action != "allow", "the target is outside, but inside the margin"
+    assert ask(grant, goto(80, 0), inside).action == "deny", (
+        "the monitor already handles the violation, so there is no second takeover"
+    )
 
 
 def test_drone_outside_inclusion_zone_may_only_fly_in() -> None:
@@ -233,15 +249,15 @@ def test_goto_is_denied_when_straight_return_is_blocked() -> None:
     assert ask(grant, goto(0, 80), behind).code == "WayHomeBlocked"
     assert ask(grant, goto(150, 60), behind).action == "allow"
     low = compiled(exclusion(box(-100, 40, 60, 50), name="wall", upper=12))
-    assert ask(low, goto(0, 80, 10), behind).action == "allow", "it returns at 15 m, above the wall"
+    assert ask(low, goto(0, 80, 10), behind).action == "allow", "the drone returns at 15 m, above the wall"
     assert ask(compiled(inclusion(box(20, -50, 150, 150))), goto(100, 50), at(80, 50)).code == "WayHomeBlocked"
 
 
 def test_straight_return_near_home_is_checked_at_lower_altitude() -> None:
-    """The autopilot climbs to three times its distance from home instead of its return altitude."""
+    """Near home the autopilot climbs only to three times its distance from home, not to its return altitude."""
     grant = compiled(exclusion(box(-20, 15, 20, 17), name="mast", upper=70))
     high = at(60, 60, airframe=Airframe(return_altitude_m=100.0))
-    assert ask(grant, goto(0, 60), high).action == "allow", "from there it returns at 100 m"
+    assert ask(grant, goto(0, 60), high).action == "allow", "from the target the drone returns at 100 m"
     near = ask(grant, goto(0, 23), high)
     assert near.code == "WayHomeBlocked"
     assert "69.0 to 100.0 m" in near.reason
@@ -253,7 +269,7 @@ def test_takeoff_and_landing_respect_fences() -> None:
     assert ask(grant, Call("Takeoff", TakeoffArgs(30)), at(alt=0)).action == "deny"
     ground = compiled(exclusion(box(40, -10, 60, 10), upper=30))
     assert ask(ground, Call("Land"), at(50, 0, alt=50)).code == "InsideExclusionZone"
-    assert ask(ground, Call("Land"), at(30, 0, east_mps=8)).action == "deny", "it would come down inside"
+    assert ask(ground, Call("Land"), at(30, 0, east_mps=8)).action == "deny", "the drone would land in the zone"
     assert ask(ground, Call("Land"), at(0, 0)).action == "allow"
     assert ask(ground, Call("Arm"), at(50, 0, alt=0)).action == "deny"
 
@@ -267,8 +283,10 @@ def test_drone_too_close_below_or_above_zone_may_sink_or_climb_away(
         beside = at(x, 0, 10.0)
         assert ask(grant, goto(x, 0, away), beside).action == "allow"
         assert ask(grant, goto(x, 0, closer), beside).action == "deny"
-        assert ask(grant, goto(x, 0, 10.0), beside).action == "deny", "it stays too close"
-        assert ask(grant, goto(x - 20, 0, away), beside).action == "deny", "it may be over or under it first"
+        assert ask(grant, goto(x, 0, 10.0), beside).action == "deny", "the drone stays too close"
+        assert ask(grant, goto(x - 20, 0, away), beside).action == "deny", (
+            "the drone may be above or below the zone first"
+        )
     moving = at(x=40.5, alt=10.0, east_mps=-8.0)
     assert ask(grant, goto(40.5, 0, away), moving).action == "deny"
 
@@ -278,7 +296,7 @@ def test_disarm_is_denied_in_the_air() -> None:
     assert ask(compiled(), Call("Disarm"), at(in_air=False)).action == "allow"
 
 
-# Geometry far away
+# Distant geometry
 
 
 def test_zones_on_the_far_side_of_the_globe_are_ignored() -> None:

@@ -1,4 +1,4 @@
-"""Lens models against OpenCV's projections: the footprint contains everything in a picture."""
+"""Footprints of lens models compared with projections of OpenCV: a footprint contains everything in the picture."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ def projected(model: str, rays: np.ndarray, focal: float, centre: tuple[float, f
     matrix = np.array([[focal, 0, centre[0]], [0, focal, centre[1]], [0, 0, 1]])
     still = np.zeros(3)
     if model == "equidistant":
-        found, _ = cv2.fisheye.projectPoints(rays.reshape(-1, 1, 3), still, still, matrix, np.zeros(4))
+        pixels, _ = cv2.fisheye.projectPoints(rays.reshape(-1, 1, 3), still, still, matrix, np.zeros(4))
     else:
-        found, _ = cv2.projectPoints(rays.reshape(-1, 1, 3), still, still, matrix, np.array(k))
-    return found.reshape(-1, 2)
+        pixels, _ = cv2.projectPoints(rays.reshape(-1, 1, 3), still, still, matrix, np.array(k))
+    return pixels.reshape(-1, 2)
 
 
-def described(model: str, half: float, height: int, k: tuple[float, ...], *, told: bool) -> CameraFeatures:
+def described(model: str, half: float, height: int, k: tuple[float, ...], *, has_lens: bool) -> CameraFeatures:
     lens: dict[str, Any] = {"model": model}
     if model == "brownConrady":
         lens |= dict(zip(("k1", "k2", "p1", "p2", "k3"), k, strict=True))
@@ -50,23 +50,23 @@ def described(model: str, half: float, height: int, k: tuple[float, ...], *, tol
             "resolution": f"{_WIDTH}x{height}",
             "horizontalFieldOfView": math.degrees(2 * half),
             "mount": {"pitch": -90},
-            **({"lens": lens} if told else {}),
+            **({"lens": lens} if has_lens else {}),
         }
     )
 
 
 def folds_at(k: tuple[float, ...], reach: float) -> float:
-    """Return the tangent at which the model of a lens turns back, which no real lens does."""
+    """Return the tangent beyond which the model of a lens folds back, unlike a real lens."""
     r = np.linspace(0, reach, 20_000)
     shown = r * (1 + k[0] * r**2 + k[1] * r**4 + k[4] * r**6)
-    back = np.flatnonzero(np.diff(shown) <= 0)
-    return float(r[back[0]]) if back.size else math.inf
+    falling = np.flatnonzero(np.diff(shown) <= 0)
+    return float(r[falling[0]]) if falling.size else math.inf
 
 
 @_cases
 @given(
     model=st.sampled_from(MODELS),
-    told=st.booleans(),
+    has_lens=st.booleans(),
     half_deg=st.floats(5, 75),
     height=st.sampled_from([360, 480, 640, 853]),
     k=st.tuples(st.floats(-0.35, 0.2), st.floats(-0.05, 0.15), *[st.floats(-0.003, 0.003)] * 2, st.floats(-0.02, 0.02)),
@@ -76,7 +76,7 @@ def folds_at(k: tuple[float, ...], reach: float) -> float:
 )
 def test_bounding_lens_covers_every_zone_a_picture_shows(
     model: str,
-    told: bool,
+    has_lens: bool,
     half_deg: float,
     height: int,
     k: tuple[float, ...],
@@ -91,14 +91,14 @@ def test_bounding_lens_covers_every_zone_a_picture_shows(
     else:
         fold = folds_at(k, 200.0)
         assume(fold > math.tan(half) * 1.3)
-        # The bound does not cover what the description omits: a lens without description has little decentring.
-        k = k if told else (*k[:2], 0.0, 0.0, k[4])
+        # The bound for a camera without lens description assumes little decentring.
+        k = k if has_lens else (*k[:2], 0.0, 0.0, k[4])
     # Focal length at which the sides of the picture are at that angle.
     side = projected(model, np.array([[math.tan(half), 0.0, 1.0]]), 1.0, (0.0, 0.0), k)[0][0]
     assume(side > 0.01)
     focal = _WIDTH / 2 / side
     centre = (_WIDTH / 2, height / 2)
-    lens = bounding_lens(described(model, half, height, k, told=told))
+    lens = bounding_lens(described(model, half, height, k, has_lens=has_lens))
     assert lens is not None
     exact = Lens(lens.horizontal_deg, lens.vertical_deg, error_deg=0.0)
     now = at(0, 0, alt=alt, lens=exact, attitude=Attitude(*turn, 0, 0), position_error_m=0.0, altitude_error_m=0.0)
@@ -114,18 +114,18 @@ def test_bounding_lens_covers_every_zone_a_picture_shows(
     turned = rotation(2, turn[2]) @ rotation(1, turn[1]) @ rotation(0, turn[0]) @ rotation(1, -90)
     ahead, right, down = (world @ turned).T
     rays = np.stack([right, down, ahead], axis=1)
-    seen = ahead > 1e-6
+    visible = ahead > 1e-6
     if model == "brownConrady":
-        seen &= np.hypot(right, down) < fold * np.abs(ahead)
-    u, v = projected(model, np.where(seen[:, None], rays, [0.0, 0.0, 1.0]), focal, centre, k).T
-    seen &= (u >= 0) & (u <= _WIDTH) & (v >= 0) & (v <= height)
-    if not told and model == "brownConrady":
-        # At its corners, a lens without description shows no more than an orthographic fisheye.
+        visible &= np.hypot(right, down) < fold * np.abs(ahead)
+    u, v = projected(model, np.where(visible[:, None], rays, [0.0, 0.0, 1.0]), focal, centre, k).T
+    visible &= (u >= 0) & (u <= _WIDTH) & (v >= 0) & (v <= height)
+    if not has_lens and model == "brownConrady":
+        # The bound for a camera without lens description assumes at most an orthographic fisheye at the corners.
         angle = np.arctan2(np.hypot(right, down), ahead)
         across = np.hypot(u - centre[0], v - centre[1]) / (_WIDTH / 2)
-        seen &= np.sin(np.minimum(angle, math.pi / 2)) <= np.maximum(across, 1.0) * math.sin(half) + 1e-9
-        seen &= angle < math.pi / 2
-    for x, y in zip(east[seen], north[seen], strict=True):
+        visible &= np.sin(np.minimum(angle, math.pi / 2)) <= np.maximum(across, 1.0) * math.sin(half) + 1e-9
+        visible &= angle < math.pi / 2
+    for x, y in zip(east[visible], north[visible], strict=True):
         zone = shapely.Point(x, y).buffer(0.01 * alt)
         assert shown.shows(zone), f"a zone at {x:.1f} {y:.1f} is in the picture"
 
@@ -141,7 +141,9 @@ def test_bounding_lens_excludes_ground_outside_the_picture() -> None:
     assert half_views("pinhole", 62.2) == pytest.approx((31.1, 24.34), abs=0.01)
     assert half_views("brownConrady", 62.2) == pytest.approx((31.1, 24.34), abs=0.1)
     assert half_views("equidistant", 62.2) == pytest.approx((32.82, 25.81), abs=0.05)
-    assert half_views(None, 62.2) == pytest.approx((34.06, 31.1), abs=0.05), "taller than any of them"
+    assert half_views(None, 62.2) == pytest.approx((34.06, 31.1), abs=0.05), (
+        "the picture is taller than that of any known sensor"
+    )
     wide = half_views("brownConrady", 100, k1=-0.3, k2=0.1)
     assert max(wide) < 75
 

@@ -19,7 +19,7 @@ def test_monitor_returns_none_when_nothing_is_wrong() -> None:
     grant = compiled(exclusion(WALL), altitude(upperLimit=30), speed(upperLimit=10))
     assert monitor(at(), grant) is None
     assert monitor(at(0, 20, north_mps=5), grant) is None
-    assert monitor(at(0, 60, in_air=False), grant) is None, "on the ground nothing moves"
+    assert monitor(at(0, 60, in_air=False), grant) is None, "the monitor ignores a drone on the ground"
 
 
 def test_monitor_stops_drone_while_it_can_still_brake() -> None:
@@ -29,7 +29,7 @@ def test_monitor_stops_drone_while_it_can_still_brake() -> None:
         if verdict is not None:
             assert (verdict.action, verdict.takeover, verdict.code) == ("deny", "hover", "ExclusionZoneAhead")
             stop = 8 * (0.3 + 0.25) + 1.25 + 64 / 5
-            assert 50 - stop - 3 < y < 50 - stop + 1, "neither too early nor too late"
+            assert 50 - stop - 3 < y < 50 - stop + 1, "the drone stops neither too early nor too late"
             return
     raise AssertionError("it never braked")
 
@@ -63,7 +63,7 @@ def test_monitor_respects_altitude_bands_and_validity_windows() -> None:
     assert monitor(at(0, 70, 40), compiled(exclusion(WALL, "land", upper=20))) is None
     falling = at(0, 70, 26, down_mps=4)
     verdict = monitor(falling, compiled(exclusion(WALL, "land", upper=20)))
-    assert verdict is not None, "it sinks into the zone"
+    assert verdict is not None, "the drone sinks into the zone"
     future = compiled(exclusion(WALL, "land", validFrom="2026-06-01T12:00:10Z"))
     assert monitor(at(0, 70), future) is None
     assert monitor(replace(at(0, 70), time_s=NOW + 11), future) is not None
@@ -74,18 +74,18 @@ def test_monitor_stops_drone_leaving_operation_area_or_inclusion_zone() -> None:
     assert leaving is not None
     assert (leaving.action, leaving.code) == ("deny", "OperationAreaBorderAhead")
     assert monitor(at(0, 190, north_mps=-6), compiled()) is None
-    kept = compiled(inclusion(box(-50, -50, 50, 50), "returnToLaunch"))
-    verdict = monitor(at(0, 45, north_mps=6), kept)
+    inclusion_grant = compiled(inclusion(box(-50, -50, 50, 50), "returnToLaunch"))
+    verdict = monitor(at(0, 45, north_mps=6), inclusion_grant)
     assert verdict is not None
     assert (verdict.code, verdict.takeover) == ("InclusionBorderAhead", "returnToLaunch")
 
 
 def test_monitor_stops_system_flight_only_when_it_makes_things_worse() -> None:
-    kept = compiled(inclusion(box(-50, -50, 50, 50), "land"))
+    inclusion_grant = compiled(inclusion(box(-50, -50, 50, 50), "land"))
     out = compiled(exclusion(WALL, "revoke"))
     for state, grant, code in (
-        (at(0, 45, north_mps=6), kept, "InclusionBorderAhead"),
-        (at(0, 60, north_mps=6), kept, "OutsideInclusionZone"),
+        (at(0, 45, north_mps=6), inclusion_grant, "InclusionBorderAhead"),
+        (at(0, 60, north_mps=6), inclusion_grant, "OutsideInclusionZone"),
         (at(0, 40, north_mps=6), out, "ExclusionZoneAhead"),
         (at(0, 55, north_mps=6), out, "InsideExclusionZone"),
         (replace(at(), lat=None), out, "PositionUnknown"),
@@ -93,7 +93,11 @@ def test_monitor_stops_system_flight_only_when_it_makes_things_worse() -> None:
         verdict = monitor(state, grant, system_flies=True)
         assert verdict is not None
         assert (verdict.action, verdict.code) == ("takeover", code)
-    for state, grant in ((at(0, 60), kept), (at(0, 60, north_mps=-6), kept), (at(0, 55, north_mps=-6), out)):
+    for state, grant in (
+        (at(0, 60), inclusion_grant),
+        (at(0, 60, north_mps=-6), inclusion_grant),
+        (at(0, 55, north_mps=-6), out),
+    ):
         assert monitor(state, grant, system_flies=True) is None, "it leads back"
         assert monitor(state, grant) is not None
 
@@ -111,13 +115,13 @@ def test_monitor_detects_zone_ahead_while_leaving_another() -> None:
 @pytest.mark.parametrize("forward_mps2", [None, 0.0, -2.5])
 def test_drone_flying_into_zone_brakes_before_a_new_command(forward_mps2: float | None) -> None:
     grant = compiled(exclusion(WALL))
-    back = goto(0, 0)
+    toward_home = goto(0, 0)
     heading = replace(at(0, 29, north_mps=7.5), forward_mps2=forward_mps2)
-    verdict = judge(back, heading, grant)
+    verdict = judge(toward_home, heading, grant)
     assert (verdict.permits, verdict.brake_first) == (True, True)
-    assert judge(back, at(0, 29), grant).brake_first is False
-    assert judge(back, at(0, 29, north_mps=-7.5), grant).brake_first is False
-    assert judge(back, at(0, 10, north_mps=7.5), grant).brake_first is False
+    assert judge(toward_home, at(0, 29), grant).brake_first is False
+    assert judge(toward_home, at(0, 29, north_mps=-7.5), grant).brake_first is False
+    assert judge(toward_home, at(0, 10, north_mps=7.5), grant).brake_first is False
 
 
 def test_monitor_corrects_altitude_and_speed() -> None:
@@ -126,7 +130,7 @@ def test_monitor_corrects_altitude_and_speed() -> None:
     assert high is not None
     assert isinstance(high.args, GotoArgs)
     assert (high.action, high.args.alt, high.policies) == ("correct", 15, ("altitudes",))
-    assert monitor(at(alt=15.5), grant) is None, "a climb that ends there"
+    assert monitor(at(alt=15.5), grant) is None, "the climb may end at the limit"
     fast = monitor(at(north_mps=9), grant)
     assert fast is not None
     assert fast.args == SetSpeedArgs(5)
@@ -175,7 +179,7 @@ def test_monitor_ignores_lower_limits_while_landing() -> None:
     assert isinstance(low.args, GotoArgs)
     assert (low.action, low.code, low.args.alt) == ("correct", "AltitudeBelowLimit", 8)
     assert monitor(at(alt=4, vertical=True), grant) is None
-    assert monitor(at(alt=7), grant) is None, "within what the autopilot strays"
+    assert monitor(at(alt=7), grant) is None, "the deviation is within the tolerance of the autopilot"
 
 
 def test_monitor_correction_never_leads_into_zone() -> None:
@@ -188,7 +192,9 @@ def test_monitor_correction_never_leads_into_zone() -> None:
 def test_monitor_handles_zone_appearing_around_drone() -> None:
     for action, want in (("ignore", None), ("hover", "hover"), ("land", "land"), ("revoke", "revoke")):
         verdict = monitor(at(0, 70, north_mps=-4), compiled(exclusion(WALL, action)))
-        assert (verdict.takeover if verdict else None) == want, "it leaves without a command if the policy permits"
+        assert (verdict.takeover if verdict else None) == want, (
+            "the drone leaves the zone without a command if the policy permits"
+        )
     deeper = monitor(at(0, 60, north_mps=6), compiled(exclusion(WALL, "adjust")))
     assert deeper is not None
     assert (deeper.action, deeper.takeover) == ("deny", "hover")
@@ -203,7 +209,7 @@ def test_monitor_permits_climb_to_allowed_altitude_despite_link_latency() -> Non
     assert correction(monitor(climbing, grant)) == "AltitudeAboveLimit"
     past = at(0, 0, 17.5, down_mps=-2.6, latency_s=0.77)
     assert correction(monitor(past, grant, current_leg=leg)) == "AltitudeAboveLimit", (
-        "it does not brake for the leg's end"
+        "the drone may not brake at the end of the leg"
     )
     higher = goto(100, 0, 12.0).args
     assert isinstance(higher, GotoArgs)
@@ -212,7 +218,7 @@ def test_monitor_permits_climb_to_allowed_altitude_despite_link_latency() -> Non
 
 
 def test_monitor_stops_leg_crossing_new_zone_at_once() -> None:
-    """The stop is not delayed to the last possible moment, because the link may be cut by then."""
+    """The monitor does not wait until the last possible moment, because the link may fail before."""
     leg = goto(180, 0, 12.0).args
     climbing = goto(180, 0, 30.0).args
     short = goto(60, 0, 12.0).args
@@ -220,12 +226,12 @@ def test_monitor_stops_leg_crossing_new_zone_at_once() -> None:
     assert isinstance(climbing, GotoArgs)
     assert isinstance(short, GotoArgs)
     flying = at(0, 0, 12.0, east_mps=5.0)
-    for action, wanted in (("ignore", ("deny", "hover")), ("returnToLaunch", ("takeover", "returnToLaunch"))):
+    for action, expected in (("ignore", ("deny", "hover")), ("returnToLaunch", ("takeover", "returnToLaunch"))):
         ahead = compiled(exclusion(box(100, -20, 140, 20), action))
         verdict = monitor(flying, ahead, current_leg=leg, fences_changed=True)
         assert verdict is not None
-        assert (verdict.action, verdict.takeover) == wanted
-    assert monitor(flying, ahead, current_leg=short, fences_changed=True) is None, "it ends before the zone"
+        assert (verdict.action, verdict.takeover) == expected
+    assert monitor(flying, ahead, current_leg=short, fences_changed=True) is None, "the leg ends before the zone"
     above = compiled(exclusion(box(100, -20, 140, 20), lower=20))
     assert monitor(flying, above, current_leg=leg, fences_changed=True) is None, "it passes below"
     assert monitor(flying, above, current_leg=climbing, fences_changed=True) is not None
@@ -271,10 +277,10 @@ def test_monitor_stops_drone_below_and_above_altitude_band(
             assert (verdict.action, verdict.takeover) == ("takeover" if action == "hover" else "deny", "hover")
             stopped.append(height)
     stop_m = 2 * (0.3 + 0.1) + 0.5 + 2.0
-    assert stop_m < (15 - stopped[0]) * up < stop_m + 1.5, "neither too early nor too late"
-    assert len(stopped) > 100, "also after it has entered"
+    assert stop_m < (15 - stopped[0]) * up < stop_m + 1.5, "the drone stops neither too early nor too late"
+    assert len(stopped) > 100, "the monitor also stops a drone that has entered the zone"
     away = at(0, 0, 15 + up, down_mps=climb_mps)
-    assert (monitor(away, grant) is None) is (action == "ignore"), "it may turn back"
+    assert (monitor(away, grant) is None) is (action == "ignore"), "the drone may turn back"
     assert monitor(at(0, 0, 15 - 3 * up), grant) is None
     assert monitor(at(60 * up, 0, 12, down_mps=-climb_mps), compiled(exclusion(AROUND, lower=15))) is None
 
@@ -310,8 +316,8 @@ def test_monitor_ends_unjudged_climb_at_half_the_tolerance() -> None:
     grant = compiled(altitude(upperLimit=10))
     climbing = at(0, 0, 10.8, down_mps=-0.7)
     assert correction(monitor(climbing, grant, system_flies=True)) == "AltitudeAboveLimit"
-    assert monitor(climbing, grant) is None, "the driver's, which was judged"
+    assert monitor(climbing, grant) is None, "the climb of the driver was judged before"
     leg = goto(0, 50, 10.0).args
     assert isinstance(leg, GotoArgs)
-    assert monitor(climbing, grant, system_flies=True, current_leg=leg) is None, "the system's own leg"
-    assert monitor(at(0, 0, 11.4, down_mps=-0.1), grant, system_flies=True) is None, "it holds its height"
+    assert monitor(climbing, grant, system_flies=True, current_leg=leg) is None, "the system flies the leg itself"
+    assert monitor(at(0, 0, 11.4, down_mps=-0.1), grant, system_flies=True) is None, "the drone holds its height"

@@ -1,4 +1,4 @@
-"""Setpoints in quick succession: pending setpoints count whenever each of them is received."""
+"""Setpoints in quick succession are judged for all possible times at which pending setpoints arrive."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ STEP_S = 0.02
 BRAKES = -2.5
 
 
-def flown(rng: random.Random, now: Situation, pending: list[Velocity], asked: VelocityArgs) -> list[Velocity]:
+def flown(rng: random.Random, now: Situation, pending: list[Velocity], requested: VelocityArgs) -> list[Velocity]:
     """Return possible positions of a drone that receives setpoints in order, within the latency, and then stops."""
-    moments = sorted(rng.choice([0.0, rng.uniform(0, now.latency_s), now.latency_s]) for _ in (*pending, asked))
-    wanted = [
+    moments = sorted(rng.choice([0.0, rng.uniform(0, now.latency_s), now.latency_s]) for _ in (*pending, requested))
+    velocities = [
         (0.0, 0.0) if now.forward_mps2 == BRAKES else (now.east_mps, now.north_mps),
         *((e, n) for n, e in pending),
-        (asked.east_mps, asked.north_mps),
+        (requested.east_mps, requested.north_mps),
         (0.0, 0.0),
     ]
-    moments.append(rng.choice([asked.hold_s, asked.hold_s + now.latency_s]))
+    moments.append(rng.choice([requested.hold_s, requested.hold_s + now.latency_s]))
     x = 0.0
     y = 0.0
     vx = now.east_mps
@@ -34,7 +34,7 @@ def flown(rng: random.Random, now: Situation, pending: list[Velocity], asked: Ve
     time_s = 0.0
     places = []
     while time_s < moments[-1] or math.hypot(vx, vy) > 0.05:
-        tx, ty = wanted[sum(moment <= time_s for moment in moments)]
+        tx, ty = velocities[sum(moment <= time_s for moment in moments)]
         change = math.hypot(tx - vx, ty - vy)
         share = min(now.airframe.accel_mps2 * STEP_S / change, 1.0) if change else 0.0
         vx = vx + (tx - vx) * share
@@ -65,13 +65,15 @@ def test_velocity_leg_contains_the_flown_path_with_pending_setpoints(seed: int) 
             forward_mps2=rng.choice([None, 0.0, BRAKES]), pending=tuple((n, e, 0.0) for n, e in pending),
         )  # fmt: skip
         n, e = direction(rng, 12.0)
-        asked = VelocityArgs(n, e, hold_s=rng.choice([0.3, 0.5, 1.0]))
-        places = shapely.points(flown(rng, now, pending, asked))
-        holds = velocity_leg(now, (0.0, 0.0), asked).ground
+        requested = VelocityArgs(n, e, hold_s=rng.choice([0.3, 0.5, 1.0]))
+        places = shapely.points(flown(rng, now, pending, requested))
+        holds = velocity_leg(now, (0.0, 0.0), requested).ground
         furthest_m = max(furthest_m, float(shapely.distance(holds, places).max()))
         blind = Situation(**{f: getattr(now, f) for f in Situation.__slots__ if f != "pending"})
-        missed_m = max(missed_m, float(shapely.distance(velocity_leg(blind, (0.0, 0.0), asked).ground, places).max()))
-    assert furthest_m < now.airframe.tracking_m, "legs keep that much more"
+        missed_m = max(
+            missed_m, float(shapely.distance(velocity_leg(blind, (0.0, 0.0), requested).ground, places).max())
+        )
+    assert furthest_m < now.airframe.tracking_m, "legs keep a larger margin than this deviation"
     assert missed_m > 2.0, "the pending setpoint makes the difference"
 
 

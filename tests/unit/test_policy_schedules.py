@@ -19,8 +19,8 @@ def scheduled(name: str, area: dict[str, Any], schedule: list[dict[str, Any]]) -
 
 def test_exclusion_zone_applies_only_while_active() -> None:
     def verdict(schedule: list[dict[str, Any]]) -> str:
-        found = policy("no-fly", "GeofenceControl", "exclusion", [scheduled("z", box(20, -9, 40, 9), schedule)])
-        return ask(compiled(found), goto(30, 0)).action
+        verdicts = policy("no-fly", "GeofenceControl", "exclusion", [scheduled("z", box(20, -9, 40, 9), schedule)])
+        return ask(compiled(verdicts), goto(30, 0)).action
 
     assert verdict([]) != "allow"
     assert verdict(ON) != "allow"
@@ -30,8 +30,8 @@ def test_exclusion_zone_applies_only_while_active() -> None:
 
 def test_inactive_inclusion_zone_permits_nothing() -> None:
     def verdict(schedule: list[dict[str, Any]]) -> str:
-        found = policy("keep-in", "GeofenceControl", "inclusion", [scheduled("z", box(-90, -90, 90, 90), schedule)])
-        return ask(compiled(found), goto(10, 0)).action
+        verdicts = policy("keep-in", "GeofenceControl", "inclusion", [scheduled("z", box(-90, -90, 90, 90), schedule)])
+        return ask(compiled(verdicts), goto(10, 0)).action
 
     assert verdict(ON) == "allow"
     assert verdict(OFF) != "allow"
@@ -39,8 +39,10 @@ def test_inactive_inclusion_zone_permits_nothing() -> None:
 
 def test_method_is_granted_in_zone_only_while_active() -> None:
     def code(schedule: list[dict[str, Any]]) -> str | None:
-        here = policy("h", "AccessControl", "grant", [scheduled("z", box(-9, -9, 9, 9), schedule)], methods=["Hover"])
-        return ask(compiled(here), Call("Hover"), at(0, 0)).code
+        position = policy(
+            "h", "AccessControl", "grant", [scheduled("z", box(-9, -9, 9, 9), schedule)], methods=["Hover"]
+        )
+        return ask(compiled(position), Call("Hover"), at(0, 0)).code
 
     assert code(ON) != "MethodNotGrantedHere"
     assert code(OFF) == "MethodNotGrantedHere"

@@ -68,14 +68,14 @@ def test_drone_inside_thin_zone_may_leave_it() -> None:
 def test_leg_across_gap_is_allowed_only_when_the_drone_cannot_stop_before_it(
     gap: float, speed: float, away: float, latency: float, forward: float | None
 ) -> None:
-    here = box(-60, -60, 60, away)
-    there = box(-60, away + gap, 60, 200)
+    start = box(-60, -60, 60, away)
+    end = box(-60, away + gap, 60, 200)
     now: Situation = at(
         0, 0, north_mps=speed, latency_s=latency, forward_mps2=forward, airframe=RETRACES, speed_setpoint_mps=max(speed, 5.0)
     )  # fmt: skip
     grants = (
-        compiled(policy("in", "GeofenceControl", "inclusion", [zone("a", here), zone("b", there)]), operationArea=[]),
-        compiled(operationArea=[here, there]),
+        compiled(policy("in", "GeofenceControl", "inclusion", [zone("a", start), zone("b", end)]), operationArea=[]),
+        compiled(operationArea=[start, end]),
     )
     for grant in grants:
         verdict = judge(goto(0, away + gap + 40.0), now, grant)

@@ -35,9 +35,9 @@ def test_implausible_state_denies_motion_and_stops_drone(odd: dict[str, Any]) ->
     assert ask(grant, Call("Hover"), now).action == "allow"
     assert ask(grant, Call("ReturnToLaunch"), now).action == "allow"
     assert ask(grant, CAPTURE, now).action == "deny"
-    found = monitor(now, grant)
-    assert found is not None
-    assert (found.action, found.takeover) == ("takeover", "hover")
+    verdict = monitor(now, grant)
+    assert verdict is not None
+    assert (verdict.action, verdict.takeover) == ("takeover", "hover")
 
 
 def test_judge_raises_when_time_is_not_a_number() -> None:
@@ -89,13 +89,13 @@ def test_inclusion_zone_must_be_active_at_both_readings_of_uncertain_time() -> N
 
 
 @pytest.mark.parametrize(
-    ("x", "height_m", "seen"),
+    ("x", "height_m", "shown"),
     [(0, 20, True), (0, 35, True), (23, 20, True), (45, 20, True), (53, 20, False), (80, 70, True)],
 )
-def test_privacy_is_judged_by_camera_footprint(x: float, height_m: float, seen: bool) -> None:
+def test_privacy_is_judged_by_camera_footprint(x: float, height_m: float, shown: bool) -> None:
     private = policy("p", "PrivacyControl", "camera", [zone("z", box(-20, -20, 20, 20), upper=30)], action="refuse")
     verdict = ask(compiled(private), CAPTURE, at(x, 0, alt=height_m))
-    assert verdict.code == ("PrivacyZone" if seen else "")
+    assert verdict.code == ("PrivacyZone" if shown else "")
 
 
 def test_camera_denial_is_judged_by_camera_footprint() -> None:

@@ -21,10 +21,10 @@ POD = {
 
 
 def test_mobility_endpoint_is_that_of_the_node() -> None:
-    found = endpoint("mobility", POD)
-    assert found.address == "10.200.0.11:50051"
-    assert found.server_name == "drone-1.node.fractus.dev"
-    assert str(found.tls_dir) == "/tls"
+    clients = endpoint("mobility", POD)
+    assert clients.address == "10.200.0.11:50051"
+    assert clients.server_name == "drone-1.node.fractus.dev"
+    assert str(clients.tls_dir) == "/tls"
 
 
 def test_camera_endpoint_uses_host_ip_unless_address_is_set() -> None:
@@ -95,5 +95,5 @@ def test_invalid_control_points_are_refused(text: str) -> None:
 @pytest.mark.parametrize("component", ["ImageChecker", "Viewer2D", "data-store", "A"])
 def test_egress_variable_names_match_the_operator(component: str) -> None:
     assert egress(component, {address_variable(component): "a:1"}) == "a:1"
-    found = endpoint("mobility", {"FRACTUS_NODE": "drone-1", "FRACTUS_HOST_IP": "10.0.0.1"})
-    assert found.server_name == node_server_name("drone-1")
+    clients = endpoint("mobility", {"FRACTUS_NODE": "drone-1", "FRACTUS_HOST_IP": "10.0.0.1"})
+    assert clients.server_name == node_server_name("drone-1")

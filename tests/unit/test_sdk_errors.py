@@ -39,7 +39,7 @@ async def test_busy_error_contains_retry_delay(again_s: float) -> None:
     assert isinstance(found, Busy)
     assert str(found) == "GetSpeed: more than 50 calls per second; slow down"
     assert found.retry_after_s == (again_s or None)
-    assert bool(found.remedy) == bool(again_s), "where waiting does not help, the message says what does"
+    assert bool(found.remedy) == bool(again_s), "if waiting does not help, the message names another remedy"
 
 
 async def test_policy_denied_contains_decision() -> None:

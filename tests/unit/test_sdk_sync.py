@@ -16,11 +16,11 @@ PAIRS = [
 ]
 
 
-@pytest.mark.parametrize(("theirs", "ours"), PAIRS, ids=lambda kind: kind.__name__)
-def test_sync_clients_have_every_asynchronous_method(theirs: type, ours: type) -> None:
-    for name, method in inspect.getmembers(theirs, inspect.isfunction):
+@pytest.mark.parametrize(("asynchronous", "synchronous"), PAIRS, ids=lambda kind: kind.__name__)
+def test_sync_clients_have_every_asynchronous_method(asynchronous: type, synchronous: type) -> None:
+    for name, method in inspect.getmembers(asynchronous, inspect.isfunction):
         if not name.startswith("_"):
-            waiting = getattr(ours, name)
+            waiting = getattr(synchronous, name)
             assert not inspect.iscoroutinefunction(waiting)
             assert waiting.__doc__
             assert inspect.signature(waiting).parameters.keys() == inspect.signature(method).parameters.keys()

@@ -1,4 +1,4 @@
-"""Each acknowledgement answers the oldest sending that it can be of, and no later command."""
+"""Assignment of acknowledgements: each belongs to the oldest possible transmission, and to no later command."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ def ack(result: int = ACCEPTED, command: int = SPEED, target: int = 245) -> Mess
     return message("COMMAND_ACK", command=command, result=result, target_system=target)
 
 
-def link(way_s: float = 1.0) -> Acknowledgements:
-    """Over a link whose answers take so long, and go on coming."""
-    return Acknowledgements(245, measured(way_s))
+def link(delay_s: float = 1.0) -> Acknowledgements:
+    """Return acknowledgements for a link with a measured delay and regular responses."""
+    return Acknowledgements(245, measured(delay_s))
 
 
-class Heard(Timing):
-    """Of a link on which the last answer came so long ago."""
+class SilentTiming(Timing):
+    """Timing of a link with a given time since the last response."""
 
     def __init__(self, silence: Callable[[float], float]) -> None:
         super().__init__()
@@ -44,22 +44,22 @@ class Heard(Timing):
         return self._silence(now)
 
 
-def measured(way_s: float, silence: Callable[[float], float] = lambda _now: 0.2) -> Timing:
-    timing = Heard(silence) if math.isfinite(way_s) else Timing()
-    if math.isfinite(way_s):
+def measured(delay_s: float, silence: Callable[[float], float] = lambda _now: 0.2) -> Timing:
+    timing = SilentTiming(silence) if math.isfinite(delay_s) else Timing()
+    if math.isfinite(delay_s):
         timing.take_position(1000, 0.0)
         number = timing.request(0.0)
         assert number is not None
-        timing.take_reply(1_000_000_000, number, way_s)
+        timing.take_reply(1_000_000_000, number, delay_s)
     return timing
 
 
 @pytest.mark.parametrize(
-    ("way_s", "timeout_s"),
+    ("delay_s", "timeout_s"),
     [(0.02, ACK_TIMEOUT_S), (0.5, 0.7), (1.0, 1.2), (2.0, 2.2), (2.9, MAX_ACK_TIMEOUT_S), (math.inf, ACK_TIMEOUT_S)],
 )
-def test_transmission_is_lost_after_the_longest_measured_delay(way_s: float, timeout_s: float) -> None:
-    assert link(way_s).timeout_s == pytest.approx(timeout_s)
+def test_transmission_is_lost_after_the_longest_measured_delay(delay_s: float, timeout_s: float) -> None:
+    assert link(delay_s).timeout_s == pytest.approx(timeout_s)
 
 
 async def test_second_acknowledgement_of_a_repeated_command_does_not_deny_the_next_one() -> None:
@@ -90,18 +90,18 @@ async def test_earlier_acceptance_does_not_accept_a_denied_command() -> None:
     assert later.result() == DENIED
 
 
-@pytest.mark.parametrize("way_s", [0.05, 0.5, 1.0, 2.0])
-async def test_lost_transmission_does_not_consume_the_next_acknowledgement(way_s: float) -> None:
-    acks = link(way_s)
+@pytest.mark.parametrize("delay_s", [0.05, 0.5, 1.0, 2.0])
+async def test_lost_transmission_does_not_consume_the_next_acknowledgement(delay_s: float) -> None:
+    acks = link(delay_s)
     first = Answer()
     later = Answer()
-    again = acks.timeout_s
+    second_s = acks.timeout_s
     acks.add_transmission(SPEED, first, 0.0)
-    acks.add_transmission(SPEED, first, again)
-    acks.take(ack(), again + way_s)
+    acks.add_transmission(SPEED, first, second_s)
+    acks.take(ack(), second_s + delay_s)
     assert first.result() == ACCEPTED
-    acks.add_transmission(SPEED, later, again + way_s)
-    acks.take(ack(DENIED), again + 2 * way_s)
+    acks.add_transmission(SPEED, later, second_s + delay_s)
+    acks.take(ack(DENIED), second_s + 2 * delay_s)
     assert later.result() == DENIED
 
 
@@ -185,17 +185,17 @@ async def test_duplicate_frame_is_ignored() -> None:
     first = Answer()
     later = Answer()
 
-    def heard(result: int) -> Message:
+    def frame(result: int) -> Message:
         (incoming,) = parser.feed(autopilot.encode("COMMAND_ACK", ack(result).values))
         return incoming
 
     acks.add_transmission(SPEED, first, 0.0)
-    denied = heard(DENIED)
+    denied = frame(DENIED)
     acks.take(denied, 0.05)
     acks.add_transmission(SPEED, later, 0.06)
     acks.take(denied, 0.07)
     assert not later.done()
-    acks.take(heard(DENIED), 0.11)
+    acks.take(frame(DENIED), 0.11)
     assert later.result() == DENIED
 
 

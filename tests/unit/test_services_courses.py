@@ -29,9 +29,9 @@ async def test_first_leg_skips_waypoint_near_drone_only_at_its_altitude(
     monkeypatch.setattr(route_following, "route_steps", route)
     grant = compiled(operationArea=[])
     trip = route_following.SystemFlight(FlightConstraints(ActiveGrant("", "", spec(), grant), grant), "Transit", unused)
-    found = await route_following.first_leg(grant.frame.latlon(100.0, 50.0), (30.0,), at(0, 0, alt=altitude_m), trip)
-    assert found is not None
-    leg, last, _ = found
+    result = await route_following.first_leg(grant.frame.latlon(100.0, 50.0), (30.0,), at(0, 0, alt=altitude_m), trip)
+    assert result is not None
+    leg, last, _ = result
     assert grant.frame.xy(leg.lat, leg.lon) == pytest.approx(waypoint, abs=0.01)
     assert leg.alt == 30.0
     assert last == (altitude_m == 30.0)

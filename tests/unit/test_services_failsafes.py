@@ -1,11 +1,8 @@
-"""What must hold in the autopilot before anything may arm."""
+"""Failsafe parameters that are set and verified before arming."""
 
 from __future__ import annotations
 
-import asyncio
 import math
-from collections.abc import Coroutine
-from typing import Any, TypeVar
 
 import pytest
 from fractus_core.policy.decision_types import Airframe
@@ -14,7 +11,7 @@ from fractus_services.mobility.autopilot import FailsafeStatus
 from fractus_services.mobility.mavlink.companion import SYSTEM_ID
 from fractus_services.mobility.mavlink.failsafes import MavlinkFailsafes
 from parameter_vehicle import MOVEMENT, ParameterVehicle
-from virtual_time import Loop
+from virtual_time import run
 
 SOUND = {
     "FS_GCS_ENABLE": 1.0, "FS_GCS_TIMEOUT": 5.0, "BATT_FS_LOW_ACT": 2.0, "BATT_FS_CRT_ACT": 1.0, "FS_EKF_ACTION": 1.0,
@@ -23,19 +20,10 @@ SOUND = {
 
 
 class Parameters(ParameterVehicle):
-    """An autopilot that only has parameters; those in `fixed` cannot be set."""
+    """Fake autopilot that has only parameters. Parameters in `fixed` cannot be set."""
 
     def __init__(self, values: dict[str, float], fixed: tuple[str, ...] = ()) -> None:
         super().__init__(MOVEMENT | SOUND | values, fixed)
-
-
-T = TypeVar("T")
-
-
-def run(work: Coroutine[Any, Any, T]) -> T:
-    """The outcome of work in a loop whose time jumps."""
-    with asyncio.Runner(loop_factory=Loop) as runner:
-        return runner.run(work)
 
 
 def configured(parameters: Parameters, *, flying: bool = False) -> FailsafeStatus:
@@ -139,8 +127,8 @@ def test_failsafe_uses_rtl_if_armed_away_from_home_and_smart_rtl_at_home() -> No
         away = await MavlinkFailsafes(vehicle).choose_return(checked, retrace=False)
         assert not away.airframe.retraces
         assert vehicle.values["FS_GCS_ENABLE"] == 1.0
-        again = await MavlinkFailsafes(vehicle).choose_return(away, retrace=True)
-        assert again.airframe.retraces
+        rechecked = await MavlinkFailsafes(vehicle).choose_return(away, retrace=True)
+        assert rechecked.airframe.retraces
         assert vehicle.values["FS_GCS_ENABLE"] == 3.0
 
     run(chosen())
@@ -221,17 +209,17 @@ def test_fence_ceiling_set_later_limits_return_altitude() -> None:
 FENCED = {"FENCE_ENABLE": 1.0, "FENCE_TYPE": 5.0, "FENCE_ALT_MAX": 65.0}
 
 
-@pytest.mark.parametrize("lost", ["RTL_ALT", "FENCE_ENABLE"])
-def test_lost_return_altitude_parameter_keeps_value_and_prevents_arming(lost: str) -> None:
+@pytest.mark.parametrize("removed_parameter", ["RTL_ALT", "FENCE_ENABLE"])
+def test_lost_return_altitude_parameter_keeps_value_and_prevents_arming(removed_parameter: str) -> None:
     async def learnt() -> None:
         vehicle = Parameters(RETRACING | FENCED | {"RTL_ALT": 6000.0})
         checked = await MavlinkFailsafes(vehicle).configure()
         assert checked.airframe.return_altitude_m == 60.0
         vehicle.values |= {"RTL_ALT": 9000.0}
-        del vehicle.values[lost]
+        del vehicle.values[removed_parameter]
         later = await MavlinkFailsafes(vehicle).learn_return(checked)
         assert later.airframe.return_altitude_m == 60.0
-        assert later.problem == f"{lost} cannot be read: the autopilot does not answer"
+        assert later.problem == f"{removed_parameter} cannot be read: the autopilot does not answer"
 
     run(learnt())
 
@@ -251,8 +239,8 @@ def test_return_parameters_are_not_changed_in_flight(retrace: bool, known: bool)
             await MavlinkFailsafes(vehicle).configure(), retrace=retrace
         )
         before = vehicle.values["FS_GCS_ENABLE"]
-        again = await MavlinkFailsafes(vehicle).configure(flying=True, before=chosen if known else None)
-        assert again.airframe.retraces is retrace
+        rechecked = await MavlinkFailsafes(vehicle).configure(flying=True, before=chosen if known else None)
+        assert rechecked.airframe.retraces is retrace
         assert vehicle.values["FS_GCS_ENABLE"] == before == (3.0 if retrace else 1.0)
         landed = await MavlinkFailsafes(vehicle).configure(before=chosen)
         assert landed.airframe.retraces
@@ -267,11 +255,11 @@ def test_unreadable_parameters_keep_last_value_in_flight() -> None:
         before = await MavlinkFailsafes(vehicle).configure()
         for name in (*moves, "SRTL_POINTS"):
             del vehicle.values[name]
-        again = await MavlinkFailsafes(vehicle).configure(flying=True, before=before)
-        assert (again.airframe, again.speed_mps) == (before.airframe, 8.0)
-        assert again.airframe.retraces
-        assert "WPNAV_ACCEL" in again.problem
-        assert "cannot be read: the autopilot does not answer" in again.problem
+        rechecked = await MavlinkFailsafes(vehicle).configure(flying=True, before=before)
+        assert (rechecked.airframe, rechecked.speed_mps) == (before.airframe, 8.0)
+        assert rechecked.airframe.retraces
+        assert "WPNAV_ACCEL" in rechecked.problem
+        assert "cannot be read: the autopilot does not answer" in rechecked.problem
 
     run(flown())
 

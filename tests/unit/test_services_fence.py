@@ -1,4 +1,4 @@
-"""Commands that were overtaken are not sent; no duty, no heartbeats."""
+"""Superseded commands are not sent, and heartbeats end when the companion does not work."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
 from fractus_services.mobility.mavlink.mavlink_autopilot import MavlinkAutopilot
 
 
-class Overtaken(Exception):
-    pass
+class Superseded(Exception):
+    """Raised by the permit of a superseded command."""
 
 
 @pytest.fixture
@@ -31,9 +31,9 @@ async def test_command_is_not_repeated_after_a_later_command(link: tuple[Mavlink
 
     def permit() -> None:
         if sent:
-            raise Overtaken
+            raise Superseded
 
-    with pytest.raises(Overtaken):
+    with pytest.raises(Superseded):
         await autopilot.go_to(39.0, 22.0, 10.0, None, permit)
     assert len(sent) == 1
 
@@ -44,7 +44,9 @@ async def test_no_heartbeat_is_sent_while_the_companion_does_not_work(monkeypatc
     autopilot = MavlinkAutopilot("tcp:127.0.0.1:1", ARDUCOPTER, alive=lambda: duty)
     monkeypatch.setattr(autopilot, "send", sent.append)
     autopilot.send_heartbeat()
-    assert [m.name for m in sent] == ["PARAM_REQUEST_READ"], "it knocks, so that it is answered"
+    assert [m.name for m in sent] == ["PARAM_REQUEST_READ"], (
+        "the companion sends a probe, to which the autopilot responds"
+    )
     autopilot.target = (1, 1)
     autopilot.send_heartbeat()
     assert len(sent) == 1

@@ -1,4 +1,4 @@
-"""What is a firmware's own: ArduCopter's modes and texts, and that another firmware's modes need nothing but its stack."""
+"""Flight stacks: modes and failsafe texts of ArduCopter, and the stack of another firmware."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ def test_each_mode_maps_to_its_flight_state() -> None:
     assert kinds.pop(mavlink.COPTER_MODE_BRAKE) is ModeKind.BRAKING
     for mode in (mavlink.COPTER_MODE_RTL, mavlink.COPTER_MODE_SMART_RTL, mavlink.COPTER_MODE_AUTO_RTL):
         assert kinds.pop(mode) is ModeKind.RETURNING
-    assert set(kinds.values()) == {ModeKind.OTHER}, "in every other mode a pilot flies"
+    assert set(kinds.values()) == {ModeKind.OTHER}, "in every other mode, a pilot flies"
 
 
 def test_modes_are_requested_by_number() -> None:
     for mode in enum_names("COPTER_MODE"):
         assert ARDUCOPTER.mode_parameters(ARDUCOPTER.mode(mode)) == (float(mode),)
-    assert ARDUCOPTER.mode(99) == FlightMode("MODE99"), "a later release's: a pilot's until it is known"
+    assert ARDUCOPTER.mode(99) == FlightMode("MODE99"), "an unknown mode of a later release counts as a mode of a pilot"
 
 
 @pytest.mark.parametrize(
-    ("text", "tells"),
+    ("text", "is_failsafe"),
     [
         ("GCS Failsafe", True),
         ("Battery 1 is low 10.32V used 1200 mAh", False),
@@ -40,12 +40,12 @@ def test_modes_are_requested_by_number() -> None:
         ("Radio Failsafe - Continuing Auto Mode", False),
     ],
 )
-def test_failsafe_statustexts_are_recognised(text: str, tells: bool) -> None:
-    assert ARDUCOPTER.reports_failsafe(text) is tells
+def test_failsafe_statustexts_are_recognised(text: str, is_failsafe: bool) -> None:
+    assert ARDUCOPTER.reports_failsafe(text) is is_failsafe
 
 
 class TwoNumbers(ArduCopter):
-    """A firmware whose modes have a main and a sub mode, as PX4's, packed into one number."""
+    """Use a firmware with main and sub modes packed into one number, like PX4."""
 
     land = FlightMode("AUTO.LAND", ModeKind.LANDING)
 

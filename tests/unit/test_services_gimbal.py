@@ -1,4 +1,4 @@
-"""Where a gimbal points, as its autopilot reports it: what is not surely measured is unknown."""
+"""Gimbal attitude reported by the autopilot. An attitude that may not be measured is unknown."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 CAMERA = Lens(1.0, 1.0, pitch_deg=0.0)
-KEPT = mavlink.GIMBAL_DEVICE_FLAGS_ROLL_LOCK | mavlink.GIMBAL_DEVICE_FLAGS_PITCH_LOCK
-ARDUPILOT_4_4 = KEPT
-ARDUPILOT_4_6 = KEPT | mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_VEHICLE_FRAME
-NORTH = KEPT | mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_EARTH_FRAME
+ROLL_AND_PITCH_LOCK = mavlink.GIMBAL_DEVICE_FLAGS_ROLL_LOCK | mavlink.GIMBAL_DEVICE_FLAGS_PITCH_LOCK
+ARDUPILOT_4_4 = ROLL_AND_PITCH_LOCK
+ARDUPILOT_4_6 = ROLL_AND_PITCH_LOCK | mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_VEHICLE_FRAME
+NORTH = ROLL_AND_PITCH_LOCK | mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_EARTH_FRAME
 SIYI = 8.0
 SERVO = 1.0
 
 
 def quaternion(roll_deg: float, pitch_deg: float, yaw_deg: float) -> tuple[float, ...]:
-    """Of a rotation about z, then y, then x: three quaternions multiplied."""
+    """Return the quaternion of a rotation about z, then y, then x, as a product of three quaternions."""
 
     def times(a: tuple[float, ...], b: tuple[float, ...]) -> tuple[float, ...]:
         return (
@@ -45,17 +45,17 @@ def quaternion(roll_deg: float, pitch_deg: float, yaw_deg: float) -> tuple[float
 
 
 def vehicle(kind: float | None = SIYI, heading_deg: float = 0.0) -> Vehicle:
-    told = Vehicle(stack=ARDUCOPTER)
-    told.take(message("ATTITUDE", yaw=math.radians(heading_deg)), 10.0)
+    reporting = Vehicle(stack=ARDUCOPTER)
+    reporting.take(message("ATTITUDE", yaw=math.radians(heading_deg)), 10.0)
     if kind is not None:
-        told.take(message("PARAM_VALUE", param_id=b"MNT1_TYPE", param_value=kind), 10.0)
-    return told
+        reporting.take(message("PARAM_VALUE", param_id=b"MNT1_TYPE", param_value=kind), 10.0)
+    return reporting
 
 
-def report(told: Vehicle, now: float = 10.0, flags: int = ARDUPILOT_4_6, **more: Any) -> Attitude | None:
+def report(reporting: Vehicle, now: float = 10.0, flags: int = ARDUPILOT_4_6, **more: Any) -> Attitude | None:
     values = {"q": quaternion(0.0, -45.0, 30.0), "flags": flags, "gimbal_device_id": 1} | more
-    told.take(message("GIMBAL_DEVICE_ATTITUDE_STATUS", **values), now)
-    return told.gimbal
+    reporting.take(message("GIMBAL_DEVICE_ATTITUDE_STATUS", **values), now)
+    return reporting.gimbal
 
 
 @settings(max_examples=examples(300), deadline=None, derandomize=True)
@@ -67,11 +67,11 @@ def report(told: Vehicle, now: float = 10.0, flags: int = ARDUPILOT_4_6, **more:
 )
 def test_attitude_matches_the_quaternion(roll: float, pitch: float, yaw: float, heading: float) -> None:
     status = message("GIMBAL_DEVICE_ATTITUDE_STATUS", q=quaternion(roll, pitch, yaw), flags=ARDUPILOT_4_6)
-    found = attitude_of(status, heading)
-    assert found is not None
+    attitude = attitude_of(status, heading)
+    assert attitude is not None
     expected = camera_axes(CAMERA, Attitude(roll, pitch, yaw + heading))
-    for axis, other in zip(camera_axes(CAMERA, found), expected, strict=True):
-        assert axis == pytest.approx(other, abs=0.01)
+    for axis, expected_axis in zip(camera_axes(CAMERA, attitude), expected, strict=True):
+        assert axis == pytest.approx(expected_axis, abs=0.01)
 
 
 @pytest.mark.parametrize(
@@ -84,16 +84,16 @@ def test_attitude_matches_the_quaternion(roll: float, pitch: float, yaw: float, 
     ],
 )
 def test_yaw_reference_follows_the_flags(flags: int, yaw_deg: float) -> None:
-    found = report(vehicle(heading_deg=90.0), flags=flags)
-    assert found is not None
-    assert (found.pitch_deg, found.yaw_deg) == (pytest.approx(-45.0), pytest.approx(yaw_deg))
+    attitude = report(vehicle(heading_deg=90.0), flags=flags)
+    assert attitude is not None
+    assert (attitude.pitch_deg, attitude.yaw_deg) == (pytest.approx(-45.0), pytest.approx(yaw_deg))
 
 
 @pytest.mark.parametrize(
-    "told",
+    "report_fields",
     [
         {"flags": ARDUPILOT_4_6 | mavlink.GIMBAL_DEVICE_FLAGS_YAW_LOCK},
-        {"flags": KEPT | mavlink.GIMBAL_DEVICE_FLAGS_YAW_LOCK},
+        {"flags": ROLL_AND_PITCH_LOCK | mavlink.GIMBAL_DEVICE_FLAGS_YAW_LOCK},
         {"flags": ARDUPILOT_4_6 | mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_EARTH_FRAME},
         {"flags": ARDUPILOT_4_6 | mavlink.GIMBAL_DEVICE_FLAGS_RETRACT},
         {"flags": mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_VEHICLE_FRAME | mavlink.GIMBAL_DEVICE_FLAGS_ROLL_LOCK},
@@ -107,10 +107,10 @@ def test_yaw_reference_follows_the_flags(flags: int, yaw_deg: float) -> None:
         {"q": (1.1, 0.0, 0.0, 0.0)},
     ],
 )  # fmt: skip
-def test_ambiguous_attitude_is_unknown(told: dict[str, Any]) -> None:
+def test_ambiguous_attitude_is_unknown(report_fields: dict[str, Any]) -> None:
     drone = vehicle()
     assert report(drone) is not None
-    assert report(drone, 10.1, **told) is None
+    assert report(drone, 10.1, **report_fields) is None
 
 
 @pytest.mark.parametrize("kind", [None, 0.0, SERVO, 2.0, 4.0, 7.0, 9.0, 13.0, 99.0])
@@ -122,7 +122,7 @@ def test_changed_gimbal_type_takes_effect_after_a_restart() -> None:
     drone = vehicle(SERVO)
     drone.take(message("PARAM_VALUE", param_id=b"MNT1_TYPE", param_value=SIYI), 10.0)
     assert report(drone) is None, "the servos are still driven"
-    drone.gimbal_measured = None  # the link was lost
+    drone.gimbal_measured = None  # as after a loss of the link
     drone.take(message("PARAM_VALUE", param_id=b"MNT1_TYPE", param_value=SIYI), 11.0)
     assert report(drone) is not None
 
@@ -144,7 +144,7 @@ def test_gimbal_attitude_is_as_old_as_the_heading() -> None:
 
 
 class Commanded:
-    """An autopilot that acknowledges, refuses, or is silent; and tells how far its gimbal turns, or does not."""
+    """Fake autopilot that acknowledges, refuses or ignores commands, and reports the limits of its gimbal or not."""
 
     def __init__(self, error: AutopilotError | None = None, limits: dict[str, float] | None = None) -> None:
         self.vehicle = vehicle()
@@ -157,8 +157,8 @@ class Commanded:
         permit()
         if command == mavlink.MAV_CMD_REQUEST_MESSAGE:
             if self._limits is not None:
-                told = {end: math.radians(deg) for end, deg in self._limits.items()}
-                self.vehicle.take(message("GIMBAL_MANAGER_INFORMATION", gimbal_device_id=1, **told), 10.0)
+                fields = {end: math.radians(deg) for end, deg in self._limits.items()}
+                self.vehicle.take(message("GIMBAL_MANAGER_INFORMATION", gimbal_device_id=1, **fields), 10.0)
             return
         if self._error is not None:
             raise self._error
@@ -184,14 +184,16 @@ async def test_point_refuses_angles_outside_of_the_limits() -> None:
 
 
 @pytest.mark.parametrize(
-    ("error", "raised", "said"),
+    ("error", "raised", "message_text"),
     [
         (AutopilotError("failed", refused=True), PreconditionFailed, "no gimbal"),
         (AutopilotError("no answer", link=True), AutopilotError, "no answer"),
     ],
 )
-async def test_point_raises_the_reason_of_a_failure(error: AutopilotError, raised: type[Exception], said: str) -> None:
-    with pytest.raises(raised, match=said):
+async def test_point_raises_the_reason_of_a_failure(
+    error: AutopilotError, raised: type[Exception], message_text: str
+) -> None:
+    with pytest.raises(raised, match=message_text):
         await point(Commanded(error), -45.0, 0.0, always)
 
 

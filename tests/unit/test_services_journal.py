@@ -30,11 +30,11 @@ async def saved_journal(directory: Path) -> Journal:
 async def test_journal_restores_previous_copy_when_file_is_damaged(tmp_path: Path, torn: bytes) -> None:
     await saved_journal(tmp_path)
     (tmp_path / "journal.json").write_bytes(torn)
-    found = Journal(tmp_path)
-    assert found.record.active == "k"
-    assert found.record.missions["k"].points_done == 1
-    assert found.record.missions["k"].home == (39.0, 22.0, 10.0)
-    await found.save(found.record)
+    journal = Journal(tmp_path)
+    assert journal.record.active == "k"
+    assert journal.record.missions["k"].points_done == 1
+    assert journal.record.missions["k"].home == (39.0, 22.0, 10.0)
+    await journal.save(journal.record)
     assert json.loads((tmp_path / "journal.last.json").read_bytes())["active"] == "k", (
         "a damaged file must not replace a valid one"
     )
@@ -53,8 +53,8 @@ async def test_journal_reads_format_version_1(tmp_path: Path, stored: str, outco
     mission = {"key": "k", "identity": "id", "outcome": stored, "points_done": 2, "waypoints": 3, "flown": True}
     body = {"version": 1, "active": "k", "missions": [{**mission, "home": [39, 22, 10]}]}
     (tmp_path / "journal.json").write_text(json.dumps(body))
-    found = Journal(tmp_path).record
-    assert found == JournalContent({"k": Mission("k", "id", outcome, 2, 3, True, (39.0, 22.0, 10.0), True)}, "k")
+    stored = Journal(tmp_path).record
+    assert stored == JournalContent({"k": Mission("k", "id", outcome, 2, 3, True, (39.0, 22.0, 10.0), True)}, "k")
 
 
 @pytest.mark.parametrize("odd", ["lost in space", {"kind": "lost", "reason": ""}, {"kind": "failed"}, 7, ["failed"]])

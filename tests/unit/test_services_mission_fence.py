@@ -1,4 +1,4 @@
-"""The vehicle's own fence around a mission: what is loaded, beside what, and what happens when it cannot be."""
+"""Mission fence of the vehicle: its shape, the fence of the owner, and failures."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def outline(items: tuple[MissionItem, ...]) -> Any:
 
 
 class Vehicle(ParameterVehicle):
-    """An autopilot that has parameters and one list of items."""
+    """Fake autopilot with parameters and one list of items."""
 
     def __init__(self) -> None:
         values = {"FENCE_ENABLE": 0.0, "FENCE_TYPE": 7.0, "FENCE_ALT_MAX": 100.0, "FENCE_ACTION": 2.0}
@@ -160,20 +160,18 @@ async def test_mission_fence_is_enabled_and_owner_fence_restored(vehicle: Vehicl
     vehicle.items = (MissionItem(5003, 30.0, 1, 2),)
     fence = MissionFence(vehicle, tmp_path)
     await fence.raise_around(spec(area(-50, -50, 50, 50), **LIMITS), retraces=True)
-    assert vehicle.written[-1] == "FENCE_ENABLE", "it is switched on when all else stands"
+    assert vehicle.written[-1] == "FENCE_ENABLE", "the fence is enabled after all other settings"
     assert vehicle.values["FENCE_TYPE"] == 5.0
     assert vehicle.values["FENCE_ACTION"] == 3.0
     assert vehicle.values["FENCE_ALT_MAX"] == 65.0
-    assert {i.command for i in vehicle.items} == {5001}, (
-        "what the owner had stored and not enabled stays out of the way"
-    )
-    again = MissionFence(vehicle, tmp_path)
-    assert again.raised, "a service that was restarted knows"
-    await again.raise_around(spec(area(-10, -10, 10, 10)), retraces=False)
-    await again.lower(lambda: True)
+    assert {i.command for i in vehicle.items} == {5001}, "a disabled fence of the owner is not enabled"
+    restarted = MissionFence(vehicle, tmp_path)
+    assert restarted.raised, "a restarted service knows the mission fence"
+    await restarted.raise_around(spec(area(-10, -10, 10, 10)), retraces=False)
+    await restarted.lower(lambda: True)
     assert vehicle.values == before
     assert vehicle.items == (MissionItem(5003, 30.0, 1, 2),)
-    assert not again.raised
+    assert not restarted.raised
 
 
 async def test_owner_fence_stays_in_force(vehicle: Vehicle, tmp_path: Path) -> None:
@@ -182,7 +180,7 @@ async def test_owner_fence_stays_in_force(vehicle: Vehicle, tmp_path: Path) -> N
     fence = MissionFence(vehicle, tmp_path)
     await fence.raise_around(spec(area(-50, -50, 50, 50), **LIMITS), retraces=True)
     assert [n for n in vehicle.written if n == "FENCE_ENABLE"] == ["FENCE_ENABLE"] * 2, (
-        "off, and on with all that is new"
+        "the fence is disabled, and enabled with the new settings"
     )
     assert (vehicle.written[0], vehicle.written[-1]) == ("FENCE_ENABLE", "FENCE_ENABLE")
     assert vehicle.values["FENCE_ENABLE"] == 1.0
@@ -191,7 +189,7 @@ async def test_owner_fence_stays_in_force(vehicle: Vehicle, tmp_path: Path) -> N
     assert vehicle.values["FENCE_ALT_MAX"] == 40.0
     assert vehicle.values["FENCE_TYPE"] == 7.0
     assert vehicle.values["FENCE_ACTION"] == 2.0
-    assert vehicle.values["FENCE_OPTIONS"] == 1.0, "a union of inclusion areas would weaken both"
+    assert vehicle.values["FENCE_OPTIONS"] == 1.0, "a union of the inclusion areas would weaken both fences"
 
 
 @pytest.mark.parametrize("action", [0.0, 4.0])
@@ -290,15 +288,15 @@ async def test_fence_is_not_changed_while_armed(vehicle: Vehicle, tmp_path: Path
 async def test_fence_stays_enabled_if_vehicle_arms_during_its_request(vehicle: Vehicle, tmp_path: Path) -> None:
     vehicle.values |= OWNED
     send = vehicle.send
-    asked = 0
+    reads = 0
 
-    def heard(outgoing: Message) -> None:
-        nonlocal asked
-        asked += outgoing.name == "PARAM_REQUEST_READ" and outgoing.text("param_id") == "FENCE_ENABLE"
-        vehicle.vehicle.armed = asked >= 3
+    def arm_during_read(outgoing: Message) -> None:
+        nonlocal reads
+        reads += outgoing.name == "PARAM_REQUEST_READ" and outgoing.text("param_id") == "FENCE_ENABLE"
+        vehicle.vehicle.armed = reads >= 3
         send(outgoing)
 
-    vehicle.send = heard  # type: ignore[method-assign]
+    vehicle.send = arm_during_read  # type: ignore[method-assign]
     fence = MissionFence(vehicle, tmp_path)
     with pytest.raises(AutopilotError, match="cannot be disabled"):
         await fence.raise_around(spec(area(-50, -50, 50, 50)), retraces=False)
@@ -334,13 +332,13 @@ async def test_owner_fence_that_cannot_be_restored_is_kept_for_later(
     vehicle.values |= OWNED
 
     async def silent(*_: Any) -> None:
-        raise AutopilotError("the autopilot stopped answering", link=True)
+        raise AutopilotError("the autopilot stopped responding", link=True)
 
     monkeypatch.setattr(module, "upload", silent)
     fence = MissionFence(vehicle, tmp_path)
-    with pytest.raises(AutopilotError, match="stopped answering"):
+    with pytest.raises(AutopilotError, match="stopped responding"):
         await fence.raise_around(spec(area(-50, -50, 50, 50)), retraces=False)
-    assert fence.raised, "the supervisor puts it back later"
+    assert fence.raised, "the supervisor restores the fence of the owner later"
 
 
 async def test_fence_parameter_changed_by_another_station_in_flight_is_reset(vehicle: Vehicle, tmp_path: Path) -> None:
@@ -375,7 +373,7 @@ async def test_replaced_fence_items_of_same_count_are_reported(
     fence = MissionFence(vehicle, tmp_path)
     await fence.raise_around(spec(area(-50, -50, 50, 50)), retraces=False)
     vehicle.items = tuple(replace(item, lat_e7=item.lat_e7 + 5000) for item in vehicle.items)
-    assert await fence.hold() == (), "it was read a moment ago"
+    assert await fence.hold() == (), "the items were read a moment ago"
     with pytest.raises(AutopilotError, match="replaced the items of its fence"):
         await MissionFence(vehicle, tmp_path).hold()
     monkeypatch.setattr(module, "ITEMS_AGAIN_S", 0.0)
@@ -397,12 +395,12 @@ async def test_loaded_fence_is_not_loaded_again(vehicle: Vehicle, tmp_path: Path
         vehicle.values["FENCE_ACTION"] = 0.0
         await fence.raise_around(spec(area(-50, -50, 50, 50)), retraces=False)
         assert not loads
-        assert vehicle.values["FENCE_ACTION"] == 1.0, "what another station changed is set back"
+        assert vehicle.values["FENCE_ACTION"] == 1.0, "a parameter changed by another station is reset"
     finally:
         module.upload = upload
     vehicle.values["FENCE_TOTAL"] = 9.0
     vehicle.items = ()
     await fence.raise_around(spec(area(-50, -50, 50, 50)), retraces=False)
-    assert len(vehicle.items) == 4, "what another station replaced is loaded again"
+    assert len(vehicle.items) == 4, "items replaced by another station are loaded again"
     await fence.raise_around(spec(area(-60, -50, 50, 50)), retraces=False)
     assert len(vehicle.items) == 4

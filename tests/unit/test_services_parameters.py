@@ -1,11 +1,10 @@
-"""Parameters over links that lose frames: what the vehicle does not have is told apart from what was not heard."""
+"""Parameters over lossy links: absent parameters are distinguished from lost responses."""
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Coroutine
 from dataclasses import replace
-from typing import Any, TypeVar
+from typing import Any
 
 import pytest
 from depth import examples
@@ -16,12 +15,10 @@ from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
 from fractus_services.mobility.mavlink.failsafes import MavlinkFailsafes, Reader
 from fractus_services.mobility.mavlink.parameters import ParameterLost
 from parameter_vehicle import BY_NAME, ParameterVehicle
-from virtual_time import Loop
+from virtual_time import run
 
-T = TypeVar("T")
-
-OTHERS = {f"P{number:04}": float(number) for number in range(1380)}
-"""As many parameters as a real vehicle has."""
+OTHER_PARAMETERS = {f"P{number:04}": float(number) for number in range(1380)}
+"""Return as many parameters as a real vehicle has."""
 
 AS_4_6 = {
     "SYSID_MYGCS": 255.0, "FS_GCS_ENABLE": 0.0, "FS_GCS_TIMEOUT": 5.0, "GUID_TIMEOUT": 3.0, "BATT_FS_CRT_ACT": 0.0,
@@ -46,12 +43,6 @@ FIGURES = Airframe(
 )
 
 
-def run(work: Coroutine[Any, Any, T]) -> T:
-    """The outcome of work in a loop whose time jumps."""
-    with asyncio.Runner(loop_factory=Loop) as runner:
-        return runner.run(work)
-
-
 async def started(vehicle: ParameterVehicle) -> FailsafeStatus:
     return await MavlinkFailsafes(vehicle).configure()
 
@@ -69,7 +60,7 @@ def rounded(airframe: Airframe) -> Airframe:
 def test_startup_uses_only_parameter_values_of_the_vehicle(loss: float, starts: int, release: dict[str, float]) -> None:
     verified = 0
     for seed in range(starts):
-        vehicle = ParameterVehicle(release | OTHERS, loss=loss, seed=seed, delay_s=0.05)
+        vehicle = ParameterVehicle(release | OTHER_PARAMETERS, loss=loss, seed=seed, delay_s=0.05)
         checked = run(started(vehicle))
         if not checked.problem:
             verified += 1
@@ -77,25 +68,27 @@ def test_startup_uses_only_parameter_values_of_the_vehicle(loss: float, starts: 
             assert checked.speed_mps == pytest.approx(7.0)
             settings = {name: vehicle.values[name] for name in ("FS_GCS_ENABLE", "GUID_TIMEOUT", "BATT_FS_CRT_ACT")}
             assert settings == {"FS_GCS_ENABLE": 3.0, "GUID_TIMEOUT": 3.0, "BATT_FS_CRT_ACT": 1.0}, f"seed {seed}"
-    assert verified >= 0.8 * starts, "a lossy link is slow, and seldom stops a start"
+    assert verified >= 0.8 * starts, "a lossy link is slow, but seldom prevents a start"
 
 
-@pytest.mark.parametrize("lost", sorted({"WPNAV_ACCEL", "SRTL_POINTS", "FENCE_ALT_MAX", "RTL_ALT", "FS_GCS_ENABLE"}))
-def test_parameter_without_response_prevents_arming_and_is_named(lost: str) -> None:
+@pytest.mark.parametrize(
+    "unanswered", sorted({"WPNAV_ACCEL", "SRTL_POINTS", "FENCE_ALT_MAX", "RTL_ALT", "FS_GCS_ENABLE"})
+)
+def test_parameter_without_response_prevents_arming_and_is_named(unanswered: str) -> None:
     class Deaf(ParameterVehicle):
         def send(self, outgoing: Any) -> None:
-            named = outgoing.name == "PARAM_REQUEST_READ" and outgoing.text("param_id") == lost
+            named = outgoing.name == "PARAM_REQUEST_READ" and outgoing.text("param_id") == unanswered
             if not named:
                 super().send(outgoing)
 
         def take(self, incoming: Any) -> None:
-            if incoming.name != "PARAM_VALUE" or incoming.text("param_id") != lost or listing:
+            if incoming.name != "PARAM_VALUE" or incoming.text("param_id") != unanswered or listing:
                 super().take(incoming)
 
     for listing in (False, True):
-        problem = run(started(Deaf(AS_4_6 | OTHERS))).problem
-        # While nothing of it is heard the list stays incomplete; a value of the list counts as any other.
-        assert ("cannot be read" in problem and lost in problem) is not listing, problem
+        problem = run(started(Deaf(AS_4_6 | OTHER_PARAMETERS))).problem
+        # Without any value of the parameter the list is incomplete. A value from the list is sufficient.
+        assert ("cannot be read" in problem and unanswered in problem) is not listing, problem
 
 
 def test_incomplete_parameter_list_names_requested_parameters() -> None:
@@ -104,57 +97,57 @@ def test_incomplete_parameter_list_names_requested_parameters() -> None:
             if incoming.name != "PARAM_VALUE" or incoming.text("param_id") not in {"WPNAV_ACCEL", "P0100"}:
                 super().take(incoming)
 
-    problem = run(started(Mute(AS_4_6 | OTHERS))).problem
+    problem = run(started(Mute(AS_4_6 | OTHER_PARAMETERS))).problem
     assert "WPNAV_ACCEL or WP_ACC cannot be read" in problem
 
 
 def test_absent_parameter_is_detected_by_one_list_request() -> None:
-    async def asked() -> None:
+    async def read_parameters() -> None:
         vehicle = ParameterVehicle(
-            {name: value for name, value in AS_4_6.items() if name != "BATT_FS_CRT_ACT"} | OTHERS
+            {name: value for name, value in AS_4_6.items() if name != "BATT_FS_CRT_ACT"} | OTHER_PARAMETERS
         )
         checked = await started(vehicle)
         assert not checked.problem
         assert checked.missing == ("BATT_FS_CRT_ACT",)
-        assert vehicle.asked.count("PARAM_REQUEST_LIST") == 1
+        assert vehicle.received_names.count("PARAM_REQUEST_LIST") == 1
         begun = vehicle.now
         assert (await started(vehicle)).missing == ("BATT_FS_CRT_ACT",)
         assert vehicle.now - begun < 0.1
 
-    run(asked())
+    run(read_parameters())
 
 
 def test_parameter_list_is_not_requested_if_all_parameters_are_reported() -> None:
     for release in (AS_4_6, AS_4_7):
-        vehicle = ParameterVehicle(release | OTHERS, delay_s=0.02)
+        vehicle = ParameterVehicle(release | OTHER_PARAMETERS, delay_s=0.02)
         assert not run(started(vehicle)).problem
-        assert "PARAM_REQUEST_LIST" not in vehicle.asked
+        assert "PARAM_REQUEST_LIST" not in vehicle.received_names
 
 
 def test_parameter_hidden_from_list_is_read_by_name() -> None:
-    async def asked() -> None:
-        values = {name: value for name, value in AS_4_6.items() if name != "FS_EKF_ACTION"} | OTHERS
+    async def read_parameters() -> None:
+        values = {name: value for name, value in AS_4_6.items() if name != "FS_EKF_ACTION"} | OTHER_PARAMETERS
         vehicle = ParameterVehicle(values, hidden=("BATT_FS_LOW_ACT", "BATT_FS_CRT_ACT"), loss=0.1, seed=3)
         checked = await started(vehicle)
         assert not checked.problem
         assert checked.missing == ("FS_EKF_ACTION",)
         assert vehicle.values["BATT_FS_CRT_ACT"] == 1.0
 
-    run(asked())
+    run(read_parameters())
 
 
 def test_parameter_list_that_grows_while_read_is_read_again() -> None:
     class Growing(ParameterVehicle):
         def send(self, outgoing: Any) -> None:
             super().send(outgoing)
-            if outgoing.name == "PARAM_REQUEST_LIST" and self.asked.count("PARAM_REQUEST_LIST") == 1:
+            if outgoing.name == "PARAM_REQUEST_LIST" and self.received_names.count("PARAM_REQUEST_LIST") == 1:
                 self.values = {"A_FIRST": 1.0} | self.values
 
-    async def asked() -> None:
-        vehicle = Growing({"WPNAV_ACCEL": 100.0} | OTHERS, loss=0.02, seed=5)
+    async def read_parameters() -> None:
+        vehicle = Growing({"WPNAV_ACCEL": 100.0} | OTHER_PARAMETERS, loss=0.02, seed=5)
         assert await vehicle.vehicle_parameters.read([("NEVER",), ("WPNAV_ACCEL",)]) == {"WPNAV_ACCEL": 100.0}
 
-    run(asked())
+    run(read_parameters())
 
 
 def test_missing_or_late_response_is_not_a_refusal() -> None:

@@ -1,4 +1,4 @@
-"""When the vehicle's position is known, and who is told of it."""
+"""Validity of the vehicle's position, and its telemetry."""
 
 from __future__ import annotations
 
@@ -94,46 +94,46 @@ def test_telemetry_reports_age_of_attitude() -> None:
     assert not stale.HasField("attitude_age_s")
 
 
-@pytest.mark.parametrize("way_s", [0.3, math.inf])
-def test_telemetry_ages_include_link_latency(way_s: float) -> None:
+@pytest.mark.parametrize("delay_s", [0.3, math.inf])
+def test_telemetry_ages_include_link_latency(delay_s: float) -> None:
     vehicle = Vehicle(stack=ARDUCOPTER)
     fix(vehicle, 3)
     place(vehicle, 39.0, 10.0)
     vehicle.take(message("ATTITUDE", yaw=1.0), 10.1)
-    fresh = telemetry(vehicle, 10.2, downlink_latency_s=way_s)
-    assert fresh.position_age_s == pytest.approx(0.2 + way_s)
-    assert fresh.attitude_age_s == pytest.approx(0.1 + way_s)
+    fresh = telemetry(vehicle, 10.2, downlink_latency_s=delay_s)
+    assert fresh.position_age_s == pytest.approx(0.2 + delay_s)
+    assert fresh.attitude_age_s == pytest.approx(0.1 + delay_s)
     assert fresh.position_error_m == pytest.approx(0.6 + 3.0 * 0.2)
 
 
-def heard(name: str, boot_s: float, **values: float) -> Message:
+def timed_message(name: str, boot_s: float, **values: float) -> Message:
     fields: dict[str, Value] = {"time_boot_ms": round(boot_s * 1e3), **values}
     return message(name, **fields)
 
 
 def test_attitude_age_follows_its_timestamp() -> None:
-    async def hears() -> None:
+    async def receive_late_attitude() -> None:
         autopilot = MavlinkAutopilot("tcp:127.0.0.1:1", ARDUCOPTER)
         for boot_s in (100.0, 100.5):
-            autopilot.take(heard("GLOBAL_POSITION_INT", boot_s))
+            autopilot.take(timed_message("GLOBAL_POSITION_INT", boot_s))
             await asyncio.sleep(0.5)
         vehicle = autopilot.vehicle
         now = autopilot.now
-        autopilot.take(heard("ATTITUDE", 100.6, yaw=0.5))  # it waited on its way for 0.4 s
+        autopilot.take(timed_message("ATTITUDE", 100.6, yaw=0.5))  # delayed by 0.4 s
         assert vehicle.attitude_at == pytest.approx(now - 0.4, abs=1e-3)
-        autopilot.take(heard("ATTITUDE", 100.2, yaw=2.0))  # and this one was overtaken
+        autopilot.take(timed_message("ATTITUDE", 100.2, yaw=2.0))  # overtaken by the previous message
         assert vehicle.attitude_at == pytest.approx(now - 0.4, abs=1e-3)
         assert vehicle.heading_deg == pytest.approx(math.degrees(0.5))
 
     with asyncio.Runner(loop_factory=Loop) as runner:
-        runner.run(hears())
+        runner.run(receive_late_attitude())
 
 
 def test_mission_items_are_addressed_to_the_node_only() -> None:
-    ours, others = (telemetry(Vehicle(stack=ARDUCOPTER), 0.0, missions=node) for node in (True, False))
-    assert dict(ours.missions) == {"uid": MissionOutcome(kind=MissionOutcome.KIND_REVOKED, reason="why")}
-    assert ours.controller_reason == "a pilot took it"
-    assert (dict(others.missions), others.controller_reason) == ({}, "")
+    for_node, for_others = (telemetry(Vehicle(stack=ARDUCOPTER), 0.0, missions=node) for node in (True, False))
+    assert dict(for_node.missions) == {"uid": MissionOutcome(kind=MissionOutcome.KIND_REVOKED, reason="why")}
+    assert for_node.controller_reason == "a pilot took it"
+    assert (dict(for_others.missions), for_others.controller_reason) == ({}, "")
 
 
 def test_telemetry_reports_satellites_wind_and_new_statustexts() -> None:

@@ -1,4 +1,4 @@
-"""The delay of the autopilot's link: an upper bound, whatever the link does and whatever the two clocks show."""
+"""Delay of the autopilot's link: the estimate is an upper bound, independent of losses and of both clocks."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ Delay = Callable[[], float]
 
 @dataclass
 class Bench:
-    """A link in our time, and a vehicle whose clock runs as it likes.
+    """Simulated link to a vehicle with its own clock.
 
     Attributes:
-        up, down: seconds that a message takes; infinite for one that is lost.
-        clock: the vehicle's seconds since its start, of ours.
-        worst: how much less than the truth was ever told: positive is an error.
+        up, down: Delay of a message in seconds, infinite if the message is lost.
+        clock: Vehicle time since its start as a function of the time of the test.
+        worst: Largest underestimate of the delay. A positive value is an error.
     """
 
     up: Delay
@@ -42,24 +42,24 @@ class Bench:
     timing: Timing = field(default_factory=Timing)
     now: float = 50.0
     worst: float = -math.inf
-    told: list[float] = field(default_factory=list)
+    excess: list[float] = field(default_factory=list)
     _queue: list[tuple[float, int, Callable[[], None]]] = field(default_factory=list)
     _number: int = 0
-    _told_at: float = -math.inf
+    _reported_stamp: float = -math.inf
 
-    def later(self, delay_s: float, what: Callable[[], None]) -> None:
+    def schedule(self, delay_s: float, action: Callable[[], None]) -> None:
         if math.isfinite(delay_s):
             self._number += 1
-            heapq.heappush(self._queue, (self.now + delay_s, self._number, what))
+            heapq.heappush(self._queue, (self.now + delay_s, self._number, action))
 
     def fly(self, seconds: float) -> None:
-        """Let time pass: positions come, delays are measured, and the bound is compared with the truth."""
+        """Advance the time: receive positions, measure delays, and compare the estimate with the true delay."""
         end = self.now + seconds
         for event in (self._state, self._probe, self._judge):
-            self.later(0.0, event)
+            self.schedule(0.0, event)
         while self._queue and self._queue[0][0] <= end:
-            self.now, _, what = heapq.heappop(self._queue)
-            what()
+            self.now, _, action = heapq.heappop(self._queue)
+            action()
         self._queue = [item for item in self._queue if item[2] not in (self._state, self._probe, self._judge)]
         heapq.heapify(self._queue)
         self.now = end
@@ -67,12 +67,12 @@ class Bench:
     def _state(self) -> None:
         stamp = self.clock(self.now)
         for _ in range(self.copies):
-            self.later(self.down(), lambda: self._arrives(stamp))
-        self.later(self.every_s, self._state)
+            self.schedule(self.down(), lambda: self._arrives(stamp))
+        self.schedule(self.every_s, self._state)
 
     def _arrives(self, stamp: float) -> None:
         if self.timing.take_position(round(stamp * 1e3) % (1 << 32), self.now) is not None:
-            self._told_at = stamp
+            self._reported_stamp = stamp
 
     def _probe(self) -> None:
         number = self.timing.request(self.now)
@@ -81,37 +81,37 @@ class Bench:
             up = self.up()
             tc1 = round(self.clock(self.now + min(up, 1e6)) * 1e9)
             for _ in range(self.copies):
-                self.later(up + self.down(), lambda: self.timing.take_reply(tc1, number, self.now))
+                self.schedule(up + self.down(), lambda: self.timing.take_reply(tc1, number, self.now))
         elif number is not None and self.timing.unanswering:
-            self.later(self.up() + self.down(), lambda: self.timing.take_acknowledgement(sent, self.now))
-        self.later(PROBE_S, self._probe)
+            self.schedule(self.up() + self.down(), lambda: self.timing.take_acknowledgement(sent, self.now))
+        self.schedule(PROBE_S, self._probe)
 
     def _judge(self) -> None:
-        told = self.timing.latency_s(self.now)
-        if math.isfinite(told):
+        estimate = self.timing.latency_s(self.now)
+        if math.isfinite(estimate):
             up = self.up()
             if math.isfinite(up):
-                true = self.clock(self.now + up) - self._told_at
-                self.worst = max(self.worst, true - told)
-                self.told.append(told - true)
-        self.later(0.013, self._judge)
+                true = self.clock(self.now + up) - self._reported_stamp
+                self.worst = max(self.worst, true - estimate)
+                self.excess.append(estimate - true)
+        self.schedule(0.013, self._judge)
 
 
 def steady(seconds: float) -> Delay:
     return lambda: seconds
 
 
-def wild(rng: random.Random, least: float, most: float, lost: float = 0.0) -> Delay:
-    return lambda: math.inf if rng.random() < lost else rng.uniform(least, most)
+def random_delay(rng: random.Random, least: float, most: float, loss: float = 0.0) -> Delay:
+    return lambda: math.inf if rng.random() < loss else rng.uniform(least, most)
 
 
 @pytest.mark.parametrize(("up", "down"), [(0.0, 0.0), (0.15, 0.15), (0.25, 0.25), (0.5, 0.0), (0.0, 0.5)])
 def test_latency_of_each_direction_is_counted_once(up: float, down: float) -> None:
-    """Whichever way is the slower one: the bound is what it takes, and little more."""
+    """The estimate is only little more than the delay, whichever direction is slower."""
     bench = Bench(steady(up), steady(down))
     bench.fly(30)
     assert bench.worst <= -REACTION_S + 0.01
-    assert max(bench.told) <= REACTION_S + 0.01
+    assert max(bench.excess) <= REACTION_S + 0.01
     assert bench.timing.delay_s == pytest.approx(up + down, abs=0.01)
 
 
@@ -120,11 +120,11 @@ def test_latency_is_an_upper_bound_despite_lost_late_and_duplicate_messages(seed
     rng = random.Random(seed)
     least = rng.uniform(0, 0.2)
     most = rng.uniform(0.2, 0.4)
-    bench = Bench(wild(rng, least, most, 0.1), wild(rng, least, most, 0.1), copies=2)
+    bench = Bench(random_delay(rng, least, most, 0.1), random_delay(rng, least, most, 0.1), copies=2)
     bench.fly(15)
     bench.worst = -math.inf
     bench.fly(60)
-    assert bench.worst <= 0.0, "REACTION_S covers what no request happened to meet"
+    assert bench.worst <= 0.0, "REACTION_S covers delays that no request has measured"
 
 
 @pytest.mark.parametrize("rate", [0.999, 1.001, 1.5, 2.0, 3.0, 5.0])
@@ -150,7 +150,7 @@ def test_slow_link_prevents_arming_with_reason() -> None:
     bench.fly(15)
     assert "takes 1.2 s" in bench.timing.problem(bench.now) or "1.3 s" in bench.timing.problem(bench.now)
     assert bench.timing.delay_s > MAX_ARMING_DELAY_S
-    assert math.isfinite(bench.timing.latency_s(bench.now)), "who flies may land with it"
+    assert math.isfinite(bench.timing.latency_s(bench.now)), "a drone in flight may land over this link"
     worse = Bench(steady(1.0), steady(0.9))
     worse.fly(15)
     assert math.isinf(worse.timing.latency_s(worse.now))
@@ -178,7 +178,7 @@ def test_slow_link_is_detected_before_first_slow_response() -> None:
     before_s = bench.timing.latency_s(bench.now)
     up_s = 1.0
     bench.fly(0.9)
-    assert bench.timing.delay_s < 0.2, "no slow answer has come yet"
+    assert bench.timing.delay_s < 0.2, "no slow response has arrived yet"
     assert bench.timing.latency_s(bench.now) >= before_s + 0.6
     bench.worst = -math.inf
     bench.fly(1.0)
@@ -186,7 +186,7 @@ def test_slow_link_is_detected_before_first_slow_response() -> None:
 
 
 def test_many_overdue_responses_do_not_count_as_fast_link() -> None:
-    """Ten requests without an answer are of a vehicle that answers none, or of a link that got slow: until that is clear they count."""
+    """Ten requests without a response mean a vehicle that does not respond, or a slow link. Until then they count as overdue."""
     up_s = 0.05
     bench = Bench(lambda: up_s, steady(0.05))
     bench.fly(15)
@@ -196,7 +196,7 @@ def test_many_overdue_responses_do_not_count_as_fast_link() -> None:
     assert bench.timing.unanswering
     assert bench.timing.latency_s(bench.now) >= MAX_DELAY_S
     bench.fly(2.0)
-    assert math.isinf(bench.timing.latency_s(bench.now)), "the slow answers are there"
+    assert math.isinf(bench.timing.latency_s(bench.now)), "the slow responses have arrived"
 
 
 def test_one_lost_response_does_not_make_link_too_slow_to_fly() -> None:
@@ -227,7 +227,7 @@ def test_latency_is_measured_by_acknowledgements_without_timesync() -> None:
     assert math.isinf(bench.timing.latency_s(bench.now))
     bench.fly(20)
     assert bench.worst <= -REACTION_S + 0.01
-    assert max(bench.told) <= REACTION_S + 0.02
+    assert max(bench.excess) <= REACTION_S + 0.02
 
 
 def test_timesync_replies_to_others_and_duplicates_are_ignored() -> None:
@@ -240,7 +240,7 @@ def test_timesync_replies_to_others_and_duplicates_are_ignored() -> None:
     number = timing.request(3.0)
     assert number is not None
     timing.take_reply(0, number, 3.02)
-    assert math.isinf(timing.latency_s(3.02)), "a request of the vehicle's own"
+    assert math.isinf(timing.latency_s(3.02)), "a request by the vehicle does not count as a response"
     number = timing.request(3.04)
     assert number is not None
     timing.take_reply(round(7.01e9), number, 3.06)
@@ -257,7 +257,7 @@ def test_repeated_command_after_gap_is_not_a_latency_sample() -> None:
     bench.fly(2.5)
     assert bench.timing.unanswering
     bench.timing.take_acknowledgement(sent, bench.now)
-    assert bench.timing.delay_s < 0.1, "its answer comes before the first position"
+    assert bench.timing.delay_s < 0.1, "the response arrives before the first position"
     bench.up = bench.down = steady(0.02)
     bench.timing.take_position(round(bench.clock(bench.now) * 1e3), bench.now + 0.02)
     bench.timing.take_acknowledgement(sent, bench.now + 0.03)
@@ -280,7 +280,7 @@ def test_vehicle_clock_wraps_after_49_days() -> None:
     bench = Bench(steady(0.1), steady(0.1), clock=lambda t: t - 60 + 2**32 / 1e3)
     bench.fly(40)
     assert bench.worst <= -REACTION_S + 0.01
-    assert max(bench.told) <= REACTION_S + 0.01
+    assert max(bench.excess) <= REACTION_S + 0.01
 
 
 def test_vehicle_restart_resets_timing() -> None:
@@ -298,13 +298,13 @@ def test_vehicle_restart_resets_timing() -> None:
 
 
 @pytest.mark.parametrize(
-    ("stamps", "told"),
+    ("stamps", "expected"),
     [
         ((102_000, 110_050, 110_100), [False, False, False]),
         ((1_000, 1_050, 1_100), [False, True, True]),
     ],
 )
-def test_late_old_position_is_not_a_restart(stamps: tuple[int, ...], told: list[bool]) -> None:
+def test_late_old_position_is_not_a_restart(stamps: tuple[int, ...], expected: list[bool]) -> None:
     timing = Timing()
     for i in range(200):
         timing.take_position(100_000 + 50 * i, 50.0 + 0.05 * i)
@@ -312,7 +312,7 @@ def test_late_old_position_is_not_a_restart(stamps: tuple[int, ...], told: list[
     for i, stamp in enumerate(stamps):
         timing.take_position(stamp, 60.0 + 0.05 * i)
         restarted.append(timing.restarted)
-    assert restarted == told
+    assert restarted == expected
 
 
 def test_restart_is_detected_from_replies_alone() -> None:
@@ -339,13 +339,13 @@ def test_timing_of_frozen_vehicle_is_unknown_until_it_recovers() -> None:
     bench.worst = -math.inf
     bench.fly(10)
     assert bench.worst <= -REACTION_S + 0.01
-    assert max(bench.told[-100:]) <= REACTION_S + 0.02
+    assert max(bench.excess[-100:]) <= REACTION_S + 0.02
 
 
 @pytest.mark.parametrize("rate", [1.0, 3.0])
 @pytest.mark.parametrize("stall_s", [0.3, 0.8, 2.0, 3.0])
 def test_burst_after_stalled_connection_does_not_speed_up_clock(stall_s: float, rate: float) -> None:
-    """What TCP has kept comes late, in order, at one moment: the vehicle's clock seems to catch up."""
+    """After a stall, TCP delivers late data in order at one moment, so the vehicle's clock seems to catch up."""
     until = -math.inf
     in_order = 1 - 1e-6
     bench = Bench(steady(0.01), lambda: max(0.01, (until - bench.now) * in_order), clock=lambda t: rate * t + 7)
@@ -357,7 +357,7 @@ def test_burst_after_stalled_connection_does_not_speed_up_clock(stall_s: float, 
         paces.append(bench.timing.pace)
     assert min(paces) >= max(rate - 0.001, 1.0)
     assert max(paces) <= (1.0 if rate == 1.0 else rate * 1.1)
-    assert bench.worst <= 0.0, "what is late counts meanwhile"
+    assert bench.worst <= 0.0, "late data increases the estimate meanwhile"
 
 
 def test_delay_of_the_own_event_loop_is_included() -> None:
@@ -366,7 +366,7 @@ def test_delay_of_the_own_event_loop_is_included() -> None:
         timing.take_position(5000 + 50 * i, 1.0 + 0.05 * i)
     number = timing.request(3.5)
     assert number is not None
-    # It was due at 3.5, sent at 3.9 by a loop that was busy, and heard at once.
+    # The request was due at 3.5 s, but a busy loop sent it at 3.9 s. The response arrived at once.
     timing.take_reply(round((5.0 + 3.9 - 1.0) * 1e9), number, 3.95)
     assert timing.delay_s == pytest.approx(0.4, abs=0.01)
 

@@ -1,4 +1,4 @@
-"""UDP and serial links to an autopilot: who is heard, who is spoken to, and what a line does that breaks."""
+"""UDP and serial links to an autopilot: accepted addresses, and broken lines."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def heartbeat(autopilot: int = mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA) -> bytes:
 
 
 class Socket:
-    """Stands for the event loop's UDP transport."""
+    """Fake UDP transport of an event loop."""
 
     def __init__(self) -> None:
         self.sent: list[tuple[bytes, Any]] = []
@@ -33,36 +33,36 @@ class Socket:
 
 
 def link(connected: bool) -> tuple[Any, Socket, list[bytes]]:
-    heard: list[bytes] = []
-    made = transport._Datagrams(heard.append, lambda _error: None, connected)
+    received: list[bytes] = []
+    datagrams = transport._Datagrams(received.append, lambda _error: None, connected)
     socket = Socket()
-    made.connection_made(socket)  # type: ignore[arg-type]
-    return made, socket, heard
+    datagrams.connection_made(socket)  # type: ignore[arg-type]
+    return datagrams, socket, received
 
 
 def test_udpout_sends_before_it_receives() -> None:
-    made, socket, _ = link(connected=True)
-    made.write(b"hello")
+    datagrams, socket, _ = link(connected=True)
+    datagrams.write(b"hello")
     assert socket.sent == [(b"hello", None)]
 
 
 def test_udpin_accepts_only_the_first_autopilot(monkeypatch: pytest.MonkeyPatch) -> None:
     now = [100.0]
     monkeypatch.setattr(transport.time, "monotonic", lambda: now[0])
-    made, socket, heard = link(connected=False)
-    made.datagram_received(b"x", STRANGER)
-    made.datagram_received(heartbeat(mavlink.MAV_AUTOPILOT_INVALID), STRANGER)
-    made.write(b"lost")
-    assert not heard
+    datagrams, socket, received = link(connected=False)
+    datagrams.datagram_received(b"x", STRANGER)
+    datagrams.datagram_received(heartbeat(mavlink.MAV_AUTOPILOT_INVALID), STRANGER)
+    datagrams.write(b"lost")
+    assert not received
     assert not socket.sent
-    made.datagram_received(heartbeat(), AUTOPILOT)
-    made.datagram_received(heartbeat(), STRANGER)
-    made.write(b"command")
-    assert len(heard) == 1
+    datagrams.datagram_received(heartbeat(), AUTOPILOT)
+    datagrams.datagram_received(heartbeat(), STRANGER)
+    datagrams.write(b"command")
+    assert len(received) == 1
     assert socket.sent == [(b"command", AUTOPILOT)]
     now[0] += transport.PEER_SILENCE_S + 0.1
-    made.datagram_received(heartbeat(), STRANGER)
-    made.write(b"again")
+    datagrams.datagram_received(heartbeat(), STRANGER)
+    datagrams.write(b"again")
     assert socket.sent[-1] == (b"again", STRANGER)
 
 
@@ -73,21 +73,21 @@ def test_udpin_refuses_addresses_other_than_loopback(host: str) -> None:
 
 
 class Line:
-    """A pseudoterminal: we are the autopilot at its far end."""
+    """Pseudoterminal with the autopilot of the test at its other end."""
 
     def __init__(self) -> None:
         self.far, near = os.openpty()
         self.name = os.ttyname(near)
         os.close(near)
-        self.heard: list[bytes] = []
+        self.received: list[bytes] = []
         self.closed: list[Exception | None] = []
         self.news = asyncio.Event()
 
     async def open(self, speed: int = 115200) -> Any:
-        return await open_link(f"serial:{self.name}:{speed}", self._hear, self._close)
+        return await open_link(f"serial:{self.name}:{speed}", self._receive, self._close)
 
-    def _hear(self, data: bytes) -> None:
-        self.heard.append(data)
+    def _receive(self, data: bytes) -> None:
+        self.received.append(data)
         self.news.set()
 
     def _close(self, error: Exception | None) -> None:
@@ -104,9 +104,9 @@ class Line:
 async def test_serial_line_transfers_bytes_in_both_directions() -> None:
     line = Line()
     link = await line.open()
-    sent = bytes(range(256))  # with what terminals make of control characters left alone
+    sent = bytes(range(256))  # includes control characters, which terminals may change
     os.write(line.far, sent)
-    await line.until(lambda: b"".join(line.heard) == sent)
+    await line.until(lambda: b"".join(line.received) == sent)
     link.write(sent)
     assert os.read(line.far, 1000) == sent
     link.close()

@@ -1,4 +1,4 @@
-"""Whether a vehicle flies, when it says so, says otherwise, or says nothing."""
+"""Vehicle state from telemetry: airborne or landed, readiness, position and recorded path."""
 
 from __future__ import annotations
 
@@ -35,25 +35,28 @@ def test_forward_acceleration_is_derived_from_velocities(vx: tuple[int, int], fo
     vehicle = Vehicle(stack=ARDUCOPTER, located=True, gps_at=0.0)
     assert vehicle.forward_mps2 is None
     for i in range(12):
-        told = message("GLOBAL_POSITION_INT", time_boot_ms=i * 50, lat=1, lon=1, vx=vx[0] + i * vx[1])
-        vehicle.take(told, i * 0.05)
+        position = message("GLOBAL_POSITION_INT", time_boot_ms=i * 50, lat=1, lon=1, vx=vx[0] + i * vx[1])
+        vehicle.take(position, i * 0.05)
     assert vehicle.forward_mps2 == pytest.approx(forward_mps2, abs=0.01)
-    assert len(vehicle.velocity_history) < 10, "old ones are forgotten"
+    assert len(vehicle.velocity_history) < 10, "old velocities are removed"
 
 
 @pytest.mark.parametrize(
-    ("unplaced_s", "told", "lost"), [(11, True, False), (14, True, True), (11, False, False), (14, False, True)]
+    ("unplaced_s", "with_text", "path_lost"),
+    [(11, True, False), (14, True, True), (11, False, False), (14, False, True)],
 )
-def test_smart_rtl_path_is_lost_with_position_even_without_statustext(unplaced_s: int, told: bool, lost: bool) -> None:
+def test_smart_rtl_path_is_lost_with_position_even_without_statustext(
+    unplaced_s: int, with_text: bool, path_lost: bool
+) -> None:
     vehicle = Vehicle(stack=ARDUCOPTER, armed=True, positioned_at=0.0)
     for at in range(1, unplaced_s):
-        if told:
+        if with_text:
             vehicle.take(message("EKF_STATUS_REPORT", flags=BOOTED), float(at))
     vehicle.take(message("EKF_STATUS_REPORT", flags=POSITIONED), float(unplaced_s))
-    assert vehicle.path_lost is lost
+    assert vehicle.path_lost is path_lost
     for at in (20.0, 21.0):
         vehicle.take(message("HEARTBEAT"), at)
-    assert not vehicle.path_lost, "the next flight remembers its own"
+    assert not vehicle.path_lost, "the next flight records a new path"
 
 
 def test_landed_vehicle_without_position_keeps_smart_rtl_path() -> None:
@@ -71,9 +74,9 @@ def test_position_becomes_unknown_when_its_quality_is_no_longer_reported(silent:
     vehicle = Vehicle(stack=ARDUCOPTER)
     for tenth in range(300):
         now = tenth / 10
-        for told in (message("EKF_STATUS_REPORT", flags=POSITIONED), message("GPS_RAW_INT", fix_type=3, h_acc=800)):
-            if now < 10.0 or told.name != silent:
-                vehicle.take(told, now)
+        for received in (message("EKF_STATUS_REPORT", flags=POSITIONED), message("GPS_RAW_INT", fix_type=3, h_acc=800)):
+            if now < 10.0 or received.name != silent:
+                vehicle.take(received, now)
         vehicle.take(message("GLOBAL_POSITION_INT", lat=393600000, lon=229500000), now)
         if not 19.5 < now < 21.0:
             assert vehicle.position_fresh(now) is (now < 20.0)
@@ -97,7 +100,7 @@ def test_readiness_depends_on_requirements_of_the_arming_mode() -> None:
     vehicle.take(message("STATUSTEXT", severity=2, text=b"PreArm: AHRS: waiting for home"), 30.0)
     assert vehicle.arming_refusal(30.0) == "PreArm: AHRS: waiting for home"
     vehicle.take(message("SYS_STATUS", **HEALTHY), 31.0)
-    assert "EKF_STATUS_REPORT" in vehicle.arming_refusal(31.0), "one that never tells is not ready"
+    assert "EKF_STATUS_REPORT" in vehicle.arming_refusal(31.0), "a vehicle without EKF_STATUS_REPORT is not ready"
     vehicle.take(message("EKF_STATUS_REPORT", flags=BOOTED), 31.0)
     vehicle.take(message("HOME_POSITION", latitude=393600000, longitude=229500000), 31.0)
     assert "position estimate is not accurate" in vehicle.arming_refusal(31.0), (
@@ -117,9 +120,9 @@ def test_stale_reports_make_vehicle_not_ready(silent: str) -> None:
     vehicle = Vehicle(stack=ARDUCOPTER)
     vehicle.take(message("HOME_POSITION", latitude=393600000, longitude=229500000), 31.0)
     for now in (31.0, 39.0):
-        for told in (message("SYS_STATUS", **HEALTHY), message("EKF_STATUS_REPORT", flags=POSITIONED)):
-            if now == 31.0 or told.name != silent:
-                vehicle.take(told, now)
+        for received in (message("SYS_STATUS", **HEALTHY), message("EKF_STATUS_REPORT", flags=POSITIONED)):
+            if now == 31.0 or received.name != silent:
+                vehicle.take(received, now)
         assert (silent in vehicle.arming_refusal(now)) is (now > 31.0)
 
 
@@ -134,7 +137,7 @@ def test_vehicle_reports_satellites_wind_and_statustexts() -> None:
     vehicle.take(message("GPS_RAW_INT", fix_type=3, satellites_visible=14), 1.0)
     assert vehicle.satellites == 14
     vehicle.take(message("GPS_RAW_INT", fix_type=3, satellites_visible=255), 2.0)
-    assert vehicle.satellites == 0, "255: it does not say"
+    assert vehicle.satellites == 0, "255 means unknown"
     vehicle.take(message("WIND", direction=-90.0, speed=6.0), 3.0)
     assert (vehicle.wind_from_deg, vehicle.wind_mps, vehicle.wind_at) == (270.0, 6.0, 3.0)
     vehicle.take(message("WIND", direction=float("nan"), speed=6.0), 4.0)
@@ -145,12 +148,12 @@ def test_vehicle_reports_satellites_wind_and_statustexts() -> None:
     assert vehicle.status_texts[-1] == (60, 4, "text 59")
 
 
-@pytest.mark.parametrize(("flags", "lost"), [(POSITIONED, False), (BOOTED, True)])
-def test_smart_rtl_path_survives_service_restart_if_position_is_known(flags: int, lost: bool) -> None:
+@pytest.mark.parametrize(("flags", "path_lost"), [(POSITIONED, False), (BOOTED, True)])
+def test_smart_rtl_path_survives_service_restart_if_position_is_known(flags: int, path_lost: bool) -> None:
     vehicle = Vehicle(stack=ARDUCOPTER)
     vehicle.take(message("HEARTBEAT", base_mode=mavlink.MAV_MODE_FLAG_SAFETY_ARMED), 100.0)
     vehicle.take(message("EKF_STATUS_REPORT", flags=flags), 100.5)
     vehicle.take(message("EKF_STATUS_REPORT", flags=POSITIONED), 101.5)
-    assert vehicle.path_lost is lost
+    assert vehicle.path_lost is path_lost
     vehicle.take(message("EKF_STATUS_REPORT", flags=POSITIONED), 115.0)
-    assert vehicle.path_lost, "of what is silent for so long nothing is known"
+    assert vehicle.path_lost, "after a long silence, the path counts as lost"

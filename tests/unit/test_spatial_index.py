@@ -19,8 +19,8 @@ places = st.builds(lambda lat, lon: Point(lat=lat, lon=lon), latitudes, longitud
 
 
 def destination(place, bearing_deg, distance):
-    there = Geodesic.WGS84.Direct(place.lat, place.lon, bearing_deg, distance)
-    return Point(lat=there["lat2"], lon=there["lon2"])
+    target = Geodesic.WGS84.Direct(place.lat, place.lon, bearing_deg, distance)
+    return Point(lat=target["lat2"], lon=target["lon2"])
 
 
 def brute_force(points, centre, radius):
@@ -46,8 +46,8 @@ def test_within_equals_brute_force_anywhere_on_earth(centre, radius, spread):
 
 @given(places, st.lists(places, max_size=12), st.floats(300_000, 2e7))
 @settings(max_examples=examples(60), deadline=None)
-def test_within_equals_brute_force_for_huge_radii(centre, others, radius):
-    points = {f"n{i}": p for i, p in enumerate(others)}
+def test_within_equals_brute_force_for_huge_radii(centre, other_points, radius):
+    points = {f"n{i}": p for i, p in enumerate(other_points)}
     result = index_of(points).within(centre, radius)
     expected = brute_force(points, centre, radius)
     assert [n for n, _ in result] == [n for n, _ in expected]
@@ -165,8 +165,8 @@ def test_nearest_orders_equal_distances_by_name_at_its_limit():
 
 @given(places, st.integers(1, 8), st.floats(0, 2e7), st.floats(1e5, 2e7), st.lists(places, max_size=12))
 @settings(max_examples=examples(60), deadline=None)
-def test_nearest_equals_brute_force_at_any_distance(centre, count, beyond, limit, others):
-    points = {f"n{i:02d}": p for i, p in enumerate(others)}
+def test_nearest_equals_brute_force_at_any_distance(centre, count, beyond, limit, other_points):
+    points = {f"n{i:02d}": p for i, p in enumerate(other_points)}
     distances = {n: geodesic_m(centre, p) for n, p in points.items()}
     assume(all(abs(d - beyond) > 1e-3 and abs(d - limit) > 1e-3 for d in distances.values()))
     expected = [n for n, d in brute_force(points, centre, limit) if d > beyond][:count]

@@ -19,11 +19,11 @@ URL = "udpout:192.168.1.2:14550"
 
 
 class Air:
-    """A link, and a vehicle that tells its heartbeat once a second once it was spoken to."""
+    """Fake link to a vehicle that sends a heartbeat each second after it received a first message."""
 
     def __init__(self, *, state: int = mavlink.MAV_STATE_ACTIVE, armed: bool = True, sysid: int = 1) -> None:
         self._vehicle = Endpoint(sysid, 1)
-        self._told = {
+        self._contacted = {
             "type": mavlink.MAV_TYPE_QUADROTOR, "autopilot": mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, "custom_mode": mavlink.COPTER_MODE_GUIDED,
             "system_status": state, "base_mode": mavlink.MAV_MODE_FLAG_SAFETY_ARMED if armed else 0,
         }  # fmt: skip
@@ -41,14 +41,14 @@ class Air:
 
     def _fly(self, receive: Callable[[bytes], None]) -> None:
         if self._receive is not None:
-            receive(self._vehicle.encode("HEARTBEAT", self._told))
+            receive(self._vehicle.encode("HEARTBEAT", self._contacted))
         self._again = asyncio.get_running_loop().call_later(1.0, self._fly, receive)
 
     def write(self, data: bytes) -> None:
         self._receive = self._receive or (lambda _data: None)
-        for heard in Parser().feed(data):
-            if heard.name == "HEARTBEAT":
-                assert (heard.sysid, heard.compid) == (SYSTEM_ID, COMPONENT_ID)
+        for received in Parser().feed(data):
+            if received.name == "HEARTBEAT":
+                assert (received.sysid, received.compid) == (SYSTEM_ID, COMPONENT_ID)
                 self.beats.append(asyncio.get_running_loop().time())
 
     def close(self) -> None:

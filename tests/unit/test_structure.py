@@ -38,13 +38,13 @@ def sources() -> Iterator[tuple[str, str]]:
 
 
 def test_packages_are_documented_and_have_import_contracts() -> None:
-    found = {path.parent.name: path.parts[-3] for path in ROOT.glob("*/fractus*/__init__.py")}
-    assert set(found.values()) == {*SOURCE_ROOTS, "proto"}
+    problems = {path.parent.name: path.parts[-3] for path in ROOT.glob("*/fractus*/__init__.py")}
+    assert set(problems.values()) == {*SOURCE_ROOTS, "proto"}
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())
-    assert set(project["tool"]["importlinter"]["root_packages"]) == set(found)
+    assert set(project["tool"]["importlinter"]["root_packages"]) == set(problems)
     for document in ("CONTRIBUTING.md", "docs/architecture.md"):
         text = (ROOT / document).read_text()
-        assert not [package for package in found if not re.search(rf"\b{package}\b", text)], document
+        assert not [package for package in problems if not re.search(rf"\b{package}\b", text)], document
 
 
 def test_modules_have_no_import_cycles() -> None:
@@ -61,7 +61,7 @@ def test_type_ignores_have_a_reason() -> None:
         for number, line in enumerate(text.splitlines(), 1)
         if "# type: ignore" in line
     ]
-    assert not [where for where, line in silenced if not re.search(r"# type: ignore\[[\w, -]+\]  # \w", line)]
+    assert not [location for location, line in silenced if not re.search(r"# type: ignore\[[\w, -]+\]  # \w", line)]
 
 
 WHOLE_SERVICE = re.compile(

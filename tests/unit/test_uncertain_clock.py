@@ -132,7 +132,7 @@ def test_unknown_caller_is_judged_by_later_reading_of_uncertain_clock(machine: M
     expired = certificate(-2 * DAY_S, -1.0)
     machine.offset_s -= 2 * DAY_S
     assert machine.accepts(fresh)
-    assert not machine.accepts(expired), "a clock that is set back does not make it valid"
+    assert not machine.accepts(expired), "a clock that is set back does not make the certificate valid"
     machine.offset_s += 402 * DAY_S
     assert not machine.accepts(certificate())
     assert not machine.accepts(fresh), "callers are not remembered while the clock is uncertain"
@@ -162,7 +162,7 @@ def test_caller_without_valid_identity_is_refused(machine: Machine) -> None:
         machine.caller(certificate(-DAY_S, -1.0))
     with pytest.raises(NotAuthenticated, match="not valid yet"):
         machine.caller(certificate(90.0))
-    assert machine.accepts(certificate(30.0)), "clocks may differ by that much"
+    assert machine.accepts(certificate(30.0)), "clocks may differ by up to this time"
 
 
 def test_number_of_remembered_callers_is_limited(machine: Machine) -> None:

@@ -33,10 +33,10 @@ def known_file(directory: Path, url: str = URL) -> KnownVehicleFile:
     return KnownVehicleFile(directory / "vehicle.json", url)
 
 
-async def stored(found: KnownVehicleFile) -> None:
-    assert found._storing is not None
+async def stored(file: KnownVehicleFile) -> None:
+    assert file._storing is not None
     async with asyncio.timeout(10):
-        await found._storing
+        await file._storing
 
 
 def test_vehicle_on_the_ground_is_replaced_before_it_is_confirmed_and_not_afterwards() -> None:
@@ -70,12 +70,12 @@ async def test_unknown_vehicle_is_selected_and_stored_after_it_was_alone(tmp_pat
     assert known.own is None, "another vehicle may still appear"
     assert not selector.problem(heartbeat(7), SELECT_AFTER_S + CONFIRM_AFTER_S + 0.1)
     await stored(known)
-    again = VehicleSelector(known_file(tmp_path))
-    assert not again.select(heartbeat(8), 0.0, flying=False)
-    assert not again.select(heartbeat(8), 3600.0, flying=False), "an unknown vehicle is ignored on the ground, too"
-    assert "MAVLink system 8" in again.problem(heartbeat(8), 3600.0)
-    assert again.select(heartbeat(7, armed=True), 3600.5, flying=False)
-    assert "systems 8)" in again.problem(heartbeat(7), 3600.5)
+    restarted = VehicleSelector(known_file(tmp_path))
+    assert not restarted.select(heartbeat(8), 0.0, flying=False)
+    assert not restarted.select(heartbeat(8), 3600.0, flying=False), "an unknown vehicle is ignored on the ground, too"
+    assert "MAVLink system 8" in restarted.problem(heartbeat(8), 3600.0)
+    assert restarted.select(heartbeat(7, armed=True), 3600.5, flying=False)
+    assert "systems 8)" in restarted.problem(heartbeat(7), 3600.5)
     assert known_file(tmp_path, "serial:/dev/ttyACM0:115200").own is None
 
 

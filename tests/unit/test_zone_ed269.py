@@ -14,7 +14,7 @@ def ed269(applicability, **volume):
         "uomDimensions": "M", "lowerLimit": 0, "lowerVerticalReference": "AGL", "upperLimit": 120, "upperVerticalReference": "AGL",
         "horizontalProjection": {"type": "Circle", "center": [4.0, 50.0], "radius": 500}, **volume,
     }  # fmt: skip
-    one = {
+    feature = {
         "identifier": "BEL0001",
         "country": "BEL",
         "name": "Hospital",
@@ -23,8 +23,8 @@ def ed269(applicability, **volume):
         "applicability": applicability,
         "geometry": [geometry],
     }
-    found = formats.read_ed269(json.dumps({"title": "t", "features": [one]}))
-    return found.zones[0].spec, found.notes
+    imported = formats.read_ed269(json.dumps({"title": "t", "features": [feature]}))
+    return imported.zones[0].spec, imported.notes
 
 
 def test_ed269_reads_foreign_file():

@@ -56,9 +56,9 @@ def kml(inside, around=""):
 @pytest.mark.parametrize("name", WRITERS)
 def test_zone_areas_survive_export_and_import(name):
     write, read = WRITERS[name]
-    back = read(write([BLOCK, ROUND]).text).zones
-    assert len(back) == 2
-    block, disc = sorted(back, key=lambda z: -shape(z.spec).area)
+    read_back = read(write([BLOCK, ROUND]).text).zones
+    assert len(read_back) == 2
+    block, disc = sorted(read_back, key=lambda z: -shape(z.spec).area)
     if name == "qgc-plan":
         assert shape(block.spec).area == pytest.approx(
             area_polygon(LocalFrame(50, 4), zone("x", {"polygon": {"exterior": points(SQUARE)}}).spec.area).area
@@ -66,7 +66,9 @@ def test_zone_areas_survive_export_and_import(name):
     else:
         assert shape(block.spec).symmetric_difference(shape(BLOCK.spec)).area < 1e-3 * shape(BLOCK.spec).area
     assert shape(disc.spec).area == pytest.approx(shape(ROUND.spec).area, rel=3e-3)
-    assert shape(disc.spec).buffer(0.01).covers(shape(ROUND.spec).buffer(-0.2)), "never smaller than the circle"
+    assert shape(disc.spec).buffer(0.01).covers(shape(ROUND.spec).buffer(-0.2)), (
+        "the polygon is never smaller than the circle"
+    )
 
 
 @pytest.mark.parametrize(
@@ -85,16 +87,16 @@ def test_export_notes_parts_that_the_format_cannot_represent(name, sentences):
 
 
 def test_geojson_keeps_altitude_and_schedule():
-    back = formats.read_geojson(formats.write_geojson([BLOCK]).text)
-    assert back.notes == ()
-    assert back.zones[0].spec == BLOCK.spec
+    read_back = formats.read_geojson(formats.write_geojson([BLOCK]).text)
+    assert read_back.notes == ()
+    assert read_back.zones[0].spec == BLOCK.spec
 
 
 def test_ed269_keeps_altitude_schedule_and_circles():
-    back = formats.read_ed269(formats.write_ed269([BLOCK, ROUND]).text).zones
-    assert back[0].spec.altitude == BLOCK.spec.altitude
-    assert back[0].spec.schedule == BLOCK.spec.schedule
-    assert back[1].spec.area == ROUND.spec.area
+    read_back = formats.read_ed269(formats.write_ed269([BLOCK, ROUND]).text).zones
+    assert read_back[0].spec.altitude == BLOCK.spec.altitude
+    assert read_back[0].spec.schedule == BLOCK.spec.schedule
+    assert read_back[1].spec.area == ROUND.spec.area
 
 
 def feature(geometry, **more):
@@ -110,10 +112,10 @@ def test_geojson_reads_foreign_file():
         feature({"type": "Point", "coordinates": [4, 50]}, properties={"name": "Old Town", "radius": 20}),
         feature({"type": "LineString", "coordinates": SQUARE}, properties={"title": "road"}),
     ]
-    found = formats.read_geojson(json.dumps({"type": "FeatureCollection", "features": features}))
-    assert [z.name for z in found.zones] == ["old-town", "old-town-2", "old-town-3"]
-    assert found.zones[2].spec.area.circle.radius == 20
-    assert found.notes == (
+    imported = formats.read_geojson(json.dumps({"type": "FeatureCollection", "features": features}))
+    assert [z.name for z in imported.zones] == ["old-town", "old-town-2", "old-town-3"]
+    assert imported.zones[2].spec.area.circle.radius == 20
+    assert imported.notes == (
         "Old Town: properties owner cannot be imported; left out",
         "road: a geometry of type LineString is not a zone; left out",
     )
@@ -156,9 +158,9 @@ FLAT = {"type": "Polygon", "coordinates": [SQUARE]}
 def test_geojson_accepts_wgs84_and_ignores_heights_with_an_altitude_property():
     named = {"type": "name", "properties": {"name": "urn:ogc:def:crs:OGC:1.3:CRS84"}}
     whole = feature(HIGH, id="a", properties={"altitude": {"upper": 30, "reference": "terrain"}}) | {"crs": named}
-    found = formats.read_geojson("\ufeff" + json.dumps(whole))
-    assert found.zones[0].spec.altitude.upper == 30
-    assert found.notes == ("a: heights of its points are ignored; properties.altitude is used",)
+    imported = formats.read_geojson("\ufeff" + json.dumps(whole))
+    assert imported.zones[0].spec.altitude.upper == 30
+    assert imported.notes == ("a: heights of its points are ignored; properties.altitude is used",)
 
 
 def test_geojson_imports_every_polygon_of_a_collection():
@@ -168,9 +170,9 @@ def test_geojson_imports_every_polygon_of_a_collection():
     ]
     collection = {"type": "GeometryCollection", "geometries": [*parts, {"type": "Point", "coordinates": [4, 50]}]}
     for whole in (feature(collection, id="a"), collection):
-        found = formats.read_geojson(json.dumps(whole))
-        assert len(found.zones) == 3
-        assert len(found.notes) == 1
+        imported = formats.read_geojson(json.dumps(whole))
+        assert len(imported.zones) == 3
+        assert len(imported.notes) == 1
 
 
 def test_geojson_adds_points_along_parallels():
@@ -179,14 +181,14 @@ def test_geojson_adds_points_along_parallels():
     The imported zone follows the parallel to half a metre.
     """
     wide = [[4, 50], [6, 50], [6, 50.5], [4, 50.5], [4, 50]]
-    (found,) = formats.read_geojson(json.dumps(feature({"type": "Polygon", "coordinates": [wide]}))).zones
-    frame = LocalFrame.at(area_center(found.spec.area))
-    shape = area_polygon(frame, found.spec.area)
+    (imported,) = formats.read_geojson(json.dumps(feature({"type": "Polygon", "coordinates": [wide]}))).zones
+    frame = LocalFrame.at(area_center(imported.spec.area))
+    shape = area_polygon(frame, imported.spec.area)
     for i in range(1, 200):
         for lat in (50, 50.5):
             along = shapely.Point(frame.xy(lat, 4 + i / 100))
             assert shape.exterior.distance(along) < 0.6
-    assert len(found.spec.area.polygon.exterior) < 100
+    assert len(imported.spec.area.polygon.exterior) < 100
 
 
 LAMBERT = {"type": "name", "properties": {"name": "urn:ogc:def:crs:EPSG::31370"}}
@@ -250,11 +252,11 @@ def test_import_reports_every_rejected_feature_and_can_leave_it_out(tmp_path):
     )
     assert re.search(r"town.geojson:[1-9][0-9]*: features\[2\].geometry.layer: .* \(in c\)", second)
     without = ["--leave-out", "a", "--leave-out", "c"]
-    found = CliRunner().invoke(command, ["import", str(source), "--from", "geojson", *without])
-    assert [m["metadata"]["name"] for m in yaml.safe_load_all(found.stdout)] == ["b"]
-    assert "a: left out as requested" in found.stderr
-    lost = CliRunner().invoke(command, ["import", str(source), "--from", "geojson", *without, "--leave-out", "d"])
-    assert "there is no feature d to leave out; correct its name" in lost.stderr
+    imported = CliRunner().invoke(command, ["import", str(source), "--from", "geojson", *without])
+    assert [m["metadata"]["name"] for m in yaml.safe_load_all(imported.stdout)] == ["b"]
+    assert "a: left out as requested" in imported.stderr
+    unknown = CliRunner().invoke(command, ["import", str(source), "--from", "geojson", *without, "--leave-out", "d"])
+    assert "there is no feature d to leave out; correct its name" in unknown.stderr
 
 
 @pytest.mark.parametrize(
@@ -295,8 +297,8 @@ def test_import_rejects_properties_that_suggest_altitude_or_time(name, tmp_path)
 
 @pytest.mark.parametrize("name", ["owner", "kind", "fromage", "timer", "status", "id", "restriction"])
 def test_import_notes_other_properties(name):
-    found = formats.read_geojson(json.dumps(feature(FLAT, properties={"name": "a", name: "x"})))
-    assert found.notes == (f"a: properties {name} cannot be imported; left out",)
+    imported = formats.read_geojson(json.dumps(feature(FLAT, properties={"name": "a", name: "x"})))
+    assert imported.notes == (f"a: properties {name} cannot be imported; left out",)
 
 
 def test_import_rejects_unknown_properties_to_drop(tmp_path):
@@ -311,17 +313,17 @@ def test_import_rejects_unknown_properties_to_drop(tmp_path):
 def test_import_limits_the_points_of_a_file(monkeypatch):
     long = [[-179, 60], [179, 60], [179, 70], [-179, 70]]
     around = [[[x / 2 - 80, y] for x, y in long]]
-    one = feature({"type": "Polygon", "coordinates": around})
-    count = len(formats.read_geojson(json.dumps(one)).zones[0].spec.area.polygon.exterior)
+    polygon = feature({"type": "Polygon", "coordinates": around})
+    count = len(formats.read_geojson(json.dumps(polygon)).zones[0].spec.area.polygon.exterior)
     assert count > 100 * len(long)
     monkeypatch.setattr(zone_builder, "MAX_POINTS", 3 * count)
-    collection = {"type": "FeatureCollection", "features": [one] * 3}
+    collection = {"type": "FeatureCollection", "features": [polygon] * 3}
     assert len(formats.read_geojson(json.dumps(collection)).zones) == 3
     holes = feature({"type": "Polygon", "coordinates": around * 4})
-    for more in (collection | {"features": [one] * 1000}, collection | {"features": [holes, one]}):
+    for more in (collection | {"features": [polygon] * 1000}, collection | {"features": [holes, polygon]}):
         with pytest.raises(InvalidObject, match=f"the file needs more than {3 * count} points") as refused:
             formats.read_geojson(json.dumps(more))
-        assert not isinstance(refused.value, formats.InexactFeatures), "it is not read on"
+        assert not isinstance(refused.value, formats.InexactFeatures), "the file is not read further"
 
 
 def test_import_rejects_duplicate_keys():
@@ -419,13 +421,13 @@ def test_import_of_bad_file_raises_readable_error(read, text, sentence):
 def test_zones_command_imports_and_exports(tmp_path):
     source = tmp_path / "town.geojson"
     source.write_text(formats.write_geojson([BLOCK, ROUND]).text)
-    found = CliRunner().invoke(command, ["import", str(source), "--from", "geojson", "--prefix", "town-"])
-    assert found.exit_code == 0, found.output
-    manifests = list(yaml.safe_load_all(found.stdout))
+    imported = CliRunner().invoke(command, ["import", str(source), "--from", "geojson", "--prefix", "town-"])
+    assert imported.exit_code == 0, imported.output
+    manifests = list(yaml.safe_load_all(imported.stdout))
     assert [m["metadata"]["name"] for m in manifests] == ["town-block", "town-round"]
     assert all(Zone.from_body(m) for m in manifests)
     target = tmp_path / "zones.yaml"
-    target.write_text(found.stdout)
+    target.write_text(imported.stdout)
     written = CliRunner().invoke(command, ["export", str(target), "--to", "qgc-plan"])
     assert json.loads(written.stdout)["geoFence"]["polygons"][0]["inclusion"] is False
     assert "left out" in written.stderr

@@ -1,4 +1,4 @@
-"""Courses of the golden flights, one function each."""
+"""Scripts of the golden flights, one function each."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ from fractus_core.control.state import FlightMode
 from fractus_core.policy.decision_types import SetSpeedArgs, TakeoffArgs, VelocityArgs
 from mobility_world import GUIDED, LAND, LOITER, RTL, partial, spec, touring, zone
 
-Course = Callable[[Flight], Coroutine[Any, Any, None]]
+Script = Callable[[Flight], Coroutine[Any, Any, None]]
 
-FLIGHTS: dict[str, Course] = {}
+FLIGHTS: dict[str, Script] = {}
 
 
-def course(flown: Course) -> Course:
+def script(function: Script) -> Script:
     """Register a golden flight under its name."""
-    FLIGHTS[flown.__name__] = flown
-    return flown
+    FLIGHTS[function.__name__] = function
+    return function
 
 
 WALL = (-40.0, 25.0, 40.0, 40.0)
-HERE = (-30.0, 10.0, 30.0, 60.0)
-POINTS = [{"navigation": "pathBased", "path": [{"lat": 39.3603, "lon": 22.95, "alt": 10.0}]}] * 2
+AROUND_DRONE = (-30.0, 10.0, 30.0, 60.0)
+CONTROL_POINTS = [{"navigation": "pathBased", "path": [{"lat": 39.3603, "lon": 22.95, "alt": 10.0}]}] * 2
 
 
-@course
-async def whole_mission(f: Flight) -> None:
+@script
+async def complete_mission(f: Flight) -> None:
     held = f.put(spec())
     await f.up(held)
     await f.goto(held, 0, 70)
@@ -38,9 +38,9 @@ async def whole_mission(f: Flight) -> None:
     await f.sleep(1)
 
 
-@course
+@script
 async def two_control_points(f: Flight) -> None:
-    held = f.put(spec(controlPoints=POINTS))
+    held = f.put(spec(controlPoints=CONTROL_POINTS))
     await f.up(held)
     await f.goto(held, 0, 33.4)
     await f.give_back(held)
@@ -51,18 +51,18 @@ async def two_control_points(f: Flight) -> None:
     await f.landed()
 
 
-@course
-async def next_point_not_asked_for(f: Flight) -> None:
-    held = f.put(spec(controlPoints=POINTS))
+@script
+async def second_control_point_unused(f: Flight) -> None:
+    held = f.put(spec(controlPoints=CONTROL_POINTS))
     await f.up(held)
     await f.give_back(held)
     await f.landed()
 
 
-@course
+@script
 async def transit(f: Flight) -> None:
     held = f.put(
-        partial(zone("wall", "ignore", *WALL), controlPoints=[*POINTS, *spec().model_dump()["control_points"]])
+        partial(zone("wall", "ignore", *WALL), controlPoints=[*CONTROL_POINTS, *spec().model_dump()["control_points"]])
     )
     await f.drive(held)
     await f.give_back(held)
@@ -74,7 +74,7 @@ async def transit(f: Flight) -> None:
     await f.landed()
 
 
-@course
+@script
 async def waiting_driver_leaves_transit(f: Flight) -> None:
     held = f.put(partial())
     stream = f.follow(held)
@@ -83,7 +83,7 @@ async def waiting_driver_leaves_transit(f: Flight) -> None:
     await f.landed()
 
 
-@course
+@script
 async def waiting_driver_leaves_before_arming(f: Flight) -> None:
     held = f.put(partial())
     f.world.plane.vehicle.ready = False
@@ -95,11 +95,11 @@ async def waiting_driver_leaves_before_arming(f: Flight) -> None:
     await f.drive(held, "again")
 
 
-@course
-async def driver_comes_back(f: Flight) -> None:
+@script
+async def driver_reconnects(f: Flight) -> None:
     held = f.put(spec())
     stream = await f.up(held)
-    f.going(held, 0, 90)
+    f.start_goto(held, 0, 90)
     await f.sleep(5)
     stream.cancel()
     await f.sleep(3)
@@ -109,13 +109,13 @@ async def driver_comes_back(f: Flight) -> None:
     await f.landed()
 
 
-@course
+@script
 async def driver_lost(f: Flight) -> None:
     held = f.put(spec(zone("wall", "ignore", *WALL)))
     stream = await f.up(held)
     await f.goto(held, 60, 30)
     await f.goto(held, 60, 70)
-    f.going(held, -60, 70)
+    f.start_goto(held, -60, 70)
     await f.sleep(4)
     stream.cancel()
     await f.landed()
@@ -123,7 +123,7 @@ async def driver_lost(f: Flight) -> None:
     await f.sleep(1)
 
 
-@course
+@script
 async def driver_lost_while_landing(f: Flight) -> None:
     held = f.put(spec())
     stream = await f.up(held)
@@ -134,8 +134,8 @@ async def driver_lost_while_landing(f: Flight) -> None:
     await f.sleep(10)
 
 
-@course
-async def driver_lost_on_its_way_home(f: Flight) -> None:
+@script
+async def driver_lost_during_return(f: Flight) -> None:
     held = f.put(spec())
     stream = await f.up(held)
     await f.goto(held, 0, 60)
@@ -146,8 +146,8 @@ async def driver_lost_on_its_way_home(f: Flight) -> None:
     await f.landed()
 
 
-@course
-async def driver_lost_over_its_home(f: Flight) -> None:
+@script
+async def driver_lost_above_home(f: Flight) -> None:
     held = f.put(spec())
     stream = await f.up(held)
     await f.goto(held, 0, 60)
@@ -158,7 +158,7 @@ async def driver_lost_over_its_home(f: Flight) -> None:
     await f.landed()
 
 
-@course
+@script
 async def driver_lost_on_the_ground(f: Flight) -> None:
     held = f.put(spec())
     stream = await f.drive(held)
@@ -170,16 +170,16 @@ async def driver_lost_on_the_ground(f: Flight) -> None:
     await f.landed()
 
 
-@course
+@script
 async def driver_lost_while_arming(f: Flight) -> None:
     held = f.put(spec())
-    raising = f.world.fence.raise_around
+    raise_around = f.world.fence.raise_around
 
-    async def slowly(*what: Any, **how: Any) -> None:
-        await raising(*what, **how)
+    async def raise_slowly(*args: Any, **options: Any) -> None:
+        await raise_around(*args, **options)
         await asyncio.sleep(3)
 
-    f.world.fence.raise_around = slowly  # type: ignore[method-assign]
+    f.world.fence.raise_around = raise_slowly  # type: ignore[method-assign]
     stream = await f.drive(held)
     f.call("Arm", lambda: f.world.service.arm(held))
     await f.sleep(1)
@@ -187,8 +187,8 @@ async def driver_lost_while_arming(f: Flight) -> None:
     await f.sleep(10)
 
 
-@course
-async def driver_lands_and_stays(f: Flight) -> None:
+@script
+async def driver_lands_and_flies_again(f: Flight) -> None:
     held = f.put(spec())
     await f.up(held)
     await f.do("Land", lambda: f.world.service.land(held))
@@ -200,7 +200,7 @@ async def driver_lands_and_stays(f: Flight) -> None:
     await f.sleep(5)
 
 
-@course
+@script
 async def landed_driver_is_lost(f: Flight) -> None:
     held = f.put(spec())
     stream = await f.up(held)
@@ -209,7 +209,7 @@ async def landed_driver_is_lost(f: Flight) -> None:
     await f.sleep(10)
 
 
-@course
+@script
 async def second_stream_takes_over(f: Flight) -> None:
     held = f.put(spec())
     await f.up(held)
@@ -219,8 +219,8 @@ async def second_stream_takes_over(f: Flight) -> None:
     await f.landed()
 
 
-@course
-async def others_wait_or_are_refused(f: Flight) -> None:
+@script
+async def other_drivers_wait_or_are_refused(f: Flight) -> None:
     held = f.put(spec())
     other = f.put(spec(instance="other"), "m2")
     f.world.plane.vehicle.ready = False
@@ -241,8 +241,8 @@ async def others_wait_or_are_refused(f: Flight) -> None:
     await f.landed()
 
 
-@course
-async def waiting_stream_gives_way_to_the_mission_that_flies(f: Flight) -> None:
+@script
+async def waiting_stream_yields_to_flying_mission(f: Flight) -> None:
     held = f.put(spec())
     other = f.put(spec(instance="other"), "m2")
     stream = await f.up(held)
@@ -256,22 +256,22 @@ async def waiting_stream_gives_way_to_the_mission_that_flies(f: Flight) -> None:
     await f.sleep(10)
 
 
-def taken(action: str) -> Callable[[Flight], Coroutine[Any, Any, None]]:
-    async def course(f: Flight) -> None:
+def takeover(action: str) -> Callable[[Flight], Coroutine[Any, Any, None]]:
+    async def script(f: Flight) -> None:
         held = f.put(spec())
         await f.up(held)
-        f.going(held, 0, 70)
+        f.start_goto(held, 0, 70)
         await f.sleep(6)
-        f.put(spec(zone("around", action, *HERE)))
+        f.put(spec(zone("around", action, *AROUND_DRONE)))
         await f.sleep(20)
         f.follow(held, "again")
         await f.sleep(3)
         await f.landed()
 
-    return course
+    return script
 
 
-@course
+@script
 async def zone_appears_in_transit(f: Flight) -> None:
     f.follow(f.put(partial()))
     await f.until(lambda: f.world.plane.xy[1] > 16)
@@ -279,7 +279,7 @@ async def zone_appears_in_transit(f: Flight) -> None:
     await f.landed()
 
 
-@course
+@script
 async def grant_removed(f: Flight) -> None:
     held = f.put(spec(zone("wall", "ignore", *WALL)))
     await f.up(held)
@@ -289,7 +289,7 @@ async def grant_removed(f: Flight) -> None:
     await f.landed()
 
 
-@course
+@script
 async def grant_removed_on_the_ground(f: Flight) -> None:
     held = f.put(spec())
     await f.drive(held)
@@ -301,7 +301,7 @@ async def grant_removed_on_the_ground(f: Flight) -> None:
     await f.sleep(1)
 
 
-@course
+@script
 async def grant_removed_while_waiting(f: Flight) -> None:
     held = f.put(spec())
     f.world.plane.vehicle.ready = False
@@ -311,8 +311,8 @@ async def grant_removed_while_waiting(f: Flight) -> None:
     await f.sleep(2)
 
 
-@course
-async def grant_removed_on_the_way_home(f: Flight) -> None:
+@script
+async def grant_removed_during_return(f: Flight) -> None:
     held = f.put(spec())
     await f.up(held)
     await f.goto(held, 0, 70)
@@ -322,11 +322,11 @@ async def grant_removed_on_the_way_home(f: Flight) -> None:
     await f.landed()
 
 
-@course
+@script
 async def grant_changes(f: Flight) -> None:
     held = f.put(spec())
     await f.up(held)
-    flying = f.going(held, 0, 90)
+    flying = f.start_goto(held, 0, 90)
     await f.sleep(3)
     f.put(spec(limits={"maxAltitude": 40, "maxSpeed": 3}))
     await flying
@@ -334,11 +334,11 @@ async def grant_changes(f: Flight) -> None:
     await f.landed()
 
 
-@course
-async def pilot_takes_and_hands_back(f: Flight) -> None:
+@script
+async def pilot_takes_over_and_hands_back(f: Flight) -> None:
     held = f.put(spec())
     await f.up(held)
-    f.going(held, 0, 70)
+    f.start_goto(held, 0, 70)
     await f.sleep(4)
     f.world.plane.set_to(LOITER)
     await f.sleep(8)
@@ -351,7 +351,7 @@ async def pilot_takes_and_hands_back(f: Flight) -> None:
     await f.landed()
 
 
-@course
+@script
 async def pilot_hands_back_a_mission_without_grant(f: Flight) -> None:
     held = f.put(spec())
     await f.up(held)
@@ -363,7 +363,7 @@ async def pilot_hands_back_a_mission_without_grant(f: Flight) -> None:
     await f.landed()
 
 
-@course
+@script
 async def pilot_lands(f: Flight) -> None:
     held = f.put(spec())
     await f.up(held)
@@ -373,8 +373,8 @@ async def pilot_lands(f: Flight) -> None:
     await f.sleep(5)
 
 
-@course
-async def pilot_takes_on_the_way_home(f: Flight) -> None:
+@script
+async def pilot_takes_over_during_return(f: Flight) -> None:
     held = f.put(spec())
     await f.up(held)
     await f.goto(held, 0, 70)
@@ -386,7 +386,7 @@ async def pilot_takes_on_the_way_home(f: Flight) -> None:
     await f.landed()
 
 
-@course
+@script
 async def pilot_arms(f: Flight) -> None:
     held = f.put(spec())
     f.world.plane.vehicle.armed = True
@@ -399,7 +399,7 @@ async def pilot_arms(f: Flight) -> None:
     await f.sleep(1)
 
 
-@course
+@script
 async def pilot_changes_modes_on_the_ground(f: Flight) -> None:
     held = f.put(spec())
     f.world.plane.set_to(LOITER)
@@ -410,20 +410,20 @@ async def pilot_changes_modes_on_the_ground(f: Flight) -> None:
 
 
 def failsafe(mode: FlightMode) -> Callable[[Flight], Coroutine[Any, Any, None]]:
-    async def course(f: Flight) -> None:
+    async def script(f: Flight) -> None:
         held = f.put(spec())
         await f.up(held)
-        f.going(held, 0, 70)
+        f.start_goto(held, 0, 70)
         await f.sleep(5)
         f.failsafe(mode)
         await f.sleep(2)
         f.follow(held, "again")
         await f.landed()
 
-    return course
+    return script
 
 
-@course
+@script
 async def failsafe_in_transit_then_pilot(f: Flight) -> None:
     f.follow(f.put(partial()))
     await f.until(lambda: f.world.plane.xy[1] > 20)
@@ -435,23 +435,23 @@ async def failsafe_in_transit_then_pilot(f: Flight) -> None:
     await f.landed()
 
 
-@course
-async def link_lost_and_found(f: Flight) -> None:
+@script
+async def link_reconnects(f: Flight) -> None:
     held = f.put(spec())
     await f.up(held)
-    f.going(held, 0, 70)
+    f.start_goto(held, 0, 70)
     await f.sleep(3)
-    f.lose_link()
+    f.break_link()
     await f.sleep(8)
-    f.find_link()
+    f.restore_link()
     await f.sleep(3)
     await f.goto(held, 0, 20)
     await f.give_back(held)
     await f.landed()
 
 
-@course
-async def link_lost_on_the_way_home(f: Flight) -> None:
+@script
+async def link_lost_during_return(f: Flight) -> None:
     held = f.put(spec(zone("wall", "ignore", *WALL)))
     await f.up(held)
     await f.goto(held, 60, 30)
@@ -459,42 +459,42 @@ async def link_lost_on_the_way_home(f: Flight) -> None:
     await f.goto(held, 0, 70)
     await f.give_back(held)
     await f.sleep(3)
-    f.lose_link()
+    f.break_link()
     await f.sleep(8)
-    f.find_link()
+    f.restore_link()
     await f.landed()
 
 
-@course
-async def link_lost_in_grace(f: Flight) -> None:
+@script
+async def link_lost_during_grace(f: Flight) -> None:
     held = f.put(spec())
     stream = await f.up(held)
     stream.cancel()
-    f.lose_link()
+    f.break_link()
     await f.sleep(7)
-    f.find_link()
+    f.restore_link()
     await f.landed()
 
 
-@course
-async def link_found_with_the_autopilot_on_its_way_home(f: Flight) -> None:
+@script
+async def link_reconnects_during_autopilot_return(f: Flight) -> None:
     held = f.put(spec())
     stream = await f.up(held)
     await f.goto(held, 0, 70)
     stream.cancel()
-    f.lose_link()
+    f.break_link()
     await f.sleep(1)
     f.world.plane.set_to(RTL)
     await f.sleep(7)
-    f.find_link()
+    f.restore_link()
     await f.landed()
 
 
-@course
+@script
 async def service_restarts(f: Flight) -> None:
     held = f.put(spec())
     await f.up(held)
-    f.going(held, 0, 70)
+    f.start_goto(held, 0, 70)
     await f.sleep(4)
     await f.restart()
     await f.sleep(2)
@@ -503,15 +503,15 @@ async def service_restarts(f: Flight) -> None:
     await f.landed()
 
 
-@course
-async def service_restarts_and_no_driver_comes(f: Flight) -> None:
+@script
+async def service_restarts_without_driver(f: Flight) -> None:
     held = f.put(spec())
     await f.up(held)
     await f.restart()
     await f.landed()
 
 
-@course
+@script
 async def service_restarts_on_the_ground(f: Flight) -> None:
     held = f.put(spec())
     await f.up(held)
@@ -520,8 +520,8 @@ async def service_restarts_on_the_ground(f: Flight) -> None:
     await f.sleep(10)
 
 
-def restarted_in(mode: FlightMode, removed: bool = False) -> Callable[[Flight], Coroutine[Any, Any, None]]:
-    async def course(f: Flight) -> None:
+def service_restarts_in(mode: FlightMode, removed: bool = False) -> Callable[[Flight], Coroutine[Any, Any, None]]:
+    async def script(f: Flight) -> None:
         held = f.put(spec())
         await f.up(held)
         await f.goto(held, 0, 40)
@@ -534,11 +534,11 @@ def restarted_in(mode: FlightMode, removed: bool = False) -> Callable[[Flight], 
             f.world.plane.set_to(GUIDED)
         await f.landed()
 
-    return course
+    return script
 
 
-@course
-async def found_armed_without_a_mission(f: Flight) -> None:
+@script
+async def service_starts_with_armed_drone(f: Flight) -> None:
     plane = f.world.plane
     plane.vehicle.armed = True
     plane.height = 12.0
@@ -548,23 +548,23 @@ async def found_armed_without_a_mission(f: Flight) -> None:
     await f.landed()
 
 
-@course
-async def tour(f: Flight) -> None:
+@script
+async def poi_mission(f: Flight) -> None:
     held = f.put(touring(zone("wall", "ignore", *WALL), tour=((0, 70), (60, 70))))
     f.follow(held, "passenger")
     await f.until(lambda: all(m.outcome for m in missions_of(f.world)) and missions_of(f.world))
     await f.landed()
 
 
-@course
-async def tour_out_of_reach(f: Flight) -> None:
+@script
+async def poi_mission_leaves_operation_area(f: Flight) -> None:
     f.follow(f.put(touring(tour=((0, 30), (0, 500)))), "passenger")
     await f.until(lambda: f.world.plane.vehicle.armed)
     await f.landed()
 
 
-@course
-async def tour_revoked(f: Flight) -> None:
+@script
+async def poi_mission_grant_removed(f: Flight) -> None:
     held = f.put(touring(tour=((0, 100),)))
     f.follow(held, "passenger")
     await f.until(lambda: f.world.plane.xy[1] > 30)
@@ -572,8 +572,8 @@ async def tour_revoked(f: Flight) -> None:
     await f.landed()
 
 
-@course
-async def tour_taken_by_a_pilot(f: Flight) -> None:
+@script
+async def poi_mission_pilot_takes_over(f: Flight) -> None:
     f.follow(f.put(touring(tour=((0, 100),))), "passenger")
     await f.until(lambda: f.world.plane.xy[1] > 30)
     f.world.plane.set_to(LOITER)
@@ -583,19 +583,19 @@ async def tour_taken_by_a_pilot(f: Flight) -> None:
     await f.landed()
 
 
-@course
-async def tour_waits_for_the_link(f: Flight) -> None:
+@script
+async def poi_mission_waits_for_link(f: Flight) -> None:
     f.follow(f.put(touring(tour=((0, 100),))), "passenger")
     await f.until(lambda: f.world.plane.xy[1] > 30)
-    f.lose_link()
+    f.break_link()
     await f.sleep(5)
-    f.find_link()
+    f.restore_link()
     await f.sleep(2)
     await f.landed()
 
 
-@course
-async def tour_restarted(f: Flight) -> None:
+@script
+async def poi_mission_service_restarts(f: Flight) -> None:
     f.put(touring(tour=((0, 40), (0, 80))))
     await f.until(lambda: f.world.plane.xy[1] > 50)
     await f.restart()
@@ -603,8 +603,8 @@ async def tour_restarted(f: Flight) -> None:
     await f.landed()
 
 
-@course
-async def tour_after_a_driver(f: Flight) -> None:
+@script
+async def poi_mission_after_driver(f: Flight) -> None:
     held = f.put(spec())
     await f.up(held)
     f.follow(f.put(touring(tour=((0, 30),)), "m2"), "passenger")
@@ -615,18 +615,18 @@ async def tour_after_a_driver(f: Flight) -> None:
     await f.landed()
 
 
-@course
-async def motions_meet(f: Flight) -> None:
+@script
+async def motions_replace_each_other(f: Flight) -> None:
     held = f.put(spec())
     await f.up(held)
     service = f.world.service
-    first = f.going(held, 0, 90)
+    first = f.start_goto(held, 0, 90)
     await f.sleep(3)
     await f.do("SetSpeed", lambda: service.set_speed(held, SetSpeedArgs(3.0)))
     await f.goto(held, 30, 30)
     await f.do("SetVelocity", lambda: service.set_velocity(held, VelocityArgs(2.0, 1.0, hold_s=1.0)))
     await f.sleep(4)
-    second = f.going(held, 0, 0)
+    second = f.start_goto(held, 0, 0)
     await f.sleep(2)
     second.cancel()
     await f.sleep(5)
@@ -645,11 +645,11 @@ async def motions_meet(f: Flight) -> None:
     await f.landed()
 
 
-@course
-async def limits_are_enforced(f: Flight) -> None:
+@script
+async def altitude_limit_added_in_flight(f: Flight) -> None:
     held = f.put(spec())
     await f.up(held, 25.0)
-    f.going(held, 0, 90)
+    f.start_goto(held, 0, 90)
     await f.sleep(4)
     limit = {"type": "LimitControl", "kind": "altitude", "upperLimit": 15.0, "action": "enforce"}
     f.put(spec({"name": "low", "spec": limit, "zones": []}))
@@ -658,7 +658,7 @@ async def limits_are_enforced(f: Flight) -> None:
     await f.landed()
 
 
-@course
+@script
 async def autopilot_refuses_modes(f: Flight) -> None:
     held = f.put(spec())
     await f.up(held)
@@ -671,8 +671,8 @@ async def autopilot_refuses_modes(f: Flight) -> None:
     await f.landed()
 
 
-@course
-async def takeover_by_a_call(f: Flight) -> None:
+@script
+async def takeover_by_denied_call(f: Flight) -> None:
     held = f.put(spec(zone("wall", "revoke", *WALL)))
     await f.up(held)
     await f.goto(held, 0, 33)
@@ -681,14 +681,14 @@ async def takeover_by_a_call(f: Flight) -> None:
 
 
 FLIGHTS |= {
-    "taken_to_hover": taken("hover"),
-    "taken_to_land": taken("land"),
-    "taken_home": taken("returnToLaunch"),
-    "taken_and_revoked": taken("revoke"),
+    "takeover_hovers": takeover("hover"),
+    "takeover_lands": takeover("land"),
+    "takeover_returns": takeover("returnToLaunch"),
+    "takeover_revokes": takeover("revoke"),
     "failsafe_returns": failsafe(RTL),
     "failsafe_lands": failsafe(LAND),
-    "restarted_on_the_way_home": restarted_in(RTL),
-    "restarted_while_landing": restarted_in(LAND),
-    "restarted_under_a_pilot": restarted_in(LOITER),
-    "restarted_without_its_grant": restarted_in(GUIDED, removed=True),
+    "service_restarts_during_return": service_restarts_in(RTL),
+    "service_restarts_during_landing": service_restarts_in(LAND),
+    "service_restarts_in_pilot_flight": service_restarts_in(LOITER),
+    "service_restarts_without_grant": service_restarts_in(GUIDED, removed=True),
 }

@@ -15,7 +15,7 @@ from fractus_sim.command_line import EXIT_FAILED, command_errors
 from fractus_sim.experiment.definition import Experiment, load, parse
 from fractus_sim.progress import Progress
 from fractus_sim.report.report_files import PAGE
-from fractus_sim.runner.experiment_runner import Outcome, run
+from fractus_sim.runner import Outcome, run
 
 
 @click.group()

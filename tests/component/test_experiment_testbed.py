@@ -16,7 +16,7 @@ from fractus_sim.experiment.definition import Experiment, parse
 from fractus_sim.interruption import uninterrupted
 from fractus_sim.report.report_files import write_page
 from fractus_sim.report.track import Place, Sample
-from fractus_sim.runner import experiment_report, experiment_runner
+from fractus_sim.runner import Outcome, experiment_report, experiment_runner
 from fractus_sim.runner.telemetry_recording import Flight
 from fractus_sim.testbeds import process_guard
 from fractus_sim.testbeds.testbed import Findings, Moment, Testbed
@@ -155,7 +155,7 @@ def test_report_is_written_before_figures_and_the_page_after_them(
 
     samples = [Sample(float(t), Place(50.0, 4.0, float(t)), 5.0, "GUIDED", t > 0, 0.8) for t in range(3)]
     flights = {"d": Flight("d", samples)}
-    outcome = experiment_runner.Outcome(experiment, tmp_path, flights, (), (), Findings(), (), (), 2.0, 2.0)
+    outcome = Outcome(experiment, tmp_path, flights, (), (), Findings(), (), (), 2.0, 2.0)
     monkeypatch.setattr(experiment_report, "draw_map", fail_to_draw)
     with pytest.raises(OSError, match="No space left"):
         experiment_report.write_outcome(outcome)

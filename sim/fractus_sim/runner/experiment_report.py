@@ -18,8 +18,8 @@ from fractus_sim.report.flight_profile import Limit, Profile, Span, draw_profile
 from fractus_sim.report.mission_report import decision_marks, decision_requests, decisions_section
 from fractus_sim.report.report_files import RESULTS, format_duration, rounded, table, write_report
 from fractus_sim.report.track import Track
-from fractus_sim.runner.experiment_runner import Event, Outcome
 from fractus_sim.runner.fault_injection import Occurrence
+from fractus_sim.runner.outcome import Event, Outcome
 
 FILES = (RESULTS, "tracks.geojson", "map.png", "profile.png")
 _MAX_EVENTS = 40

@@ -15,10 +15,12 @@ from fractus_sim.progress import Progress
 from fractus_sim.report.flight_record import JudgedCall, policy_decisions
 from fractus_sim.report.report_files import remove_report
 from fractus_sim.runner.check_evaluation import Evidence, Verdict, evaluate_check
-from fractus_sim.runner.fault_injection import FaultInjector, Occurrence
+from fractus_sim.runner.experiment_report import FILES, write_outcome
+from fractus_sim.runner.fault_injection import FaultInjector
+from fractus_sim.runner.outcome import Event, Outcome
 from fractus_sim.runner.task_execution import TaskFailed, fly_task
 from fractus_sim.runner.telemetry_recording import Flight, McapLog, Recorder
-from fractus_sim.testbeds.testbed import Findings, Moment, Testbed
+from fractus_sim.testbeds.testbed import Moment, Testbed
 from fractus_sim.testbeds.vehicle_testbed import VehicleTestbed
 
 READY_TIMEOUT_S = 90.0
@@ -29,50 +31,6 @@ SHOW_INTERVAL_S = 0.2
 MAX_SHOWN_VEHICLES = 4
 _SET_UP_OFFSET_S = 1e6
 """Experiment time is negative during the set-up, so that it always increases."""
-
-
-@dataclass(frozen=True, slots=True)
-class Event:
-    """An event of a task or fault. Vehicle is empty if the event concerns the whole experiment."""
-
-    time_s: float
-    vehicle: str
-    text: str
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """Result of an experiment. Times are seconds of the experiment.
-
-    Attributes:
-        folder: Output folder.
-        flights: Recordings by vehicle.
-        occurrences: Injected faults.
-        verdicts: Results of the checks.
-        findings: Other results, such as exit codes of programs.
-        events: Events of tasks and faults, in order.
-        decisions: Calls that policies corrected or denied.
-        duration_s: Duration in simulated time.
-        wall_s: Duration in real time.
-        problem: Reason why the experiment was aborted. Empty if it completed.
-    """
-
-    experiment: Experiment
-    folder: Path
-    flights: dict[str, Flight]
-    occurrences: tuple[Occurrence, ...]
-    verdicts: tuple[Verdict, ...]
-    findings: Findings
-    events: tuple[Event, ...]
-    decisions: tuple[JudgedCall, ...]
-    duration_s: float
-    wall_s: float
-    problem: str = ""
-
-    @property
-    def holds(self) -> bool:
-        """True if the experiment completed and every check holds."""
-        return not self.problem and all(verdict.holds for verdict in self.verdicts)
 
 
 @dataclass
@@ -182,9 +140,6 @@ def run(experiment: Experiment, out: Path, *, base: Path | None = None, progress
         ExperimentError: The experiment could not be set up. The message says what to do.
         OSError: A file could not be written.
     """
-    # matplotlib takes a second to import, and `fractus experiment check` does not need it.
-    from fractus_sim.runner.experiment_report import FILES, write_outcome  # noqa: PLC0415
-
     progress = progress or Progress()
     out.mkdir(parents=True, exist_ok=True)
     (out / "logs").mkdir(exist_ok=True)

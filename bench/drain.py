@@ -50,7 +50,7 @@ async def measure(report: Report, switches: int) -> None:
     """Measure each call rate."""
     with tempfile.TemporaryDirectory() as folder, rig() as world:
         (Path(folder) / "pod").symlink_to(world.path("dpod"))
-        namespaces = PodNamespaces(Path(folder), own=world.path("drone"))
+        namespaces = PodNamespaces(Path(folder), node_namespace=world.path("drone"))
         redirector = Redirector(world.maps("drone"), Conntrack(world.netlink("drone")), namespaces)
         redirector.set_services([VIP])
         world.servers(work_s=0.001)

@@ -148,7 +148,7 @@ async def test_unexpected_error_refuses_call_and_is_reported(
 
 
 def test_caller_without_grant_is_logged(caplog: pytest.LogCaptureFixture) -> None:
-    calls = CallAdmission(cast("Any", SimpleNamespace(of=lambda _identity: None)), lambda: 0.0)
+    calls = CallAdmission(cast("Any", SimpleNamespace(active={})), lambda: 0.0)
     with pytest.raises(PolicyDenied):
         calls.grant_of(Caller("spiffe://fractus.dev/a", math.inf))
     (record,) = caplog.records

@@ -53,7 +53,7 @@ class Agent:
         self._registration = Registration(
             store, settings.description, node, self._object_file, on_change=self._on_change
         )
-        # Without a reachable API server, an agent that starts uses the stored object.
+        # An agent that starts while the API server is unreachable uses the stored object.
         self._stored = self._object_file.read()
         self._mobility = asyncio.Event()
         self._linking = asyncio.Event()

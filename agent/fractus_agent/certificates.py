@@ -21,7 +21,7 @@ _IGNORE_DATES = 0x200000
 
 
 class InvalidCertificate(Exception):
-    """No client would accept the certificate at any date."""
+    """The certificate is invalid for clients, regardless of the date."""
 
 
 @dataclass(frozen=True, slots=True)

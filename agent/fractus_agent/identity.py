@@ -197,7 +197,10 @@ class NodeIdentity:
         return self._inspected[1]
 
     def _follow_authority(self, authority: bytes, validity: ValidityPeriod) -> ValidityPeriod | None:
-        """Store a changed authority. Return None if the certificate must be requested again, because it has another issuer."""
+        """Store the published authority if it has changed. Return the validity of the certificate under this authority.
+
+        Return None if the published authority did not issue the certificate. A new certificate must then be requested.
+        """
         current = read_set(self._directory, CERTIFICATE_FILES)
         if current is None or current["ca.crt"] == authority:
             return validity

@@ -9,7 +9,7 @@ from pathlib import Path
 
 DEFAULT_DRAIN_S = 1.5
 MAX_DRAIN_S = 600.0
-"""Limit of the drain, because a drone stays on a link while connections drain on it."""
+"""Maximum of `drain_s`, in seconds. A drone cannot leave a link while connections drain on it."""
 
 
 class MissingSetting(Exception):

@@ -98,7 +98,7 @@ LinkEnd = Literal["drone", "node"]
 class WatchTimes:
     """Timing of watches, in seconds.
 
-    The API server sends a bookmark about once a minute, so `silence_s` without one means a dead connection.
+    The API server sends a bookmark about once a minute, so a connection without any event for `silence_s` is dead.
 
     Attributes:
         server_s: Time after which the server ends a watch.
@@ -278,7 +278,8 @@ class Store:
                 packed = None
                 continue
             if isinstance(event, Listed):
-                # A list follows each interruption, so its Grants are compared with the disk even if they are the same.
+                # Forget the last Grants, so that those of the list are compared with the disk even if they have not
+                # changed.
                 body = event.objects[0]
                 packed = None
             else:

@@ -76,14 +76,14 @@ class LinkSituation:
 
 @dataclass(frozen=True, slots=True)
 class LinkActions:
-    """Actions of a decision, in this order.
+    """Actions that follow from a decision. They are carried out in the order `abrupt`, `planned`, `peer`.
 
     Attributes:
-        abrupt: New targets of services whose old path is lost, None for the cloud path.
-        planned: New targets of services whose old path still works, None for the cloud path.
-        peer: Peer that the link should go to afterwards, empty for none.
-        link: Decision on the peer.
-        targets: Decision on the path by application.
+        abrupt: New target by service, for services whose old path is lost. None is the cloud path.
+        planned: New target by service, for services whose old path still works. None is the cloud path.
+        peer: Peer of the link after all services have their new targets, empty for no link.
+        link: Decision on the peer, with its reason.
+        targets: Decision on the path of each application, with its reason.
     """
 
     abrupt: Mapping[Endpoint, Endpoint | None]
@@ -94,7 +94,7 @@ class LinkActions:
 
 
 def decide(situation: LinkSituation, settings: LinkSettings) -> LinkActions:
-    """Decide on the peer of the link and on the paths of all traffic. The same situation gives the same actions.
+    """Decide on the peer of the link and on the paths of all traffic. The result depends on the arguments only.
 
     The drone has one link, so the traffic of the first application by name decides on its peer. Other applications
     take the link if it is better for them. A link that carries traffic is left only after its traffic has been moved

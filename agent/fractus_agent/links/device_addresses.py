@@ -21,8 +21,11 @@ _COUNT = 254 * 256
 """RFC 3927 reserves the first and last 256 addresses of 169.254.0.0/16."""
 
 RAISED = " [raised by fractus-agent]"
-"""Suffix of the alias of a device that the agent brought up. It stays with the device if the agent is killed, and ends
-with a reboot. An alias of the device's owner stays before it."""
+"""Suffix that marks a device as brought up by the agent, in the device's alias.
+
+The mark remains if the agent is killed, and disappears at a reboot. If the device already has an alias, the suffix is
+appended.
+"""
 _MAX_ALIAS_BYTES = 255
 _IFF_UP = 1
 _MAIN_TABLE = 254
@@ -80,7 +83,8 @@ class DeviceAddresses:
             link = (await route.link("get", index=index))[0]
             if not link["flags"] & _IFF_UP:
                 alias = _alias(link).removesuffix(RAISED) + RAISED
-                # pyroute2 appends a NUL byte. Without room for the suffix the device is not marked, so it stays up in the end.
+                # pyroute2 appends a NUL byte to the alias. If the alias has no room for the suffix, the device is not
+                # marked, and `clear` does not take it down.
                 mark = {"ifalias": alias} if len(alias.encode()) < _MAX_ALIAS_BYTES else {}
                 await route.link("set", index=index, state="up", **mark)
             # Other addresses go first, because deleting a primary address deletes the secondary ones with it.

@@ -30,7 +30,7 @@ class DirectLinkStore:
         store: The node's objects at the API server.
         directory: Directory of the files.
         node: Name of this node.
-        end: End of the links that this node is.
+        end: This node's end of its links, `drone` or `node`.
         on_change: Called after each change.
     """
 

@@ -198,7 +198,7 @@ class DroneLinkController:
         )
 
     def _routes(self) -> dict[Endpoint, Endpoint]:
-        """Return the peer's endpoint by service. The current DirectLinks filter the peer's message."""
+        """Return the peer's endpoint by service, for the services that current DirectLinks to the peer contain."""
         if self._peer_message is None:
             return {}
         peer, message = self._peer_message

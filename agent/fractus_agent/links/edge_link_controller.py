@@ -50,7 +50,10 @@ class EdgeLinkController:
         self._record = record
         self._links: tuple[DirectLink, ...] = ()
         self._next_plan = asyncio.Event()
-        """Event that the next change of the DirectLinks sets, and then replaces by a new event."""
+        """Event that is set at the next change of the DirectLinks.
+
+        Each change also creates a new event for the change after it.
+        """
         self._routes: dict[str, dict[Endpoint, Endpoint]] = {}
         self._ports: dict[Endpoint, int] = {}
         self._acceptor = Acceptor(tls, self._refusal, self._serve, max_peers=MAX_DRONES)

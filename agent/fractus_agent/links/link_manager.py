@@ -126,7 +126,10 @@ class LinkManager:
         self._on_change()
 
     def _report_interface(self) -> None:
-        """Report the conditions that no link controller sets: for an edge node, and for an unusable interface."""
+        """Report the conditions of an edge node, or of a drone whose interface is not usable.
+
+        No link controller sets them.
+        """
         links = self._direct_links.links
         if self._end == "node":
             drones = self._edge_controller.drones if self._edge_controller is not None else frozenset()
@@ -187,14 +190,15 @@ class LinkManager:
         ports = ruleset.Ports(udp=beacons.BEACON_PORT, tcp=pairing.PAIRING_PORT)
         is_drone = self._end == "drone"
         controller = _interface_controller(interface, self._node)
-        # The packet filter closes the device before it gets an address. A device that is not usable is not changed, but pods are
-        # isolated in any case.
+        # Create the packet filter before the device gets an address, so that the device never accepts unfiltered
+        # traffic. If the device is not usable, the table does not filter it. The table is still needed, because it
+        # isolates the pods.
         device = interface.device if await self._check_usable(controller) else ruleset.NO_DEVICE
 
         def make_table(callers: Callers) -> None:
             ruleset.create(device, ports, clients=is_drone, callers=callers)
 
-        # The new table replaces the table of an earlier agent, and contains the guards from the beginning.
+        # The new table replaces the table of an earlier agent. It already contains the guarded endpoints.
         guarded_endpoints = allowed_callers if is_drone else isolated_pods
         guards = guarded_endpoints(self._direct_links.links)
         make_table(guards)

@@ -139,7 +139,7 @@ class LinkStatusReporter:
 
     Args:
         store: The node's objects at the API server.
-        end: End of the links that this node is.
+        end: This node's end of its links, `drone` or `node`.
         wall: Returns the wall clock time.
     """
 

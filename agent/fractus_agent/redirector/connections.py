@@ -133,7 +133,9 @@ class TcpSockets:
         return connections
 
     def refresh(self, connection: TcpConnection) -> TcpConnection | None:
-        """Return the current state of a connection, None if it no longer exists. Cheaper than a list.
+        """Return the current state of a connection, None if it no longer exists.
+
+        This costs less than listing all connections.
 
         Raises:
             NetlinkError: The kernel refused the request, or did not respond.

@@ -1,1 +1,1 @@
-"""System services of a node and what they share."""
+"""Mobility and camera services of a node, and the modules that both services use."""

@@ -103,7 +103,8 @@ class Callers:
         if not (started or urgent):
             raise NotAuthenticated("the client certificate is not valid yet; check the clocks")
         if started and caller.left_s and not isinstance(now_s, UncertainTime):
-            # Do not remember a certificate while the clock is uncertain or contradicts it: the clock may be corrected later.
+            # Do not remember a certificate while the clock is uncertain, or outside the certificate's validity: the
+            # clock may be corrected.
             self._seen[pem] = caller
             if len(self._seen) > MAX_SEEN:
                 self._seen.popitem(last=False)

@@ -201,7 +201,8 @@ def serve_mobility(verbose: bool, **options: Any) -> None:
     from fractus_services.mobility.mavlink.startup_heartbeat import with_heartbeats  # noqa: PLC0415 - keeps the command line fast
 
     async def run(options: MobilityOptions, stop: asyncio.Event) -> None:
-        # Imports take most of the start, on a small computer longer than the heartbeat time-out of a drone in flight.
+        # Imports take most of the start. On a small computer they take longer than the heartbeat timeout of a drone in
+        # flight.
         serve = await with_heartbeats(asyncio.to_thread(_mobility_server), options.state, options.autopilot)
         await serve(options, stop)
 
@@ -250,6 +251,6 @@ def camera() -> None:
 )
 def serve_camera(**options: Any) -> None:
     """Serve until stopped. Waits for certificates."""
-    from fractus_services.camera.server import run  # noqa: PLC0415 - needs libraries that the CLI does without
+    from fractus_services.camera.server import run  # noqa: PLC0415 - imports libraries that only this command needs
 
     until_signalled("camera", run, CameraSettings(**options))

@@ -104,7 +104,8 @@ class GrantFiles:
 
     async def run(self) -> None:
         """Scan the directory every `RESCAN_INTERVAL_S` seconds until cancelled."""
-        # Create the directory only once: if it disappears later, its disk may be gone, and no Grant must count as removed.
+        # Create the directory only once. If it disappears later, its disk may have failed. An empty new directory would
+        # then look as if all Grants had been removed.
         with contextlib.suppress(OSError):
             self._directory.mkdir(parents=True, exist_ok=True)
         while True:

@@ -25,7 +25,10 @@ from fractus_runtime.files import remove_temporary, write_file
 log = logging.getLogger(__name__)
 
 MAX_REMEMBERED = 5_000
-"""Maximum number of remembered instances. For all others, Grants issued before the oldest forgotten one are rejected."""
+"""Maximum number of remembered instances. The instances with the oldest Grants are forgotten.
+
+A Grant of an instance that is not remembered is rejected unless it was issued after all forgotten Grants.
+"""
 
 _EPOCH = datetime.fromtimestamp(0, UTC)
 
@@ -48,9 +51,9 @@ class _Seen:
 class GrantVerifier:
     """Verifies Grants, and remembers the latest one of each component instance.
 
-    A Grant is verified once. It stays in force, also after a restart, if certificates expire or the authority changes, because
-    a drone in flight must not lose its Grant to a date. It ends when its file is removed or a later Grant replaces it. The
-    memory prevents replays: an old Grant has a valid signature too.
+    A Grant is verified once. It then stays in force even if certificates expire or the authority changes, also after a
+    restart. Otherwise a drone could lose its Grant in flight. A Grant ends when its file is removed or a later Grant
+    replaces it. The memory prevents replays: an old Grant has a valid signature too.
 
     Args:
         directory: Directory that contains ca.crt.

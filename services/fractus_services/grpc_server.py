@@ -44,7 +44,10 @@ MAX_OPEN_CALLS = 32
 """Maximum number of concurrent calls of one identity, including streams."""
 
 REQUEST_TIMEOUT_S = 10.0
-"""Time between the start of a call and its request message. Clients send both together, but a bad link may delay the second."""
+"""Time between the start of a call and its request message.
+
+Clients send both together, but a bad link may delay the message.
+"""
 
 STOP_TIMEOUT_S = 2.0
 """Time for which open calls may continue when the server stops."""
@@ -202,7 +205,9 @@ class CallAdmission(grpc.aio.ServerInterceptor):  # type: ignore[misc]  # grpc h
         return build(behaviour, None, handler.response_serializer)
 
     async def _received(self, unsent: Counter[str], context: Any) -> Any:
-        """Return the request of a call as bytes, or EOF. End the call if the request is late, or if too many calls wait.
+        """Return the request of a call as bytes, or EOF.
+
+        End the call if the request is late, or if too many calls wait for their requests.
 
         Args:
             unsent: Number of calls of each identity whose request has not arrived.

@@ -27,7 +27,10 @@ CHECK_INTERVAL_S = 0.2
 """Interval at which the holder checks that its lock file still exists under its path."""
 
 NEW_FILE_WAIT_S = 1.0
-"""Time for which the first holder of a new lock file waits, so that the holder of a replaced file has ended."""
+"""Time for which a process waits after it has locked a new lock file.
+
+If the file replaced another lock file, the process that locked the other file ends itself within this time.
+"""
 
 POLL_INTERVAL_S = 0.1
 
@@ -37,8 +40,8 @@ _GONE = {errno.ENOENT, errno.ENOTDIR, errno.ESTALE}
 class ServiceLock:
     """Exclusive access to the state, the audit log, and the autopilot or camera of a service.
 
-    The lock is held until the process ends, because its threads may write until then. It fences a force-deleted pod: the new
-    pod waits until the old process has ended.
+    The lock is held until the process ends, because its threads may write until then. The lock also protects against a
+    pod that was force-deleted while its process still runs: the new pod waits until the old process has ended.
 
     Args:
         service: Name of the service, for the log and the lock file.
@@ -117,7 +120,7 @@ class ServiceLock:
 
     @contextmanager
     def watched(self) -> Iterator[None]:
-        """End the process if its lock file is replaced or removed, while in the block."""
+        """While the block runs, end the process as soon as its lock file is replaced or removed."""
         # Use a thread, because the event loop or the disk may hang.
         thread = threading.Thread(target=self._watch, name="lock", daemon=True)
         thread.start()

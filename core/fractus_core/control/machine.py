@@ -188,7 +188,7 @@ def _open_stream(update: StateUpdate, event: StreamOpened) -> None:
         update.lose_lease("another application has the drone")
         lease = None
     if (lease is not None and lease.key != event.key) or update.state.armed_for_other(event.key):
-        reason = "another application has the drone; try again when it is back"
+        reason = "another application has the drone; try again when the flight of that application has ended"
         update.act(RefuseStream(event.lease_id, "ControlHeld", reason))
         return
     if lease is not None:

@@ -206,7 +206,10 @@ def _rotate(picture: npt.NDArray[np.uint8], degrees: int) -> tuple[npt.NDArray[n
 
 
 def _map_back(box: Sequence[int], inverse: npt.NDArray[np.float64], scale: float) -> Box:
-    """Return the axis-aligned box in the original image around a box of a reduced and rotated image."""
+    """Convert a box in a reduced and rotated image to a box in the original image.
+
+    The returned box is not rotated. It is the smallest box that contains the converted one.
+    """
     left, top, width, height = box
     corners = np.array([(x, y, 1.0) for x in (left, left + width) for y in (top, top + height)]) @ inverse.T
     low = corners.min(axis=0)

@@ -36,7 +36,7 @@ class FilterPlan:
     """Filters to apply to an image.
 
     Attributes:
-        filters: Filters in order of application. None of them relies on an unreliable face detector.
+        filters: Filters in order of application. No filter relies on an unreliable face detector.
         note: Reason why a fallback filter is used, or an empty string.
     """
 
@@ -153,10 +153,11 @@ def hide_faces(picture: Pixels, boxes: Sequence[Box], method: FaceMethod) -> Pix
         y1 = min(int(top + (1 + FACE_MARGIN) * height) + 1, rows)
         if x1 <= x0 or y1 <= y0:
             continue
-        # Read from the partly hidden image: detectors also find small faces within large ones, and the finer cells of a small
-        # face must not restore the original.
+        # Read from the partly hidden image. Detectors also find small faces within large ones. If a small face were
+        # read from the original image, its finer cells would show parts of the large face again.
         region = hidden[y0:y1, x0:x1]
-        # The region includes the margins, or ends at the image border, so its number of cells is in proportion.
+        # The region is larger than the face by the margins, unless it ends at the image border. Its number of cells is
+        # in proportion.
         cell_columns = min(max(round(FACE_CELLS * (x1 - x0) / max(width, 1)), 1), x1 - x0)
         cell_rows = min(max(round(FACE_CELLS * (y1 - y0) / max(height, 1)), 1), y1 - y0)
         cells = cv2.resize(region, (cell_columns, cell_rows), interpolation=cv2.INTER_AREA)

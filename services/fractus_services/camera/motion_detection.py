@@ -82,7 +82,10 @@ def _align_and_compare(other: Pixels, picture: Pixels, fixed: bool) -> Mask | No
 
 
 def _compare(other: Pixels, visible: npt.NDArray[np.uint8], picture: Pixels) -> Mask | None:
-    """Return the pixels in which two aligned frames differ, within the part that the other frame shows."""
+    """Return a mask of the pixels in which two aligned frames differ, or None if their exposures differ too much.
+
+    `visible` is 255 at the pixels that `other` shows. All other pixels count as equal.
+    """
     matched = _match_exposure(other, picture, visible == 255)
     if matched is None:
         return None

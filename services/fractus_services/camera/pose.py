@@ -97,7 +97,10 @@ class PoseProvider(Protocol):
         """
 
     def situations_since(self, start_s: float, time_s: float, /) -> tuple[Situation, ...]:
-        """Return all situations since a time. The last one before that time comes first, and the current one last.
+        """Return the situations from a past time until now, oldest first.
+
+        The first one is the latest situation before that time, because it still applied at that time. The last one is
+        the current situation.
 
         Args:
             start_s: Monotonic time in seconds.

@@ -43,13 +43,13 @@ DEFAULT_ERROR_M = 1.5
 """Default 1-sigma position error if the GPS reports none, in metres."""
 
 MAX_POSITION_AGE_S = 1.0
-"""An older position counts as unknown: at 20 Hz in flight, 20 positions in a row were lost."""
+"""Age from which a position counts as unknown. At the rate of 20 Hz in flight, 20 successive positions were lost."""
 
 WIND_MAX_AGE_S = 10.0
 """Maximum age of the wind estimate."""
 
 READY_MAX_AGE_S = 5.0
-"""Maximum age of the reported readiness: at 1 Hz, four messages in a row were lost."""
+"""Maximum age of the reported readiness. At the rate of 1 Hz, four successive messages were lost."""
 
 VELOCITY_HISTORY_S = 0.3
 """Period for which velocities are kept to compute the acceleration, in seconds of the vehicle's clock."""
@@ -68,11 +68,11 @@ class VehicleState:
     Attributes:
         position_at: Time of the position. The delay relative to the fastest recent message is subtracted.
         yaw_deg: Heading from the position message; `heading_deg` is from the attitude message.
-        gimbal: Measured attitude of the camera, yaw from true north. `gimbal_at` is the older of the gimbal's and the vehicle's
-            attitude, because the yaw is measured from the vehicle's heading.
+        gimbal: Measured attitude of the camera, yaw from true north. It is computed from the attitudes of gimbal and
+            vehicle. `gimbal_at` is the time of the older one.
         ground_home: Latest home that was reported while the vehicle did not fly, or the first one after arming.
         ready: True if the pre-arm checks of the current mode pass, reported at `checks_at`.
-        estimated: True if the estimator has and predicts an absolute position, reported at `estimated_at`.
+        estimated: True if the estimator has an absolute position and predicts to keep it, reported at `estimated_at`.
         path_lost: True if the autopilot has stopped recording its path since it was armed.
         satellites: Number of visible satellites; None until it is reported.
         velocity_history: Time on the vehicle's clock, and velocity north and east, of the latest positions.
@@ -152,7 +152,10 @@ class VehicleState:
         return math.hypot(self.north_mps, self.east_mps)
 
     def arming_refusal(self, now: float) -> str:
-        """Return the reason why the autopilot would refuse to arm in GUIDED, from its recent messages; empty if it would not."""
+        """Return the reason why the autopilot would refuse to arm in GUIDED, or an empty string if it would arm.
+
+        The reason is taken from recent messages of the autopilot.
+        """
         if now - self.checks_at > READY_MAX_AGE_S:
             return "it does not report its pre-arm checks (SYS_STATUS)"
         if not self.ready:
@@ -165,7 +168,7 @@ class VehicleState:
         return self.identity_problem if self.home is not None else "it has no home yet (HOME_POSITION)"
 
     def position_fresh(self, now: float) -> bool:
-        """Return True if the position is recent enough to judge and to fly by."""
+        """Return True if the position is recent enough to judge calls and to fly."""
         return now - self.position_at <= MAX_POSITION_AGE_S
 
     def keeps_place(self, now: float) -> bool:
@@ -273,7 +276,7 @@ class Autopilot(Protocol):
 
     @property
     def latency_s(self) -> float:
-        """Upper bound of the time from the known state to the effect of a command that is sent now.
+        """Upper bound of the time from the latest reported state to the effect of a command that is sent now.
 
         It is in seconds of the vehicle's clock, and infinite if the link is too slow to fly.
         """
@@ -329,7 +332,7 @@ class Autopilot(Protocol):
     async def go_to(
         self, lat: float, lon: float, altitude_m: float, yaw_deg: float | None, permit: Permit = ...
     ) -> None:
-        """Start to fly straight to a point. The altitude is above home. Call `set_speed` after each call."""
+        """Start to fly straight to a point. The altitude is above home. Call `set_speed` after each `go_to`."""
 
     async def set_speed(self, speed_mps: float, permit: Permit = ...) -> None:
         """Set the horizontal ground speed of the current leg. The next leg may start with the default speed."""

@@ -71,7 +71,7 @@ class MobilitySettings:
     # Supervision and verification of the failsafes
 
     tick_timeout_s: float = 1.0
-    """Seconds without a tick after which the event loop may hang, so that the autopilot must not rely on it."""
+    """Seconds since the last iteration of the monitor's loop after which heartbeats stop: the event loop may hang."""
 
     unattended_timeout_s: float = 3.0
     """Seconds for which an armed drone may have no control authority although the state machine tries to take it over.
@@ -103,9 +103,9 @@ class MobilitySettings:
     """Pause after a judgement for the driver in control, as a multiple of the time that the judgement took."""
 
     others_rest_factor: float = 4.0
-    """The same for all other callers together.
+    """Pause after a judgement for all other callers together, as a multiple of the time that the judgement took.
 
-    The pauses keep time for the monitor: a flood of calls takes only a part of the event loop.
+    The pauses reserve time for the monitor: a flood of calls takes only a part of the event loop's time.
 """
 
     position_retry_after_s: float = 0.5
@@ -192,10 +192,13 @@ class MobilitySettings:
     """Number of new routes that are searched after the monitor stopped the drone, under the same flight constraints."""
 
     max_legs: int = 60
-    """Number of legs after which a flight makes no progress, because every leg is planned again from the current position."""
+    """Maximum number of legs of a flight.
+
+    Each leg is planned from the current position. Without this limit, a flight that makes no progress would not end.
+    """
 
     at_waypoint_m: float = 0.3
-    """Distance within which the drone is at a waypoint. Waypoints keep more than this beyond the margin of legs."""
+    """Distance within which the drone counts as being at a waypoint."""
 
     return_level_m: float = 1.0
     """Change of altitude above which a return climbs or descends before it flies towards home."""
@@ -216,7 +219,7 @@ class MobilitySettings:
     """Altitude above home to which the system takes off if the target has no altitude."""
 
     poi_check_interval_s: float = 0.5
-    """Longest time between two checks whether a mission can start."""
+    """Seconds after which the service checks again if a mission can start."""
 
     poi_stay_s: float = 5.0
     """Seconds for which the drone stays at a point of interest, if passengers may use services only there."""
@@ -239,7 +242,10 @@ class MobilitySettings:
     """Seconds after a change of the constraints for which a drone may still accelerate on a leg judged before the change."""
 
     movement_timeout_s: float = 2.0
-    """Seconds within which a drone starts to move after a command. A drone that keeps its position longer flies nothing."""
+    """Seconds within which a drone starts to move after a command.
+
+    A drone that keeps its position longer does not follow the command.
+    """
 
     # gRPC streams
 

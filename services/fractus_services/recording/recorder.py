@@ -394,7 +394,8 @@ class Recorder:
         self._problem = problem
         if self._problem_file is None:
             return
-        # If the disk rejects this file, it rejects the state and the audit log as well, which are reported elsewhere.
+        # If the disk rejects this file, it also rejects the state and the audit log. Those failures are reported
+        # elsewhere.
         with contextlib.suppress(OSError):
             if problem:
                 write_file(self._problem_file, problem.encode(), durable=False)

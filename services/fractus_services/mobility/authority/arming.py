@@ -75,7 +75,10 @@ class Arming:
             await asyncio.sleep(SETTINGS.arming_retry_s)
 
     async def _arm_exclusively(self, grant: ActiveGrant, permit: Permit) -> None:
-        """Arm while no other caller arms, because preparations for the ground must not run on a flying drone."""
+        """Arm while no other caller arms.
+
+        Otherwise one caller could still prepare the arming when the drone already flies.
+        """
         async with self._control.autopilot.starting:
             permit()
             if not self._control.autopilot.vehicle.armed:
@@ -138,10 +141,11 @@ class Arming:
     async def _prepare_return(self, grant: ActiveGrant, home: tuple[float, float, float]) -> FailsafeStatus:
         """Choose the autopilot's return mode, raise its fence around the mission, and read the altitude of its return.
 
-        A vehicle records its path from the position where it armed. If that is not home, it must not return on the path.
+        A vehicle records its path from the position where it armed. If this position is not home, the vehicle must not
+        return on the path.
 
         Returns:
-            The verified failsafes. Failsafes that are set later were not chosen for this flight.
+            The failsafes that were verified for this flight. If the failsafes are set again later, arming is refused.
         """
         at_home = self._control.autopilot.vehicle.distance_m(home[0], home[1]) <= SETTINGS.at_home_m
         status = self._require_verified()
@@ -170,7 +174,7 @@ class Arming:
         return self._require_verified(after)
 
     def _require_verified(self, chosen: FailsafeStatus | None = None) -> FailsafeStatus:
-        """Return the failsafes if they are verified and if they equal `chosen`, which is optional."""
+        """Return the failsafes if they are verified and, unless `chosen` is None, are still the chosen ones."""
         status = self._control.failsafe_status
         if status is None or status.problem or (chosen is not None and status is not chosen):
             problem = (status.problem if status is not None else "") or BEING_SET

@@ -1,6 +1,7 @@
 """Holder of the control state: the driver that has the lease, the system, or a human pilot.
 
-`fractus_core.control` makes the decisions. The store applies events to the state and has the resulting actions carried out.
+`fractus_core.control` makes the decisions. The store applies events to the state. `Effects` carries out the resulting
+actions.
 """
 
 from __future__ import annotations
@@ -219,7 +220,7 @@ class ControlStore:
 
     @property
     def cruise_mps(self) -> float:
-        """Default speed of legs: for legs of a driver its setting, otherwise the vehicle's parameter."""
+        """Default speed of legs: the speed that the driver has set for its legs, otherwise the vehicle's parameter."""
         state = self._state
         corrects = state.motion is not None and state.motion.kind == CORRECTION
         if state.speed_mps is not None and state.authority is Authority.DRIVER and not corrects:
@@ -400,7 +401,9 @@ class ControlStore:
 
     @property
     def home_moved(self) -> bool:
-        """True if another station moved home under a drone in flight. A pilot may move it.
+        """True if another station moved home while the drone is in flight.
+
+        It is False while a pilot has control, because a pilot may move home.
 
         Until home is restored, neither the altitude above home nor the destination of the autopilot's return is known.
         """
@@ -417,7 +420,7 @@ class ControlStore:
     def home_altitude_inconsistent(self) -> bool:
         """True if altitudes are not measured from the ground at the start of the flight, because home is elsewhere.
 
-        The same holds if home was not reported since the vehicle armed. A home moved by a pilot counts too.
+        It is also True if home was not reported since the vehicle armed, and if a pilot moved home.
         """
         vehicle = self.autopilot.vehicle
         state = self.state
@@ -465,7 +468,7 @@ class ControlStore:
         self.dispatch(SystemFlightEnded(constraints.flight_id))
 
     def begin_tour(self, grant: ActiveGrant, work: Coroutine[Any, Any, None]) -> None:
-        """Run a mission over points of interest. The task dispatches how the mission ends."""
+        """Run a mission over points of interest as a system task. `work` dispatches the event that ends the mission."""
         self.dispatch(TourBegan(grant.key))
         if self._state.task is not None:
             self.effects.run_task(self._state.task, work)

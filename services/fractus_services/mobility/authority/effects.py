@@ -229,7 +229,10 @@ class EffectRunner:
                 assert_never(action)
 
     def _send(self, action: SendEvent | EndStream | RefuseStream) -> None:
-        """Send to a control stream. A refused stream reads the refusal from the result of the transition instead."""
+        """Send an event to a control stream, or end the stream.
+
+        A refusal is not sent, because `open_lease` reads it from the result of the state transition.
+        """
         lease = self.leases.get(action.lease_id)
         if lease is not None and not isinstance(action, RefuseStream):
             lease.send(action.event if isinstance(action, SendEvent) else None)
@@ -263,7 +266,7 @@ class EffectRunner:
         self.tasks.spawn(self._modes.settle())
 
     def require_undisturbed(self) -> None:
-        """Permit to hover after a driver's motion, while no other motion has begun.
+        """Check that the drone may hover after a driver's motion.
 
         Raises:
             AutopilotError: Another motion has begun, or the driver has lost control.

@@ -68,7 +68,7 @@ class Supervisor:
         )
 
     def _idle(self) -> bool:
-        """Return True if the drone is disarmed and no mission that has flown continues."""
+        """Return True if the drone is disarmed, and no mission that has taken off before still runs."""
         state = self._control.state
         mission = state.mission
         if not (state.decided and state.vehicle.connected) or state.vehicle.armed:

@@ -179,13 +179,16 @@ class CallAuthorizer:
         self._motion_calls = 0
 
     async def throttle(self, grant: ActiveGrant) -> None:
-        """Wait until the pause after the previous judgement for this kind of caller is over."""
+        """Wait for the end of the pause after the last judgement.
+
+        Judgements for the driver in control and judgements for all other callers have separate pauses.
+        """
         while True:
             wait_s = self._free_at[self._has_control(grant)] - self._control.autopilot.now
             if wait_s <= 0:
                 return
-            # Look again after the sleep: another waiting call may have been judged first, and the caller may have gained or lost
-            # control.
+            # Repeat the check after the sleep. Another waiting call may have been judged first, or the caller may have
+            # gained or lost control.
             await asyncio.sleep(wait_s)
 
     async def throttle_motion(self, grant: ActiveGrant) -> None:

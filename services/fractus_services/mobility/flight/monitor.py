@@ -91,7 +91,7 @@ class MotionMonitor:
                 log.exception("monitor: supervisor failed, the autopilot's failsafe brings the drone home")
 
     def _reset_return(self) -> None:
-        """Reset the given-up return when the drone has landed or carries out another motion in GUIDED."""
+        """Allow another search for a legal return when the drone has landed or carries out another motion in GUIDED."""
         control = self._control
         vehicle = control.autopilot.vehicle
         returns = control.state.returning or (control.motion is not None and control.motion.kind == "ReturnToLaunch")
@@ -155,8 +155,8 @@ class MotionMonitor:
         now = self._gate.situation()
         changed = self._has_changed(compiled.fences_in_force(now.time_s))
         motion = control.motion
-        # A movement without a motion was never judged: another station commands it, or a motion has just ended. If the drone keeps
-        # its position, only gusts move it, and its margin covers them.
+        # A movement without a motion was never judged: another station commands it, or a motion has just ended. A drone
+        # that keeps its position is moved by gusts only, and the position margin covers gusts.
         vehicle = control.autopilot.vehicle
         changed = changed or (motion is None and not vehicle.keeps_place(control.autopilot.now))
         current_leg = motion.leg if motion is not None and motion.under_way and not motion.braking else None
@@ -180,8 +180,9 @@ class MotionMonitor:
     def _may_take_back(self, verdict: Verdict) -> bool:
         """Return True if the system may interrupt a flight of the autopilot.
 
-        The system interrupts neither a mode that a pilot chose, or may have chosen before the service started, nor a landing by
-        the system or a failsafe, nor a return flight for which it found no legal route.
+        The system does not interrupt a mode that a pilot chose, or may have chosen before the service started. It also
+        does not interrupt a landing by the system or by a failsafe, or a return flight for which it found no legal
+        route.
         """
         control = self._control
         mode = control.autopilot.vehicle.mode
@@ -241,7 +242,7 @@ class MotionMonitor:
             control.autopilot.stop()
 
     def _hover(self, verdict: Verdict, new_alarm: bool) -> None:
-        """Hover while the position is unknown. The driver keeps control for the grace time."""
+        """Hover while the position is unknown. The driver keeps control for the grace period."""
         if new_alarm or self._control.motion is not None:
             self._control.dispatch(PositionLost(verdict.reason))
         else:
@@ -260,7 +261,7 @@ class MotionMonitor:
         self._control.tasks.spawn(self._carry_out(verdict, self._control.motion, self._permits(), compiled))
 
     def _permits(self) -> Permits:
-        """Return permits for a correction that hold while lease, authority and motion do not change."""
+        """Return permits for a correction. They are valid while lease, authority and motion do not change."""
         control = self._control
         lease = control.lease
         authority = control.authority

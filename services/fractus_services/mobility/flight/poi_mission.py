@@ -28,7 +28,8 @@ class PoiMissions:
         grants: Grants of this node.
         launch: Arms and takes off to the altitude of a position. Yields the current step.
         routes: Flies the legs.
-        boarding_s: Seconds after the arrival of a grant after which its mission starts even if no passenger connected.
+        boarding_s: Time for which a mission waits for its passengers after its grant has arrived, in seconds. Then it
+            starts without them.
     """
 
     def __init__(
@@ -87,7 +88,10 @@ class PoiMissions:
         return connected or mission.flown or control.autopilot.now - self._granted_at[grant.key] >= self._boarding_s
 
     async def _run_mission(self, grant: ActiveGrant) -> None:
-        """Fly a mission as a system task. Its end is ignored if the mission no longer has the drone."""
+        """Fly a mission as a system task, and dispatch its outcome.
+
+        The state ignores the outcome if the mission has lost the drone.
+        """
         control = self._control
         control.note("tour", f"{len(grant.spec.tour)} points of interest for {grant.identity}")
         try:

@@ -45,7 +45,8 @@ class ReturnFlight:
         routes: Follows the legs of a route.
 
     Attributes:
-        given_up: Grant under which no legal return was found last, so that the autopilot's own return is flown.
+        given_up: Grant under which the last search found no legal return. The drone then flies the autopilot's own
+            return.
     """
 
     def __init__(self, control: ControlStore, gate: PolicyGate, routes: RouteFollower) -> None:
@@ -219,7 +220,7 @@ class ReturnFlight:
         return vehicle.distance_m(vehicle.home.lat, vehicle.home.lon) if vehicle.home is not None else math.inf
 
     async def _next_leg(self, flight: SystemFlight) -> NextLeg | None:
-        """Return the next leg home. None at home, or if position or home is unknown.
+        """Return the next leg home, or None if the drone is at home, or if position or home is unknown.
 
         Raises:
             Refused: There is no legal route.
@@ -232,8 +233,8 @@ class ReturnFlight:
             return None
         for height in return_altitudes_m(now, flight.constraints.compiled, RTL_CONE_SLOPE * distance_m):
             vertical_first = may_change_altitude(now, flight.constraints.compiled, height)
-            # The system flies the whole route. `retraces` removes the condition that the autopilot's straight return is legal
-            # from each waypoint.
+            # Normally the autopilot's straight return must be legal from each waypoint of a route. The system itself
+            # flies this route home, so `retraces` disables that condition.
             planned = replace(
                 now,
                 airframe=replace(now.airframe, retraces=True),

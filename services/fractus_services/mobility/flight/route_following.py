@@ -76,7 +76,7 @@ def above_home_m(altitude_m: float, reference: Reference, home: Home | None, gra
 
 
 class ReplanBudget:
-    """Number of route searches that remain since the flight constraints changed last.
+    """Limits the number of route searches under the same flight constraints. Changed constraints reset the count.
 
     Args:
         constraints: Constraints of the flight.
@@ -88,7 +88,7 @@ class ReplanBudget:
         self._count = 0
 
     def allow(self, refusal: Refused) -> bool:
-        """Count a refusal. Return True if the flight continues on a different route."""
+        """Count a refused leg. Return True if the flight may continue on a different route."""
         if self._constraints.compiled is not self._compiled:
             self._compiled = self._constraints.compiled
             self._count = 0

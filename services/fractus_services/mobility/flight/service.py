@@ -127,7 +127,8 @@ class MobilityService:
         Args:
             grant: Grant of the caller.
             args: Pitch and yaw of the camera.
-            fixed_camera: True if pictures are judged by a mount that does not move.
+            fixed_camera: True if the node description declares a camera that does not move. Policies then assume the
+                declared attitude.
 
         Raises:
             Refused: A policy forbids it, the caller does not have control, or the camera cannot turn.
@@ -256,7 +257,7 @@ class MobilityService:
             setpoint = final.args if isinstance(final.args, VelocityArgs) else args
             self._velocity_hold.start(setpoint, motion, permit)
             self._control.count_velocity_flight(grant)
-        except BaseException:  # also if the caller cancels while the drone brakes
+        except BaseException:  # includes cancellation by the caller while the drone brakes
             self._control.fail_motion(motion)
             raise
         return final, setpoint

@@ -51,7 +51,10 @@ _RETURN = 1.0
 _RETRACE = 3.0
 
 _COMES_DOWN = frozenset({1.0, 2.0, 3.0, 5.0})
-"""Values of FENCE_ACTION that bring the drone down. With other values it only reports, or hovers until the battery is low."""
+"""Values of FENCE_ACTION that bring the drone down.
+
+With other values the autopilot only reports a breach, or hovers until the battery is low.
+"""
 
 ENABLE = "FENCE_ENABLE"
 TYPE = "FENCE_TYPE"
@@ -120,7 +123,8 @@ class ArduCopter:
         Setting(
             ("RTL_ALT_TYPE",), 0, frozenset(), False, "returns at an altitude above home, not above the ground below"
         ),
-        # 0 disables the cone. A slope above three times the default only climbs higher.
+        # Near home, the drone climbs at most to its distance from home times RTL_CONE_SLOPE. 0 disables this limit.
+        # With 0 or a larger slope, the drone only climbs higher than the policies assume.
         Setting(
             ("RTL_CONE_SLOPE",),
             RTL_CONE_SLOPE,
@@ -160,8 +164,9 @@ class ArduCopter:
     fence_parameters: tuple[str, ...] = (TYPE, ALTITUDE, ACTION, OPTIONS, ENABLE)
 
     gimbal_type = "MNT1_TYPE"
-    # Alexmos, serial SToRM32, MAVLink (Gremsy), Siyi, Xacti, Viewpro, Topotek. Servos, MAVLink SToRM32 and CADDX report their
-    # targets. Reports of scripts are not trusted.
+    # Alexmos, serial SToRM32, MAVLink (Gremsy), Siyi, Xacti, Viewpro and Topotek report a measured attitude. Servos,
+    # MAVLink SToRM32 and CADDX report their target instead. The reports of gimbals that a script controls are not
+    # trusted.
     measured_gimbals = frozenset({3.0, 5.0, 6.0, 8.0, 10.0, 11.0, 12.0})
 
     def unsupported(self, vehicle_type: int, autopilot: int) -> str:

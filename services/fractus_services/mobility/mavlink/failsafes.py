@@ -226,7 +226,10 @@ class MavlinkFailsafes:
         return replace(status, problem=problem, airframe=replace(status.airframe, return_altitude_m=height_m))
 
     def _chosen(self, settings: _Settings, before: FailsafeStatus | None) -> bool:
-        """Return True if the return along the path was chosen for this flight. After a restart of the service, the vehicle's parameter shows it."""
+        """Return True if the return along the path was chosen for this flight.
+
+        After a restart of the service, the choice is read from the vehicle's parameter.
+        """
         if before is not None:
             return before.airframe.retraces
         companion = self._stack.path_return[0]

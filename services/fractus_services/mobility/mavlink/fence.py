@@ -41,7 +41,11 @@ CEILING_MARGIN_M = 5.0
 """Margin between the maximum altitude of the grant and the ceiling of the fence, in metres."""
 
 MAX_VERTICES = (60, 30, 15, 8, 4)
-"""Numbers of vertices, tried in this order. The capacity depends on the autopilot's board and on the owner's fence."""
+"""Maximum numbers of vertices of the polygon.
+
+They are tried in this order until the polygon fits. The capacity depends on the autopilot's board and on the owner's
+fence.
+"""
 
 _SIMPLER_M = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0)
 

@@ -26,7 +26,8 @@ class Setting:
         span: Values above the first number and up to the second may also stay.
         needed: True if arming is refused when the vehicle does not have the parameter.
         purpose: What the autopilot does because of the setting: a verb phrase for messages.
-        additional: Further setting, by the name of the parameter: it must hold if the vehicle uses that name.
+        additional: Further settings by name of the parameter. Each one must hold if the vehicle uses the parameter
+            under that name.
     """
 
     names: tuple[str, ...]

@@ -13,7 +13,7 @@ from fractus_services.errors import AutopilotError, PreconditionFailed
 from fractus_services.mobility.autopilot import Permit
 
 MAX_NORM_ERROR = 0.02
-"""A quaternion whose norm differs from 1 by more is not an attitude."""
+"""Maximum difference of a quaternion's norm from 1. With a larger difference, the quaternion is not an attitude."""
 
 _LEVELLED = mavlink.GIMBAL_DEVICE_FLAGS_ROLL_LOCK | mavlink.GIMBAL_DEVICE_FLAGS_PITCH_LOCK
 _FRAMES = mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_VEHICLE_FRAME | mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_EARTH_FRAME

@@ -66,10 +66,13 @@ Velocity = tuple[float, float, float]
 """North, east and down, m/s."""
 
 MAX_SETPOINTS = 200
-"""Maximum number of stored setpoints. Fewer can be sent within the longest latency with which the service flies."""
+"""Maximum number of stored setpoints.
+
+The service sends fewer setpoints within the longest latency at which it flies.
+"""
 
 TURNED_MPS = 0.5
-"""Speed across the course up to which a vehicle has turned onto the course."""
+"""A vehicle has turned onto its course if its speed across the course is at most this value."""
 
 LEVEL_M = 0.3
 """Height difference up to which a leg neither climbs nor descends."""
@@ -78,9 +81,10 @@ LEVEL_M = 0.3
 class Acknowledgements:
     """Transmissions that are not acknowledged yet, by command.
 
-    COMMAND_ACK contains the command id only. A command that was sent twice is acknowledged twice, and the second acknowledgement
-    must not count for the next command with the same id. Links preserve the order, so each acknowledgement is assigned to the oldest transmission that can still be answered
-    according to the measured delay of the link.
+    COMMAND_ACK contains the command id only. A command that was sent twice is acknowledged twice, and the second
+    acknowledgement must not count for the next command with the same id. Links preserve the order of messages. Each
+    acknowledgement is therefore assigned to the oldest transmission that can still be answered according to the
+    measured delay of the link.
 
     Args:
         sysid: System id of the sender of the commands. Acknowledgements for other systems are ignored.
@@ -147,7 +151,10 @@ class Acknowledgements:
             answer.set_result(result)
 
     def _is_duplicate(self, acknowledgement: Message, now: float) -> bool:
-        """Return True if the network delivered the last acknowledgement again. Frames contain sequence numbers."""
+        """Return True if the network delivered the last acknowledgement twice.
+
+        Frames contain sequence numbers, so only copies of one frame are equal.
+        """
         frame, at = self._last
         self._last = acknowledgement.frame, now
         return frame != b"" and frame == acknowledgement.frame and now - at < ACK_TIMEOUT_S
@@ -169,7 +176,11 @@ class RecentSetpoints:
         self._sent.append((first, now, velocity))
 
     def add_leg(self, lat: float, lon: float, altitude_m: float, vehicle: VehicleState, now: float) -> None:
-        """Add a leg from the vehicle's position to a point. The leg counts as a velocity of `LEG_MPS` towards the point."""
+        """Add a leg from the vehicle's position to a point.
+
+        The speed of a leg is unknown, so the leg is stored as a velocity towards the point with the placeholder
+        `LEG_MPS`.
+        """
         if vehicle.lat is None or vehicle.lon is None:
             return
         east, north = LocalFrame(vehicle.lat, vehicle.lon).xy(lat, lon)
@@ -181,9 +192,9 @@ class RecentSetpoints:
     def pending_since(self, earliest: float, measured: Velocity) -> tuple[Velocity, ...]:
         """Return the setpoints that the vehicle may still be reacting to, the latest last. Older ones are dropped.
 
-        Setpoints sent after `earliest` always count. The setpoint that was in force at `earliest` counts if the vehicle still
-        reacts to it. A vehicle that slows down to a held velocity does not continue to brake. A vehicle that turns onto a leg
-        does not continue in its measured direction.
+        Setpoints sent after `earliest` always count. The setpoint that was in force at `earliest` counts in two cases.
+        If it is a velocity command, the vehicle brakes only until it has reached that velocity. If it is a leg onto
+        which the vehicle still turns, the vehicle will not continue in its measured direction.
 
         Args:
             earliest: Time on the clock of `add_velocity`.
@@ -199,7 +210,7 @@ class RecentSetpoints:
 
 
 def _is_held(velocity: Velocity) -> bool:
-    """Return True for a velocity that the vehicle holds, False for a stop or a leg."""
+    """Return True if a setpoint is a velocity command. Return False for a stop, and for a leg stored with `LEG_MPS`."""
     return moves(velocity) and max(map(abs, velocity)) < LEG_MPS / 2
 
 
@@ -302,7 +313,7 @@ class MavlinkAutopilot(AutopilotLink):
     def _lost(self) -> None:
         self.vehicle.gimbal_measured = self.vehicle.gimbal_limits = None
         self.vehicle.identity_problem = ""
-        # Accept the first heartbeat of a new connection: the drone may have landed meanwhile.
+        # Let the first heartbeat of a new connection report stopped motors: the drone may have landed meanwhile.
         self.vehicle.stopping_at = -math.inf
         for part in (self._rates, self._home_monitor, self._acknowledgements, self.vehicle_parameters):
             part.forget()
@@ -342,8 +353,8 @@ class MavlinkAutopilot(AutopilotLink):
             AutopilotError: The autopilot refused the command, or did not answer.
         """
         with tracing.child_span(f"autopilot.{enum_name('MAV_CMD', command)}"):
-            # Commands with the same id wait for each other, because a repeated command could undo a later one. A mode change does
-            # not wait for an unanswered one, because it may start the return flight.
+            # Commands with the same id wait for each other, because a repeated command could undo a later one. Mode
+            # changes do not wait for earlier mode changes, because a mode change may start the return flight.
             async with nullcontext() if command in _NOT_SERIALIZED else self._locks.setdefault(command, asyncio.Lock()):
                 answer = Answer()
                 for attempt in range(attempts):

@@ -95,7 +95,8 @@ class Parameters:
         self.values[name] = value
         self._received[name] = self._number
         self._absent.discard(name)
-        # Answers to requests by name have index 65535. Indices of the list count until an enabled feature changes its length.
+        # Answers to requests by name have index 65535. Enabling a feature changes the length and the indices of the
+        # list.
         if index < size:
             if size != self._size:
                 self._size = size

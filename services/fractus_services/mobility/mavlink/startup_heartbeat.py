@@ -119,7 +119,10 @@ class _HeartbeatResponder:
         self.broken.set()
 
     def received(self, data: bytes) -> None:
-        """Reply to the vehicle's heartbeats. The replies thereby follow the vehicle's clock, like the timeout of its failsafe."""
+        """Reply to each heartbeat of the vehicle.
+
+        The rate of the replies thereby follows the vehicle's clock, which also determines the timeout of its failsafe.
+        """
         for incoming in self._endpoint.decode(data):
             if incoming.name != "HEARTBEAT" or (incoming.sysid, incoming.compid) != self._own:
                 continue

@@ -51,7 +51,7 @@ cannot send.
 """
 
 HOME_JUMP_M = 1.0
-"""Change of home's altitude above sea level, computed from one position message, above which home was moved."""
+"""Change of home's altitude above sea level, computed from one position message, above which home counts as moved."""
 
 HOME_RETRY_S = 0.3
 """Time to wait for a requested HOME_POSITION before it is requested again."""

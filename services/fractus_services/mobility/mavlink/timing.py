@@ -151,7 +151,10 @@ class Timing:
         return max(stamp + self.pace * (at - arrived) for arrived, stamp in self._samples)
 
     def _compare(self, now: float) -> None:
-        """Update the pace of the vehicle's clock. It is 1 unless that is certainly wrong."""
+        """Update the pace of the vehicle's clock.
+
+        It is 1 unless the measured rate exceeds 1 by more than its possible error.
+        """
         if now < self._compared_from:
             return
         if not self._history or now - self._history[-1][0] >= RATE_S[0] / 4:
@@ -161,10 +164,11 @@ class Timing:
         since_s = now - self._history[0][0]
         if since_s < RATE_S[0]:
             return
-        # If the first position of the history was late, the clock seems fast. The second one was then in time.
+        # If a position at the start of the period was late, the clock seems fast. Take the smaller of the rates since
+        # the first and since the second position, because rarely both are late.
         rate = min((self._sampled - first) / (now - begun) for begun, first in islice(self._history, 2))
         error = (max(self.delay_s, 0.0) + 0.1) / since_s
-        # The error grows with the measured delay, so an unknown delay does not count.
+        # The error is infinite while the delay is unknown, so it is limited here.
         self.pace = rate + min(error, 0.1 * rate) if rate > 1.0 + min(error, 1.0) else 1.0
 
     def request(self, due: float) -> int | None:
@@ -247,10 +251,11 @@ class Timing:
         if now - self._measured_at > STALE_S or self.delay_s > MAX_DELAY_S:
             return math.inf
         age_s = self._present(now) - self._sampled
-        # When the link becomes slow, the first slow answer arrives late. Until then, the delay is longer by the time by which the
-        # oldest unanswered request exceeds the slowest recent answer.
+        # When the link becomes slow, the new delay is unknown until the first slow answer arrives. Until then, assume
+        # that the delay has grown by the time for which the oldest unanswered request is overdue.
         overdue_s = 0.0
-        # After `STALE_S` without an answer, acknowledgements measure this link. Before that, the answers may only have become slow.
+        # A vehicle that has not answered TIMESYNC for `STALE_S` is measured by acknowledgements of commands. Its
+        # TIMESYNC requests are then not overdue. Before that, the answers may only have become slow.
         if not self.unanswering or now - self._latest_answered_sent <= STALE_S:
             later_requests = (sent for sent, _ in self._open_requests.values() if sent > self._latest_answered_sent)
             overdue_s = max(now - min(later_requests, default=now) - self.answer_s, 0.0)

@@ -33,7 +33,11 @@ STOPPED_S = 0.7
 """Time for which heartbeats (one per second) must report stopped motors in flight before the motors count as stopped."""
 
 STARTED_S = 5.0
-"""A drone whose motors have run for a shorter time may be about to take off. After a longer gap between heartbeats it may have landed."""
+"""Time after the start of its motors for which a drone counts as flying, because it may be about to take off.
+
+It is also the gap between heartbeats after which a report of stopped motors is accepted at once, because the drone may
+have landed.
+"""
 
 PATH_KEPT_S = 12.0
 """Time without a position after which the recorded path counts as lost.

@@ -71,7 +71,10 @@ class ControlStreams:
         while control.lease is lease:
             reason = control.not_ready_reason(lease.key)
             if control.state.armed_for_other(lease.key):
-                raise PreconditionFailed("ControlHeld", "another application has the drone; try again when it is back")
+                raise PreconditionFailed(
+                    "ControlHeld",
+                    "another application has the drone; try again when the flight of that application has ended",
+                )
             if reason is None:
                 if lease.grant.spec.control != "partial":
                     return

@@ -101,7 +101,7 @@ class _DroneFlights:
 
 
 def _flights_by_node(entries: Iterable[Entry]) -> dict[str, _DroneFlights]:
-    """Return paths and decisions by node. Nodes without either are omitted."""
+    """Return paths and decisions by node. Omit nodes that have neither paths nor decisions."""
     by_node: dict[str, _DroneFlights] = {}
     for entry in entries:
         by_node.setdefault(entry["node"], _DroneFlights()).add(entry)

@@ -247,7 +247,7 @@ RESET = '{"type":"reset"}'
 """Earlier events are void. The complete current state follows."""
 
 LIVE = '{"type":"live"}'
-"""The current state is complete. Later events happen now."""
+"""The current state is complete. Later events are sent as they happen."""
 
 END = '{"type":"end"}'
 """The recording has ended."""

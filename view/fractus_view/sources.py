@@ -75,14 +75,14 @@ class Replay:
         self._files = PictureFiles(paths)
 
     def picture(self, id_: str) -> bytes | None:
-        """Return a picture of the recordings."""
+        """See `Source`."""
         return self._files.picture(id_)
 
     async def run(self) -> None:
         """Do nothing, because recordings do not change."""
 
     async def stream(self, last_id: str) -> AsyncIterator[bytes]:
-        """Yield all events, and the end. The id of a message is the number of events up to this message."""
+        """Yield all events, and finally `END`. The id of a message is the number of events sent up to this message."""
         sent = int(last_id) if last_id.isascii() and last_id.isdecimal() and len(last_id) < 16 else 0
         events = itertools.islice(self.events(), sent, None)
         first = [] if sent else [RESET]
@@ -125,7 +125,7 @@ class GrowingRecordings:
         self._problem = ""
 
     def picture(self, id_: str) -> bytes | None:
-        """Return a picture of the recordings while its file exists."""
+        """See `Source`. The result is also None if the file of the picture was removed."""
         return self._files.picture(id_)
 
     def stream(self, last_id: str) -> AsyncIterator[bytes]:

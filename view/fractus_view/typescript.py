@@ -36,7 +36,7 @@ def typescript_types() -> str:
     parts = [
         *interfaces,
         f"export type Event =\n{union};\n",
-        "/** Markers of the stream: the complete current state follows, later events happen now, the recording has ended. */\n"
+        "/** Markers of the stream: the complete current state follows, later events are live, the recording has ended. */\n"
         f"export type Marker = {markers};\n",
     ]
     return "\n".join([_HEAD, *parts])

@@ -140,7 +140,8 @@ class MobilityServiceServicer(object):
         raise NotImplementedError('Method not implemented!')
 
     def ReportProgress(self, request, context):
-        """Reports the progress of the caller's current task. GRANTED returns it after a restart of the caller. Requires control.
+        """Reports the progress of the current task of the caller. Requires control.
+        After a restart of the caller, GRANTED contains this progress.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')

@@ -230,5 +230,5 @@ export type Event =
   | Picture
   | Problem;
 
-/** Markers of the stream: the complete current state follows, later events happen now, the recording has ended. */
+/** Markers of the stream: the complete current state follows, later events are live, the recording has ended. */
 export type Marker = { type: "reset" } | { type: "live" } | { type: "end" };

@@ -368,7 +368,7 @@ class GrantSynchronizer:
             except OSError:
                 if not self._remove_outdated(grant):
                     raise
-                stored = self._directory.write(grant)  # again, because the removal may have freed space
+                stored = self._directory.write(grant)  # The removal may have freed enough space.
             if stored:
                 log.info("grants: stored (grant=%s identity=%s)", grant.name, grant.spec.identity)
             self._written[grant.name] = grant.spec.unsigned

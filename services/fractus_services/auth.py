@@ -206,4 +206,7 @@ SERVER_OPTIONS = (
     ("grpc.server_handshake_timeout_ms", 5_000),
     ("grpc.max_allowed_incoming_connections", 512),
 )
-"""Options of gRPC servers. A peer without ping replies is disconnected within 4 s, and one without TLS handshake within 5 s."""
+"""Options of gRPC servers. A peer that does not reply to pings is disconnected within 4 s.
+
+A peer that does not complete the TLS handshake is disconnected within 5 s.
+"""

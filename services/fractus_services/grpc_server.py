@@ -34,7 +34,7 @@ log = logging.getLogger(__name__)
 
 CALLS_PER_S = 50.0
 CALL_BURST = 100.0
-"""Rate and burst of calls of one identity. A driver that streams setpoints stays far below it."""
+"""Rate and burst of calls of one identity. A driver that streams setpoints stays far below these limits."""
 
 URGENT_PER_S = 20.0
 URGENT_BURST = 40.0
@@ -290,7 +290,7 @@ async def serve_grpc(
 
 
 async def run_until(stop: asyncio.Event, *parts: Coroutine[Any, Any, None]) -> None:
-    """Run the parts of a service until `stop` is set. The failure of one part ends all.
+    """Run the parts of a service until `stop` is set. If one part fails, all parts end.
 
     Raises:
         ExceptionGroup: A part failed.

@@ -1,4 +1,4 @@
-"""Accepting end of pairing: takes sessions of the nodes that a DirectLink names, up to a limit."""
+"""Accepting end of pairing: accepts sessions of the nodes that a DirectLink names, up to a limit."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from fractus_agent.links.pairing import (
 log = logging.getLogger(__name__)
 
 MAX_PENDING = 8
-"""Limit of concurrent handshakes. Each one costs a signature, and anyone in range can start one."""
+"""Limit of concurrent handshakes. Each handshake costs a signature, and any device in range can start handshakes."""
 
 _ACCEPT_RETRY_S = 0.2
 
@@ -38,7 +38,7 @@ class Acceptor:
     Args:
         directory: Directory of this node's certificate, key and authority. Read for each session, because they are
             renewed.
-        refusal: Returns the reason why a node may not link to this one now, empty if it may.
+        refusal: Returns the reason why a node may not link to this node now, empty if it may.
         on_session: Runs while a session lasts. It moves traffic to the link, and back at the end.
         max_peers: Limit of concurrent sessions.
     """
@@ -62,7 +62,7 @@ class Acceptor:
 
     @property
     def peers(self) -> frozenset[str]:
-        """Names of the nodes that are linked to this one."""
+        """Names of the nodes that are linked to this node."""
         return frozenset(self._sessions)
 
     async def run(self, address: IPv4Address) -> None:

@@ -21,7 +21,7 @@ SILENT_S = 4.0
 STEADY_S = 5.0
 """Time with responses after which an unreachable path counts as reachable again, in seconds.
 
-A path that flaps faster moves no traffic.
+If the path fails again within this time, it stays unreachable. A path that fails often therefore causes few switches.
 """
 LATENCY_SAMPLES = 10
 """Number of samples whose minimum is the latency. Larger samples include a handshake, or queueing behind pictures."""

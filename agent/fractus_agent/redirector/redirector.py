@@ -164,7 +164,7 @@ class Redirector:
         self._close_old_paths(old_paths)
 
     async def run(self) -> None:
-        """Keep the redirects alive until cancelled. After that new connections take the cloud path at once."""
+        """Keep the redirects alive until cancelled. Then remove them, so that new connections take the cloud path."""
         try:
             while True:
                 await asyncio.sleep(REFRESH_S)

@@ -119,7 +119,8 @@ def _image_info(record: ImageRecord) -> camera_pb2.ImageInfo:
     )
     info.time.FromNanoseconds(int(record.time_s * 1e9))
     pose = record.poses[-1]
-    # Omit the position of a filtered image: it is private too, because a policy required the filter there.
+    # Omit the position of a filtered image. A policy required the filter because of this position, so the position is
+    # private too.
     if pose.lat is not None and pose.lon is not None and not record.filters:
         info.position.latitude_deg = pose.lat
         info.position.longitude_deg = pose.lon

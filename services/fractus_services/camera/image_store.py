@@ -109,7 +109,10 @@ class ImageRecord:
 
 
 def owner_of(grant: ActiveGrant) -> str:
-    """Return the owner of the images taken under a Grant. The uid distinguishes applications that use the same name in turn."""
+    """Return the owner of the images taken under a Grant.
+
+    The uid distinguishes applications that use the same name one after the other.
+    """
     return f"{grant.spec.application.uid}/{grant.identity}"
 
 

@@ -26,7 +26,10 @@ DEFAULT_AGE_S = 0.5
 STEP_WINDOW_S = 10.0
 """Time after a backward clock step during which messages with timestamps from before the step may still arrive, in seconds."""
 MAX_AHEAD_S = 0.05
-"""Maximum time by which a message's timestamp may be after its arrival. A larger difference means another clock."""
+"""Maximum time by which a message's timestamp may be after its arrival.
+
+If the difference is larger, the sender uses another clock.
+"""
 
 
 class ArrivalClock:

@@ -332,7 +332,7 @@ class ControlStore:
         return check
 
     def transit_permit(self, lease: Lease, motion: Motion) -> Permit:
-        """Return a permit for transit flights that holds while the driver that requested the transit is waiting."""
+        """Return a permit for transit flights. It is valid while the driver that requested the transit is waiting."""
 
         def check() -> None:
             motion.check()
@@ -342,7 +342,7 @@ class ControlStore:
         return check
 
     def system_permit(self, constraints: FlightConstraints, motion: Motion) -> Permit:
-        """Return a permit for flights without a driver that holds while no other party has the drone."""
+        """Return a permit for flights without a driver. It is valid while no other party has the drone."""
 
         def check() -> None:
             motion.check()

@@ -118,7 +118,7 @@ class ReturnFlight:
         return stack.return_retracing if retraces else stack.return_straight
 
     async def _restore_home(self) -> None:
-        """Restore home if it was moved, because the autopilot's own return leads there.
+        """Restore home if it was moved, because the autopilot's own return ends at home.
 
         Raises:
             AutopilotError: Home was not restored. While the autopilot is connected, this counts as a refused attempt, so that

@@ -244,7 +244,7 @@ class MobilityService:
                 return verdict
             permit()
             verdict = self.calls.allow_motion(call, self._control.require_control(grant).grant, verdict)
-        raise Aborted("NotStopping", "the drone does not come to rest, which it must before it can begin its leg")
+        raise Aborted("NotStopping", "the drone does not come to rest, so it cannot begin its leg")
 
     async def set_velocity(self, grant: ActiveGrant, args: VelocityArgs) -> tuple[Verdict, VelocityArgs]:
         """Fly with a velocity until the next setpoint, or until its hold time ends."""

@@ -25,7 +25,10 @@ log = logging.getLogger(__name__)
 
 _RESTORE_TIMEOUT_S = 5.0
 ITEMS_AGAIN_S = 60.0
-"""Interval at which the items are read in flight. Only this shows if another station replaced them by the same number of items."""
+"""Interval at which the items are read in flight.
+
+This detects that another station replaced them by the same number of items.
+"""
 
 _SWITCHED = mavlink.FENCE_TYPE_ALT_MAX | mavlink.FENCE_TYPE_CIRCLE | mavlink.FENCE_TYPE_POLYGON
 """All fence types except the minimum altitude, which the autopilot enables automatically."""

@@ -15,7 +15,10 @@ from fractus_services.errors import AutopilotError
 PARAMETER_TIMEOUT_S = 0.7
 PARAMETER_ATTEMPTS = 8
 ATTEMPTS_BEFORE_LIST = 4
-"""The list has about 1,400 parameters and takes half a minute at 57,600 baud. It is requested only for unanswered names."""
+"""Number of unanswered requests for a name after which the complete list of parameters is requested.
+
+The list has about 1,400 parameters, and its transfer takes half a minute at 57,600 baud.
+"""
 
 WINDOW = 12
 """Concurrent requests. ArduPilot queues 20 and drops the rest."""
@@ -27,7 +30,10 @@ LIST_TIMEOUT_S = 180.0
 """Longest time for the transfer of the list, including repeated requests."""
 
 FEW_MISSING = 0.05
-"""If a larger share of the list is missing, the complete list is requested again instead of single entries."""
+"""Share of the list.
+
+If more entries are missing, the complete list is requested again, otherwise the missing entries.
+"""
 
 Spellings = tuple[str, ...]
 """Names of one parameter in older and newer releases. A vehicle has the parameter under one of them."""

@@ -162,7 +162,7 @@ class GrantVerifier:
         try:
             authorities = read_authorities(self._path.read_bytes())
         except (OSError, ValueError) as error:
-            raise UnknownAuthority(f"the node has no authority to verify the signature with ({error})") from None
+            raise UnknownAuthority(f"the node cannot read the certificate of its authority ({error})") from None
         verify(grant, authorities)
 
 

@@ -21,8 +21,8 @@ class FairQueue:
     """Serves one request at a time, round-robin over the owners of requests.
 
     Args:
-        max_per_owner: Requests of one owner that may wait or be served.
-        max_requests: Requests of all owners that may wait or be served.
+        max_per_owner: Maximum number of requests of one owner that wait or are being served.
+        max_requests: Maximum number of requests of all owners that wait or are being served.
     """
 
     def __init__(self, max_per_owner: int, max_requests: int) -> None:

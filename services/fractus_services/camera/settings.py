@@ -23,10 +23,12 @@ class CameraSettings(ServiceOptions):
         relief: Maximum depth of the surrounding ground below home, in metres. It limits the area that an image may show.
         capture_timeout_s: Time after which a camera that has returned no image counts as failed, in seconds.
         motion_frame_interval_s: Interval between the three frames for motion detection, in seconds.
-        max_requests_per_instance: Requests of one component instance that may wait or be served, in each queue.
-        max_captures: Captures of all component instances that may wait or run.
-        max_filtering: Filter jobs of all component instances that may wait or run. Each takes tens of megabytes of memory.
-        max_unrecorded_images: Images that may wait for the recorder. Each takes about a megabyte of memory.
+        max_requests_per_instance: Maximum number of requests of one component instance in each queue.
+        max_captures: Maximum number of captures of all component instances that wait or run.
+        max_filtering: Maximum number of filter jobs of all component instances that wait or run. Each takes tens of
+            megabytes of memory.
+        max_unrecorded_images: Maximum number of images that wait for the recorder. Each takes about a megabyte of
+            memory.
         telemetry_interval_s: Requested interval between telemetry messages, in seconds.
         telemetry_retry_s: Delay before the telemetry subscription is renewed after a failure, in seconds.
     """

@@ -57,13 +57,13 @@ class MobilitySettings:
     """Number of refused attempts to return, after which the drone lands where it is."""
 
     settle_timeout_s: float = 10.0
-    """Seconds for which braking continues until the drone is at rest."""
+    """Longest time for which the stop setpoint is repeated until the drone is at rest, in seconds."""
 
     settled_mps: float = 0.2
     """Speed below which the drone counts as settled; well below the speed at which the policy engine considers it at rest."""
 
     brake_timeout_s: float = 8.0
-    """Seconds to wait for the drone to come to rest before a return."""
+    """Longest time to wait until the drone is at rest before a return, in seconds."""
 
     brake_resend_s: float = 0.1
     """Seconds of the vehicle's clock between stop setpoints."""

@@ -188,8 +188,9 @@ class Arming:
     def _home_of(self, grant: ActiveGrant, mission: Mission) -> tuple[float, float, float]:
         """Return the home of the mission: where it armed for its first takeoff.
 
-        If the drone lands on the way and arms again, home does not move. If the previous attempt did not lead to a flight, home is
-        the current position, because the drone may have been carried or its position estimate may have become more accurate.
+        If the drone lands on the way and arms again, home does not move. If the previous attempt did not lead to a
+        flight, home is the current position. The drone may have been carried since, or its position estimate may have
+        become more accurate.
         """
         vehicle = self._control.autopilot.vehicle
         if vehicle.lat is None or vehicle.lon is None:

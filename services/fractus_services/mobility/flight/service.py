@@ -131,7 +131,7 @@ class MobilityService:
                 declared attitude.
 
         Raises:
-            Refused: A policy forbids it, the caller does not have control, or the camera cannot turn.
+            Refused: A policy forbids the call, the caller does not have control, or the camera cannot turn.
             AutopilotError: The autopilot did not answer.
         """
         verdict = self.calls.allow_motion(Call("PointGimbal", args), grant)

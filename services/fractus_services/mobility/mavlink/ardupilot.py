@@ -204,8 +204,8 @@ class ArduCopter:
     def return_values(self, owned: Mapping[str, float], bounds: ReturnBounds) -> dict[str, float]:
         """Return limited values of the return parameters.
 
-        These are RTL_ALT, RTL_SPEED (0 means WPNAV_SPEED), WPNAV_SPEED for SmartRTL, and RTL_CLIMB_MIN of 0, so that the drone does not
-        climb above the altitude for which return flights are judged.
+        RTL_ALT and RTL_SPEED apply to RTL. WPNAV_SPEED applies to SmartRTL, and to RTL if RTL_SPEED is 0. RTL_CLIMB_MIN
+        becomes 0, so that the drone does not climb above the altitude for which return flights are judged.
         """
         speed_mps = max(bounds.speed_mps, _MIN_SPEED_MPS)
         limited = {}

@@ -11,7 +11,10 @@ SYSTEM_ID = 244
 COMPONENT_ID = mavlink.MAV_COMP_ID_ONBOARD_COMPUTER
 
 MAVLINK_VERSION = 3
-"""Version of the dialect in HEARTBEAT. The version of a frame is in its first byte."""
+"""Field `mavlink_version` of HEARTBEAT: version of the dialect.
+
+The protocol version of a frame is in its first byte.
+"""
 
 
 def heartbeat() -> Message:

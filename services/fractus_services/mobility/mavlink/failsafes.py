@@ -47,7 +47,7 @@ class Reader:
 
 
 class _Settings:
-    """One pass over the settings.
+    """One pass over the settings, in which each one is checked, and set if its parameter has another value.
 
     Args:
         parameters: Access to the vehicle's parameters.

@@ -204,7 +204,8 @@ def _status(vehicle: Vehicle, message: Message, now: float) -> None:
 
 
 def _estimator(vehicle: Vehicle, message: Message, now: float) -> None:
-    # In modes that need no position the checks pass without one. The flags show if GUIDED has what it needs.
+    # In modes that need no position, the pre-arm checks pass without a position. These flags show if the position that
+    # GUIDED needs is available.
     vehicle.estimated = message.integer("flags") & _POSITIONED == _POSITIONED
     # A service that starts in flight received no earlier positions. It assumes that a vehicle with a position has kept its path.
     first_estimate = vehicle.positioned_at == -math.inf and vehicle.estimated

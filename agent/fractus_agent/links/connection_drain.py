@@ -14,7 +14,7 @@ log = logging.getLogger(__name__)
 
 
 class ConnectionDrain:
-    """Switches services whose old path still works.
+    """Switches services whose old path still works. Their old connections may finish on that path.
 
     Args:
         redirector: Redirector of this node.
@@ -28,7 +28,7 @@ class ConnectionDrain:
 
     @property
     def on_link(self) -> bool:
-        """True if connections may still be on the direct link although their services have left it."""
+        """True if old connections may still use the direct link although their services use the cloud path now."""
         return any(self._on_link.values())
 
     async def begin(self, targets: Mapping[Endpoint, Endpoint | None]) -> None:
@@ -48,7 +48,7 @@ class ConnectionDrain:
                 continue
             task: asyncio.Task[object] = asyncio.create_task(self._redirector.switch(selected, planned=True))
             self._on_link[task] = on_link
-            await asyncio.sleep(0)  # the switch writes the map, or fails, before it waits for anything
+            await asyncio.sleep(0)  # lets the switch write the map or fail
             if task.done():
                 del self._on_link[task]
                 task.result()

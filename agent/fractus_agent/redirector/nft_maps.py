@@ -104,7 +104,10 @@ class Redirect:
 
 
 Callers = Mapping[Endpoint, Collection[IPv4Address]]
-"""Addresses of the clients that may call an endpoint, by guarded endpoint."""
+"""Addresses of the allowed clients by guarded endpoint.
+
+Calls of other clients are not redirected. If the endpoint is a pod of this node, they are dropped.
+"""
 NO_GUARDS: Callers = MappingProxyType({})
 
 

@@ -209,7 +209,7 @@ class ControlStore:
 
     @property
     def last_grant(self) -> ActiveGrant | None:
-        """Grant whose constraints apply to the return flight: the mission's, or the one that was removed in flight."""
+        """Grant of the mission, even if it was removed in flight. Its constraints apply to the return flight."""
         return self.mission_grant or (self._removed if self._state.removed is not None else None)
 
     @property

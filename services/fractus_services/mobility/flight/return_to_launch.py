@@ -185,7 +185,11 @@ class ReturnFlight:
                 raise
 
     def descent(self, grant: ActiveGrant) -> FlightMode:
-        """Return the mode for the rest of the return: landing at home, else a return along the recorded path or straight."""
+        """Return the mode for the rest of the return flight.
+
+        If no legal return was found, it is the autopilot's return along the recorded path. Otherwise it is landing if
+        the drone is at home, and the autopilot's straight return if it is not.
+        """
         autopilot = self._control.autopilot
         stack = autopilot.stack
         if grant is self.given_up:

@@ -43,7 +43,7 @@ def start_of(point: ControlPoint) -> Position:
 
 
 class TransitFlight:
-    """Arms, takes off and flies to the start of a control point. The same policies apply as to a driver."""
+    """Arms, takes off and flies to the start of a control point. The policies are the same as for a driver."""
 
     def __init__(self, control: ControlStore, arming: Arming, gate: PolicyGate, routes: RouteFollower) -> None:
         self._control = control

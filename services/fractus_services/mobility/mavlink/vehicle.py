@@ -167,7 +167,8 @@ def _gimbal_limits(vehicle: Vehicle, message: Message, _now: float) -> None:
 def _parameter(vehicle: Vehicle, message: Message, _now: float) -> None:
     if message.text("param_id") == vehicle.stack.gimbal_type:
         measures = message.real("param_value") in vehicle.stack.measured_gimbals
-        # A changed type takes effect after the next start, which requests it again.
+        # If the type was changed, the autopilot uses the new type only after a restart. The type is then requested
+        # again.
         vehicle.gimbal_measured = measures and vehicle.gimbal_measured is not False
 
 
@@ -176,7 +177,7 @@ def _home(vehicle: Vehicle, message: Message, _now: float) -> None:
     if place is None:
         return
     vehicle.home = Home(*place, message.integer("altitude") / 1e3)
-    # The first home after arming may have been lost. Then the next one counts, wherever the vehicle is.
+    # The home that was reported after arming may have been lost. The next reported home is then used, even in flight.
     if not vehicle.in_air or vehicle.ground_home is None:
         vehicle.ground_home = vehicle.home
 

@@ -1,9 +1,11 @@
-"""The mobility service and the simulated vehicle in one loop of virtual time, on a link that delays and loses frames.
+"""Random flights of the mobility service on the simulated vehicle, over a link that delays and loses frames.
 
-Only the driver is fake. The service sets parameters, failsafes and the fence of the vehicle over the link, judges calls, and
-flies and monitors motions. A seed determines a flight: zones and limits, the requests of the driver, the delay of the link, the
-wind and the faults. An oracle checks the true position of the vehicle, which the service cannot observe. The oracle shares no
-code with the policy engine.
+Service and vehicle run in one event loop with virtual time. Only the driver is fake. The service sets the parameters,
+failsafes and fence of the vehicle over the link. It judges the calls of the driver, and flies and monitors motions.
+
+A seed determines a flight: zones and limits, the requests of the driver, the delay of the link, the wind and the
+faults. An oracle checks the true position of the vehicle. The service cannot observe this position. The oracle shares
+no code with the policy engine.
 """
 
 from __future__ import annotations
@@ -40,10 +42,10 @@ from mobility_world import FRAME, Grants, area, goto, spec, zone
 from virtual_time import Loop
 
 PROGRAMME_S = 400.0
-"""Time after which a driver ends its flight, for example because a speed limit is low."""
+"""Maximum duration of a driver's flight. Flights under a low speed limit may reach it."""
 
 HOME_S = 250.0
-"""Maximum duration of a return, including the grace time."""
+"""Maximum duration of a return flight, including the driver grace before it."""
 
 HALF_M = 130.0
 """Distance from home to each side of the operation area, in metres."""
@@ -51,19 +53,23 @@ HALF_M = 130.0
 WATCH_S = 0.05
 HEIGHT_SLACK_M = 2.0
 SPEED_SLACK_MPS = 1.0
-"""Tolerances stated in docs/policies.md (height) and docs/mobility.md (speed, without gusts)."""
+"""Tolerances from docs/policies.md (height) and docs/mobility.md (speed, in wind without gusts)."""
 
 REACTION_S = 0.4
-"""Time until a change takes effect. The service guarantees 0.2 s, and the vehicle needs the same time again."""
+"""Time until a new rule affects the motion: at most 0.2 s in the service, and 0.2 s in the vehicle."""
 
 BRAKING_SHARE = 0.64
 MAX_BRAKING_MPS2 = 1.6
-"""Mean deceleration of ArduCopter's BRAKE in tailwind: with WPNAV_ACCEL 250 it takes 10.6 m from 6.4 m/s and 19.6 m from 9.6 m/s.
-A lower acceleration setting also reduces the deceleration."""
+"""Mean deceleration of ArduCopter's BRAKE mode in tailwind.
+
+It is the smaller value of BRAKING_SHARE times WPNAV_ACCEL and MAX_BRAKING_MPS2.
+
+With WPNAV_ACCEL 250, the stopping distance is 10.6 m from 6.4 m/s and 19.6 m from 9.6 m/s.
+"""
 
 
 JERK_MPS3 = 5.0
-"""PSC_JERK_XY of ArduCopter, with which an acceleration ends."""
+"""ArduCopter's PSC_JERK_XY. It limits how fast the vehicle can reduce its acceleration."""
 
 
 @dataclass(frozen=True)
@@ -77,9 +83,9 @@ class Weather:
         wind_mps: Mean wind.
         gusts_mps: Strength of gusts.
         error_m: Distance of the true position north of the estimated one.
-        claimed_error_m: Position error reported by the GPS. None: the actual error.
-        speedup: Simulated seconds of the vehicle per second of the service.
-        cut: Begin and duration of a link outage, if any.
+        claimed_error_m: Position error reported by the GPS. If None, the GPS reports the actual error.
+        speedup: Speed of the vehicle's clock relative to the clock of the service.
+        cut: Begin and duration of the link outage, if any.
         stall: Process ("service" or "vehicle") that stalls every few seconds, and the duration of each stall.
     """
 
@@ -99,7 +105,10 @@ STALL_EVERY_S = (2.0, 6.0)
 """Range of the interval between two stalls of a process."""
 
 TURN_S = 1e-7
-"""Duration of one iteration of the loop. Without it, a wait for the rest of a rounded period would never end."""
+"""Virtual duration of one iteration of the event loop.
+
+It must not be 0, because rounding could then keep a timer from expiring.
+"""
 
 
 class Wire(asyncio.Transport):
@@ -126,7 +135,7 @@ class Wire(asyncio.Transport):
             self._protocol.data_received(data)
 
     def flush(self) -> None:
-        """Send the pending messages of the vehicle."""
+        """Send the pending messages of the vehicle to the companion."""
         for message in self._parser.feed(self._channel.take()):
             self._carry(message.frame, self._loop.weather.downlink_s, self._to_companion, to_vehicle=False)
 
@@ -175,7 +184,7 @@ class Sky(Loop):
 
     @property
     def truth(self) -> VehicleState:
-        """True state of the vehicle, as opposed to its reports."""
+        """True state of the vehicle. Its telemetry may differ from it."""
         return self.craft.vehicle.state
 
     async def create_connection(self, factory: Any, *_: Any, **__: Any) -> Any:  # type: ignore[override]
@@ -209,7 +218,7 @@ class Sky(Loop):
         steps = round(duration_s / CONTROL_STEP_S)
         if process == "vehicle":
             await asyncio.sleep(duration_s)
-            self._advance_simulation(steps)  # The vehicle catches up with the lost time.
+            self._advance_simulation(steps)  # After the stall, the vehicle simulates the missed steps at once.
             return
         for _ in range(steps):
             self._now += CONTROL_STEP_S
@@ -299,7 +308,7 @@ class Oracle:
         return math.hypot(body.vn, body.ve), -body.vd
 
     def unavoidable_m(self) -> float:
-        """Return the stopping distance from now in metres, including acceleration until the command takes effect."""
+        """Return the stopping distance in metres. It includes the acceleration until a stop command takes effect."""
         speed = self.speeds()[0]
         late_s = self._late_s()
         more = self.speeding_mps2
@@ -324,11 +333,12 @@ class Oracle:
         wall.excused = near and wall.low_m - reach < height < wall.high_m + reach
 
     def reconnected(self, severed_at: float) -> None:
-        """Apply rules changed during the link outage from now on."""
+        """Apply the rules that changed during a link outage, because the drone can comply only from now on."""
         for wall in self.rules.walls:
             if wall.since_s > severed_at - self._late_s():
                 self._excuse(wall)
-        # A ceiling of this flight does not bind the path flown before it, on which a drone alone flies back.
+        # The outbound path may be older than the altitude limit and above it. A drone without link returns along this
+        # path.
         if math.isfinite(self.rules.high_since_s):
             self.rules.high_since_s = self._sky.time()
         if self.rules.fast_since_s > severed_at - self._late_s():
@@ -337,7 +347,7 @@ class Oracle:
     def _late_s(self) -> float:
         """Return the maximum time until a command takes effect."""
         weather = self._sky.weather
-        # Two frames lost in a row cost as much as the jitter of a slow link.
+        # The loss of two successive frames delays a command as much as the jitter of a slow link.
         return REACTION_S + 1.5 * (weather.uplink_s + weather.downlink_s) + (0.4 if weather.loss else 0.0)
 
     async def run(self) -> None:
@@ -355,7 +365,7 @@ class Oracle:
             return
         self._account.flew = True
         point = shapely.Point(x, y)
-        unknown_since_s = self._sky.severed_at - self._late_s()  # A rule added while the link is cut is not known yet.
+        unknown_since_s = self._sky.severed_at - self._late_s()  # unknown to the vehicle
         for number, wall in enumerate(self.rules.walls):
             if wall.since_s > unknown_since_s:
                 continue
@@ -400,7 +410,8 @@ class Drone:
         self.autopilot = MavlinkAutopilot(
             "tcp:vehicle:1",
             ARDUCOPTER,
-            # The components need the autopilot first, so they are looked up when it calls.
+            # The autopilot is created before `self.parts`, so the callbacks look up the components when they are
+            # called.
             alive=lambda: self.parts.supervisor.alive(),  # noqa: PLW0108
             on_found=lambda: self.parts.observer.found(),  # noqa: PLW0108
             on_heartbeat=lambda: self.parts.observer.heartbeat(),  # noqa: PLW0108
@@ -479,7 +490,10 @@ class Flight:
                 return box
 
     def _box_ahead(self) -> tuple[float, float, float, float]:
-        """Return a box ahead of the drone, or between a hovering drone and home. The drone can still stop before the box."""
+        """Return a box ahead of a moving drone, or between a hovering drone and home.
+
+        The drone can still stop before the box.
+        """
         chance = self.chance
         body = self.sky.truth.body
         x, y, _ = self.oracle.place()
@@ -520,7 +534,7 @@ class Flight:
         self.oracle.add_wall(Wall(shapely.box(*box), low, high))
 
     def add_zone_overhead(self) -> None:
-        """Add a zone above the drone, which can still stop below the zone."""
+        """Add a zone above the drone. A climbing drone can still stop below the zone."""
         chance = self.chance
         x, y, height = self.oracle.place()
         _, climb = self.oracle.speeds()
@@ -577,14 +591,14 @@ class Flight:
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(PROGRAMME_S):
                     await self._drive(following)
-            following.cancel()  # The driver ends or is lost. The system flies home if the drone is in the air.
+            following.cancel()  # The system now returns a flying drone home.
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(HOME_S):
                     await self._landed()
                     self.account.down = True
             if not self.account.down:
                 self.account.wrong.append(
-                    f"not down after {HOME_S:.0f} s, in {ARDUCOPTER.mode(self.sky.truth.mode).name}"
+                    f"not landed and disarmed after {HOME_S:.0f} s, in {ARDUCOPTER.mode(self.sky.truth.mode).name}"
                 )
         finally:
             for task in (following, trouble, *turning):
@@ -698,7 +712,7 @@ class Flight:
         severed_at = self.sky.severed_at
         self.sky.severed_at = math.inf
         self.oracle.reconnected(severed_at)
-        self.account.events.append(f"{self.sky.time() - 1000:7.2f} link back")
+        self.account.events.append(f"{self.sky.time() - 1000:7.2f} link restored")
 
 
 def weather_of(seed: int) -> Weather:

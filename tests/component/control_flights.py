@@ -1,8 +1,8 @@
 """Golden flights: record control authority, stream events and autopilot commands.
 
-Each flight acts from outside only, through streams, calls, grants and what pilots and the autopilot do, so that the same flight
-can be flown by any version of the service. `PYTHONPATH=tests python
-tests/component/test_control_golden.py` records them again.
+A flight uses only external inputs: control streams, calls, Grants, and actions of pilots and of the autopilot. Any
+version of the service can therefore fly it. This command records all flights again:
+`PYTHONPATH=tests python tests/component/test_control_golden.py`.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ Trace = dict[str, list[str]]
 
 
 class Recording(list[Any]):
-    """List that calls a function for each appended item."""
+    """A list that passes each appended item to a function."""
 
     def __init__(self, on_append: Callable[[Any], None]) -> None:
         super().__init__()
@@ -67,7 +67,10 @@ class Flight:
             obey(world.plane, mode)
 
         def obey_and_report(outgoing: Any) -> None:
-            """Obey, and deliver a heartbeat at once, because regular heartbeats are too rare to attribute arming."""
+            """Execute a command and report the new state at once.
+
+            The service attributes arming to a driver only if a heartbeat follows soon. Regular heartbeats are too rare.
+            """
             type(world.plane)._obey(world.plane, outgoing)
             self.observer.heartbeat()
 
@@ -79,7 +82,7 @@ class Flight:
     # Trace
 
     def _write(self, source: str, event: str) -> None:
-        """Add an entry, unless it repeats the previous entry of a source without repetitions."""
+        """Add an entry to the trace of a source. Repetitions are kept only for the sources authority and streams."""
         lines = self.trace[source]
         if not lines or lines[-1].partition(" ")[2] != event or source in {"authority", "streams"}:
             lines.append(f"{self.world.plane.now - 1000:.1f} {event}")

@@ -96,7 +96,7 @@ async def listening(server: Server, context: ssl.SSLContext | None = None) -> As
 
 @contextlib.asynccontextmanager
 async def client_of(server: Server, **options: Any) -> AsyncIterator[Client]:
-    """Run the server and yield a client of it with the given options of Client."""
+    """Run the server and yield a Client that is connected to it. `options` are passed to Client."""
     async with listening(server) as access, contextlib.aclosing(Client(access, "tests", **options)) as client:
         yield client
 

@@ -1,6 +1,6 @@
-"""Drivers that fly toward a wall as fast as permitted, over links with a delay. The result is the least distance to the wall.
+"""Drivers that fly toward a wall as fast as permitted, over links with a delay.
 
-Service and vehicle are those of `closed_loop`. The distance is that of the true position.
+The result is the least distance of the true position from the wall. `closed_loop` provides service and vehicle.
 """
 
 from __future__ import annotations
@@ -62,12 +62,12 @@ class Flown:
     grant: ActiveGrant = field(init=False)
 
     def spec(self) -> GrantSpec:
-        """Return the Grant with the present walls."""
+        """Return a Grant with an exclusion zone for each current wall."""
         zones = [zone(f"wall-{number}", "ignore", *wall.bounds) for number, wall in enumerate(self.walls)]
         return spec(*zones, operationArea=[area(-HALF_M, -HALF_M, HALF_M, HALF_M)])
 
     def put(self) -> ActiveGrant:
-        """Issue a Grant with the present walls."""
+        """Issue a Grant with an exclusion zone for each current wall."""
         self.grant = self.drone.grants.put(self.spec())
         return self.grant
 
@@ -109,7 +109,7 @@ async def bursts(flown: Flown) -> None:
 
 
 async def both(flown: Flown) -> None:
-    """Fly `straight`, then `bursts`."""
+    """Run the pilot `straight`, then the pilot `bursts`."""
     await straight(flown)
     await flown.to(0, 15)
     await bursts(flown)
@@ -119,7 +119,7 @@ SPEEDS_MPS = (12, 10, 8, 7, 6, 5, 4, 3.5, 3, 2.5, 2, 1.5, 1, 0.7, 0.4)
 
 
 async def at_highest_permitted_speed(flown: Flown) -> None:
-    """Fly straight toward the wall, each time with the highest permitted speed."""
+    """Fly straight toward the wall. Each request uses the highest speed that is permitted at that moment."""
     await flown.to(0, 0)
     for _ in range(30):
         for speed in SPEEDS_MPS:
@@ -129,7 +129,7 @@ async def at_highest_permitted_speed(flown: Flown) -> None:
 
 
 def wall_added_ahead(away_m: float, speed_mps: float = 10.0) -> Pilot:
-    """Return a pilot on whose leg a wall is added at a distance ahead of the drone."""
+    """Return a pilot that flies one leg. During the leg, a wall is added `away_m` ahead of the drone."""
 
     async def pilot(flown: Flown) -> None:
         flown.walls.clear()
@@ -151,7 +151,7 @@ def wall_added_ahead(away_m: float, speed_mps: float = 10.0) -> Pilot:
 
 
 async def _fly_with_retries(motion: Callable[[], AsyncGenerator[Any]]) -> None:
-    """Fly a motion to its end. Retry while it is unavailable, as the SDK does."""
+    """Fly a motion to its end. Repeat the call while the service raises Unavailable, as the SDK does."""
     for _ in range(20):
         try:
             async with contextlib.aclosing(motion()) as running:

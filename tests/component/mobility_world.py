@@ -1,4 +1,7 @@
-"""A mobility service and a simple vehicle in one event loop of virtual time, fast and deterministic."""
+"""The mobility service and a simple fake vehicle in one event loop with virtual time.
+
+Tests with this pair are fast and deterministic.
+"""
 
 from __future__ import annotations
 
@@ -50,7 +53,7 @@ ALL = (
 
 
 class Plane(MavlinkAutopilot):
-    """Simple fake autopilot: it acknowledges commands and moves roughly as ArduCopter does."""
+    """Simple fake autopilot. It acknowledges commands, and moves approximately like ArduCopter."""
 
     def __init__(self, step_s: float = STEP_S) -> None:
         self.step_s = step_s
@@ -75,7 +78,7 @@ class Plane(MavlinkAutopilot):
         self.uplink_s = self.downlink_s = 0.0
         self.fixed: tuple[str, ...] = ()
         self.measured = False
-        """True if velocities are reported often enough to derive the acceleration."""
+        """True if the vehicle reports its velocity so often that the service can derive the acceleration."""
         self.parameters = MOVEMENT | FAILSAFES | {"WPNAV_SPEED": 100 * DEFAULT_MPS}
         vehicle = self.vehicle
         vehicle.mode = GUIDED
@@ -150,7 +153,7 @@ class Plane(MavlinkAutopilot):
         elif number == mavlink.MAV_CMD_DO_REPOSITION:
             if not self.positions:
                 self.positions = True
-                self.speed_mps = DEFAULT_MPS  # the position controller starts again with its default speed
+                self.speed_mps = DEFAULT_MPS  # a newly started position controller uses its default speed
             self.goal = FRAME.xy(outgoing.integer("x") / 1e7, outgoing.integer("y") / 1e7)
             self.goal_height = outgoing.real("z") + self.raised_m
             self.velocity_setpoint = None
@@ -265,7 +268,7 @@ class Plane(MavlinkAutopilot):
 
 
 class Grants:
-    """Grants in force, without files."""
+    """Active Grants of the service, without Grant files."""
 
     def __init__(self) -> None:
         self.active: dict[str, ActiveGrant] = {}
@@ -393,7 +396,7 @@ class World:
         return stream
 
     def outcome(self, key: str = "m1") -> str:
-        """Return the outcome of a mission as text, empty while the mission continues."""
+        """Return the outcome of a mission as text. The text is empty while the mission is not ended."""
         mission = self.control.state.missions.get(key)
         return str(mission.outcome) if mission is not None and mission.outcome is not None else ""
 

@@ -1,4 +1,7 @@
-"""Vehicles with missing, unreadable or unusual parameters. An independent computation of the limits is the oracle."""
+"""Checks the service with vehicles whose parameters are missing, unreadable or unusual.
+
+The oracle computes the flight limits from the parameters independently of the service.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +26,7 @@ NEEDED = {
     "return_altitude_m": (("RTL_ALT", 0.01), ("RTL_ALT_M", 1.0), -math.inf),
     "speed_mps": (("WPNAV_SPEED", 0.01), ("WP_SPD", 1.0), -math.inf),
 }
-"""Required parameters by field: name and scale before release 4.7, name and scale since then, and minimum."""
+"""Parameters by Airframe field: name and scale before ArduCopter 4.7, name and scale since 4.7, and minimum."""
 
 OTHER_PARAMETERS = {
     "SYSID_MYGCS": 255.0, "FS_GCS_ENABLE": 0.0, "FS_GCS_TIMEOUT": 5.0, "GUID_TIMEOUT": 3.0, "BATT_FS_LOW_ACT": 0.0,
@@ -103,11 +106,11 @@ async def _violation(rng: random.Random) -> str:
     )
     checked = await MavlinkFailsafes(autopilot).configure()
     if not known:
-        return "" if checked.problem else f"may arm, though not all is known: {values}, unreadable {unreadable}"
+        return "" if checked.problem else f"may arm with unknown parameters: {values}, unreadable {unreadable}"
     if checked.problem:
-        return f"may not arm, though all is known: {checked.problem}"
+        return f"may not arm with known parameters: {checked.problem}"
     flown = {field_name: getattr(checked.airframe, field_name, checked.speed_mps) for field_name in expected}
     differ = [
         field_name for field_name in expected if not math.isclose(flown[field_name], expected[field_name], abs_tol=1e-9)
     ]
-    return f"{differ} of {flown} are not {expected}" if differ else ""
+    return f"fields {differ} differ: {flown} instead of {expected}" if differ else ""

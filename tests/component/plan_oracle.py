@@ -1,8 +1,13 @@
 """Exhaustive oracle for plans of random fleets, applications and policies.
 
 The oracle applies the rules (thesis chapter 8.5 and its errata, docs/policies.md) without the indexes, searches and geometry of the
-planner. Distances are geodesics, and flights are sampled. Zones are circles, routes around them are found by flood fill of a grid,
-and instances are assigned by exhaustive search. If rounding may decide a comparison, the scene is `Undecided`.
+planner:
+
+- Distances are geodesics, and flights are sampled at short intervals.
+- Zones are circles, and a flood fill of a grid finds the routes around them.
+- An exhaustive search assigns the instances.
+
+If a comparison is so close that rounding errors may decide it, the oracle raises `Undecided`.
 """
 
 from __future__ import annotations
@@ -34,7 +39,7 @@ RESERVE = 0.2
 CRUISE_MPS = 5.0
 CLIMB_MPS = 1.5
 MARGIN_M = 2.5
-"""Margin around zones for a leg from standstill: position error and deviation of the autopilot."""
+"""Margin around zones for a leg from standstill: sum of position error and path deviation of the autopilot."""
 STEP_M = 3.0
 CPU = 0.1
 ROOMS = (0.05, 0.1, 0.2, 0.2, 4.0, 4.0)
@@ -42,7 +47,7 @@ OTHER = ("default", "other")
 
 
 class Undecided(Exception):
-    """Rounding may decide a comparison of this scene."""
+    """A comparison of this scene is so close that rounding errors may decide it."""
 
 
 # -- scenes --
@@ -50,7 +55,7 @@ class Undecided(Exception):
 
 @dataclass
 class Scene:
-    """Planned application and inventory, and zones as circles for the oracle."""
+    """The application to plan, the inventory, and the zones as circles for the oracle."""
 
     application: Application
     inventory: Inventory
@@ -246,7 +251,10 @@ class SceneBuilder:
         return {"selector": selector} | window
 
     def flights(self, path: Sequence[tuple[float, float]], drones: list[Drone]) -> dict[str, Flight]:
-        """Return flights of another application: along the points, in reverse order, past some of them, or elsewhere."""
+        """Return flights of another application.
+
+        Each follows the path, reverses it, misses some points, or is elsewhere.
+        """
         rng = self.rng
         flights = {}
         for drone in rng.sample(drones, rng.randint(0, min(2, len(drones)))):
@@ -309,7 +317,7 @@ class Oracle:
     # -- the drone --
 
     def expected_drone(self) -> str | None:
-        """Return the drone that must be chosen, or None if no drone fits."""
+        """Return the drone that the planner must choose, or None if no drone is suitable."""
         leader = self.spec.leader
         assert leader is not None
         candidates = []
@@ -377,11 +385,14 @@ class Oracle:
         return points
 
     def reason(self, drone: Drone, *, shared: bool) -> str:
-        """Return the reason of the first rule that a drone breaks, or an empty text."""
+        """Return the rejection reason of the first rule that a drone breaks.
+
+        Return an empty text if it breaks no rule.
+        """
         return next((reason for reason, broken in self.rules(drone, shared=shared) if broken), "")
 
     def rules(self, drone: Drone, *, shared: bool) -> Iterator[tuple[str, bool]]:
-        """Yield the rules in order: reason, and whether the drone breaks the rule."""
+        """Yield the rejection reason of each rule in order, and True if the drone breaks the rule."""
         services = drone.spec.services
         mobility = drone.spec.services.mobility
         status = drone.status
@@ -438,7 +449,7 @@ class Oracle:
                 raise Undecided
             inside = np.flatnonzero(distances[at:] <= SAFETY_M)
             if not len(inside):
-                # A point just behind the current sample may count as ahead.
+                # Because of rounding, the planner may count a point just behind the current sample as ahead.
                 if (distances[max(at - 4, 0) :] <= SAFETY_M).any():
                     raise Undecided
                 return False
@@ -494,7 +505,7 @@ class Oracle:
                 detour = True
         if detour or not changed:
             if detour and (0.4 * self.available_min(drone) < requested_min or changed):
-                raise Undecided  # The oracle does not know the length of the detour.
+                raise Undecided  # The oracle knows that a detour exists, but not its length.
             return True
         return not _exceeds(
             self.flight_min(drone, self.requested_distance_m(drone), speed, height), self.available_min(drone)
@@ -512,13 +523,14 @@ class Oracle:
         return [*by_system, True]
 
     def has_detour(self, a: tuple[float, float], b: tuple[float, float], circles: Any, drone: Drone) -> bool:
-        """Return True if a grid has a route between two points, in the hull of operation area and depot."""
+        """Return True if a grid over the convex hull of operation area and depot has a route between two points."""
         if any(abs(math.dist(p, (x, y)) - r - MARGIN_M) < 3 * STEP_M for p in (a, b) for x, y, r in circles):
-            raise Undecided  # The grid is too coarse near a zone.
+            raise Undecided  # The grid is too coarse if a point is near a zone.
         area = operation_area(self.spec, self.inventory.depots, SAFETY_M)
         assert area is not None
         depot = self.inventory.depots.get(drone.spec.depot or "")
-        # The frames of planner and oracle are a few hundred metres apart, but agree to a millimetre.
+        # The origins of the planner's and the oracle's frame are a few hundred metres apart. The error is below a
+        # millimetre.
         coordinates = shapely.get_coordinates(area.shape)
         points = [self.scene.frame.xy(*area.frame.latlon(x, y)) for x, y in coordinates]
         depot_area = shapely.Point(self.scene.xy(self.home(drone))).buffer(
@@ -583,7 +595,7 @@ class Oracle:
         most = most_instances(numbered, inside, rooms)
         if planned is None:
             return most is None
-        assert most is not None, "there is a plan although a location can have no instance"
+        assert most is not None, "the planner returned a plan although no instance is possible at one location"
         self.check_placed(planned, inside, rooms, greedy, most)
         return True
 
@@ -595,7 +607,10 @@ class Oracle:
         greedy: dict[tuple[str, int], list[str]],
         most: int,
     ) -> None:
-        """Check that the plan has the maximum number of instances, on the nearest nodes if these have enough room."""
+        """Check that the plan has the maximum number of instances.
+
+        They must be on the nearest nodes if these have room.
+        """
         slots = [(c.name, i, spot) for c in self.spec.on("edge") for i, spot in enumerate(c.locations)]
         numbered = [(name, i, int(spot.instances)) for name, i, spot in slots if spot.instances != "*"]
         placed: dict[tuple[str, int], list[str]] = {key: [] for key in inside}
@@ -626,7 +641,7 @@ class Oracle:
         return self.inventory.edge_nodes[node].spec.location
 
     def greedy(self, slots: Any, inside: Any, rooms: dict[str, int]) -> dict[tuple[str, int], list[str]]:
-        """Return the nearest nodes, chosen one location after the other as in the thesis."""
+        """Return the nodes of each location as in the thesis: each location in turn gets the nearest free nodes."""
         room_left = dict(rooms)
         taken = set()
         chosen_nodes = {}
@@ -643,7 +658,7 @@ class Oracle:
         return min(ranges[0][0], ranges[1][0]) if all(ranges) else None
 
     def expected_hybrids(self, planned: DeploymentPlanSpec) -> list[tuple[str, str]]:
-        """Return the expected instances of Checker in order: (role, node)."""
+        """Return the expected instances of component Checker as (role, node), in the order of the plan."""
         checker = self.spec.find("Checker")
         placed: list[tuple[str, str]] = []
         for target in checker.hybrid_to if checker is not None else ():
@@ -703,7 +718,10 @@ class Oracle:
 
 
 def most_instances(slots: Any, inside: Any, rooms: dict[str, int]) -> int | None:
-    """Return by exhaustive search the maximum number of instances. Return None if a location can have no instance."""
+    """Return the maximum number of instances, by exhaustive search.
+
+    Return None if no instance is possible at one location.
+    """
 
     def best(i: int, used: frozenset[tuple[str, str]]) -> int | None:
         if i == len(slots):
@@ -727,7 +745,7 @@ def _blocked(leg: Sequence[tuple[float, float]], circles: Sequence[tuple[float, 
     line = shapely.LineString(leg) if leg[0] != leg[1] else shapely.Point(leg[0])
     for x, y, radius in circles:
         distance = line.distance(shapely.Point(x, y)) - radius - MARGIN_M
-        if abs(distance) < 0.05 + 0.02 * radius:  # The planner replaces the circle by a polygon around it.
+        if abs(distance) < 0.05 + 0.02 * radius:  # The planner uses a slightly larger polygon instead of the circle.
             raise Undecided
         if distance < 0:
             return True
@@ -764,32 +782,32 @@ def deviation(seed: int) -> str | None:
 
 
 def _compare_drone(oracle: Oracle, planned: DeploymentPlanSpec | None, problem: Infeasible | None) -> bool:
-    """Compare the drone and the reasons of rejected drones. Return True if there is a drone."""
+    """Compare the chosen drone and the reasons of rejected drones. Return True if the oracle expects a drone."""
     reason = problem.reason if problem is not None else ""
     spec = oracle.spec
     expected = oracle.expected_drone()
     assert (expected is None) == (reason in {"NoDrone", "DroneBusy", "PolicyConflict"}), (
-        f"{expected}, but {reason or 'a plan'}"
+        f"expected drone: {expected}, result of the planner: {reason or 'a plan'}"
     )
     leader = (spec.driver or next(spec.on("drone"))).name
     rejected = problem.rejected if problem is not None else planned.rejected if planned is not None else ()
     reported = {r.node: r.reason for r in rejected if r.component == leader}
     if planned is not None or expected is None:
         wrong = {n: (r, reported.get(n)) for n, r in oracle.reasons.items() if reported.get(n) != r}
-        assert not wrong, f"rejected for another reason: {wrong}"
+        assert not wrong, f"wrong rejection reasons (expected, reported): {wrong}"
     if expected is None:
         return False
     assert planned is None or (planned.drone is not None and planned.drone.node == expected), (
-        f"the plan has another drone than {expected}"
+        f"the plan does not use drone {expected}"
     )
     oracle.free_cpu[expected] -= CPU * len(list(spec.on("drone")))
     return True
 
 
 def _compare_nodes(oracle: Oracle, planned: DeploymentPlanSpec | None, problem: Infeasible | None) -> None:
-    """Compare the placements of all other components."""
+    """Compare the placements of the components that do not fly."""
     if problem is not None and problem.reason == "NoEdgeNode":
-        assert oracle.check_statics(None), "a location can have an instance"
+        assert oracle.check_statics(None), "an instance is possible at every location"
         return
     clouds = [
         n

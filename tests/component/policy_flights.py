@@ -1,8 +1,9 @@
 """Oracle for the policy engine: thousands of drones flown in small steps through random policies.
 
-It shares only calls and verdicts with the engine. It projects on a flat Earth, casts rays to distinguish inside from
-outside, and integrates ArduPilot's jerk-limited position controller under wind, latency and position errors inside the
-bounds given to the engine. The computation is vectorised over drones. Only the calls of the engine are made one by one.
+The oracle and the engine share only the types of calls and verdicts. The oracle projects positions on a flat Earth. It
+uses ray casting to distinguish inside from outside. It integrates ArduPilot's jerk-limited position controller with
+wind, latency and position errors. These errors stay within the bounds that the engine gets. The computation is
+vectorised over drones, except for the calls of the engine.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ ACCELS = (1.0, 2.5, 2.5, 3.5)
 CLIMB_ACCELS = (1.0, 1.0, 2.0)
 JERKS = (3.0, 5.0, 5.0, 8.0)
 GAIN = 1.0
-"""Values of WPNAV_ACCEL, WPNAV_ACCEL_Z and PSC_JERK_XY, in metres."""
+"""Values of WPNAV_ACCEL, WPNAV_ACCEL_Z and PSC_JERK_XY, in m/s2 and m/s3, and of the position gain PSC_POSXY_P."""
 CHANGED = 0.04
 """Fraction of vehicles whose parameters change between two requests."""
 RETURNS_M = (3.0, 15.0, 15.0, 40.0)
@@ -41,22 +42,22 @@ RETURNS_M = (3.0, 15.0, 15.0, 40.0)
 UP_MPS = 2.5
 DOWN_MPS = 1.5
 RATIO = 4.0
-"""ArduPilot's CONTROL_TIME_CONSTANT_RATIO: it plans to brake with three quarters of its acceleration."""
+"""ArduPilot's CONTROL_TIME_CONSTANT_RATIO. With this value it plans to brake with 3/4 of its acceleration."""
 POSITION_ERROR_M = 1.5
 HEIGHT_ERROR_M = 1.0
 TRACKING_M = 1.0
 LATENCY_S = (0.05, 0.8)
-"""Round-trip delay of the link of up to half a second, plus the reaction time of the autopilot."""
+"""Range of the time until a command takes effect: round-trip delay of the link, plus reaction time of the autopilot."""
 COURSE_S = 0.3
-"""Age of reported accelerations. Setpoints sent since then are reported as pending."""
+"""Age of a reported acceleration. Setpoints that were sent within this time are reported as pending."""
 RESEND_S = 0.2
-"""Interval at which the service sends a velocity during its hold time. Afterwards it sends a zero velocity."""
+"""Interval at which the service sends a velocity setpoint until its hold time ends. A zero velocity follows."""
 STILL = (0.0, 0.0, 0.0)
 HOURS = 12
 """Hour of the day of all flights."""
 NORTH_M = 110_998.6
 EAST_M = math.cos(math.radians(HOME.lat)) * 111_457.6
-"""Metres per degree at home (WGS 84), accurate to centimetres over this scene."""
+"""Metres per degree of latitude and longitude at home (WGS 84). The error within a scene is a few centimetres."""
 EXCLUSION = 1
 INCLUSION = 2
 LIMIT = 3
@@ -67,13 +68,13 @@ _CIRCLE = np.array([(math.cos(a), math.sin(a)) for a in np.arange(16) * math.pi 
 
 @dataclass
 class Scene:
-    """Policies as the oracle reads them: kind, position and altitude range of each zone.
+    """Policies in the representation of the oracle: kind, position and altitude range of each zone.
 
     Attributes:
-        rings: Corners in metres, shape (ZONES, CORNERS, 2). Short rings repeat their last corner.
-        kinds: 0 for an empty or inactive slot, shape (ZONES,).
-        bands: Lower and upper metres above home, shape (ZONES, 2). For a limit, the permitted altitudes.
-        heights: Limits that hold everywhere.
+        rings: Corners of the zones in metres, shape (ZONES, CORNERS, 2). Rings with fewer corners repeat the last one.
+        kinds: EXCLUSION, INCLUSION, LIMIT, or 0 for an empty or inactive slot, shape (ZONES,).
+        bands: Altitude range of the zone in metres above home, shape (ZONES, 2). For LIMIT, the permitted range.
+        heights: Lower and upper altitude limit that apply everywhere, in metres above home.
     """
 
     grant: CompiledGrant
@@ -84,7 +85,7 @@ class Scene:
     top_mps: float
 
     def airframe(self, rng: np.random.Generator) -> Airframe:
-        """Return a vehicle whose return altitude is lowered to the limits, as before arming."""
+        """Return a random vehicle. Its return altitude respects the limits, as the service ensures before arming."""
         return Airframe(
             accel_mps2=float(rng.choice(ACCELS)), climb_accel_mps2=float(rng.choice(CLIMB_ACCELS)),
             jerk_mps3=float(rng.choice(JERKS)), return_altitude_m=min(float(rng.choice(RETURNS_M)), self.heights[1]),
@@ -147,7 +148,7 @@ def _zone(
     *,
     banded: bool = True,
 ) -> tuple[dict[str, Any], bool]:
-    """Add a star-shaped zone, convex or not, to a slot of the scene, and return whether it is active."""
+    """Add a random star-shaped zone to a slot of the scene. Return the zone, and True if it is active at HOURS."""
     count = int(rng.integers(3, CORNERS + 1))
     turn = rng.uniform(0, 2 * math.pi) + 2 * math.pi * np.arange(count) / count
     radii = size * rng.uniform(0.45, 1.0, count)
@@ -171,7 +172,14 @@ def _zone(
 
 @dataclass(frozen=True)
 class Walls:
-    """Edges of rings for ray casting: lower and upper end north, east at north 0, and east per north."""
+    """Edges of rings for ray casting.
+
+    Attributes:
+        y0: Coordinate north of the first end.
+        y1: Coordinate north of the second end.
+        x0: Coordinate east at which the line through the edge crosses north 0.
+        slope: Change of the coordinate east per metre north.
+    """
 
     y0: Floats
     y1: Floats
@@ -180,7 +188,7 @@ class Walls:
 
     @classmethod
     def of(cls, rings: Floats) -> Walls:
-        """Return the edges of rings, shape (n, z, c, 2)."""
+        """Return the edges of rings, an array of shape (drones, zones, corners, 2)."""
         x = rings[..., 0]
         y = rings[..., 1]
         rise = np.roll(y, -1, axis=2) - y
@@ -188,11 +196,14 @@ class Walls:
         return cls(y, np.roll(y, -1, axis=2), x - slope * y, slope)
 
     def of_some(self, rows: NDArray[np.int64]) -> Walls:
-        """Return the edges of some drones."""
+        """Return the edges for the drones in `rows`."""
         return Walls(self.y0[rows], self.y1[rows], self.x0[rows], self.slope[rows])
 
     def around(self, points: Floats) -> Flags:
-        """Return which rings contain points of shape (n, 2), by rays to the east: shape (n, z)."""
+        """Return which rings contain the points, by ray casting to the east.
+
+        Shapes: points (drones, 2), result (drones, zones).
+        """
         x = points[:, None, None, 0]
         y = points[:, None, None, 1]
         hits = ((self.y0 > y) != (self.y1 > y)) & (x < self.x0 + self.slope * y)
@@ -208,18 +219,18 @@ _ROWS = (
 
 @dataclass
 class Fleet:
-    """Drones in flight, one per row: position of each in its controller, and the disturbances that act on it."""
+    """State of drones in flight, one row per drone: motion in its position controller, and disturbances."""
 
     rng: np.random.Generator
     scenes: list[Scene]
     place: Floats = field(init=False)
-    """East, north, up in the controller."""
+    """East, north and up in metres, in the position controller."""
     speed: Floats = field(init=False)
     accel: Floats = field(init=False)
     airframes: list[Airframe] = field(init=False)
 
     def __post_init__(self) -> None:
-        """Place each drone somewhere, with some velocity, wind and errors."""
+        """Give each drone a random position, velocity, wind and position error."""
         rng = self.rng
         count = len(self.scenes)
         (generator,) = rng.spawn(1)
@@ -239,40 +250,40 @@ class Fleet:
         )
         self.gust = np.column_stack((_disc(rng, count, TRACKING_M), rng.uniform(-TRACKING_M, TRACKING_M, count)))
         self.settled = np.zeros((count, 3))
-        """Sway of each drone at the beginning of its present course."""
+        """Displacement of each drone by wind when its current course began."""
         self.beat = rng.uniform(0.05, 0.4, count)
         self.phase = rng.uniform(0, 2 * math.pi, count)
         self.latency = rng.uniform(*LATENCY_S, count)
         self.sent: list[list[tuple[float, float, tuple[float, float, float]]]] = [[] for _ in range(count)]
-        """Velocity setpoints of each drone with first and last time, in the order of arrival."""
+        """Velocity setpoints of each drone in the order of arrival, with the times of first and last transmission."""
         self.mail: list[tuple[float, int, Verdict]] = []
         self.last_calls: list[Call | None] = [None] * count
         self.legs: list[GotoArgs | None] = [None] * count
-        """Last target of each drone, unless another command followed."""
+        """Current Goto target of each drone, or None if its last command was not a Goto."""
         self.time_s = 0.0
         self._estimated: Floats | None = None
-        # Commands: fly to a point with a speed, or hold a velocity until a time. All start at a time.
+        # The current command of each drone: fly to `goal` with `cruise`, or hold `velocity_setpoint` until `until`.
         self.goal = self.place.copy()
         self.cruise = np.full(count, 5.0)
         self.setpoint = np.full(count, 5.0)
         self.velocity_setpoint = np.zeros((count, 3))
         self.held = np.zeros(count, dtype=bool)
         self.arrives, self.surely_returns = (np.zeros(count, dtype=bool) for _ in range(2))
-        """Drones that fly a leg whose end has a legal return."""
+        """`surely_returns`: drones on a leg from whose end a legal return flight exists."""
         self.until = np.zeros(count)
         self.learn()
         # A drone without a command stops.
         self.stop(np.arange(count))
 
     def learn(self) -> None:
-        """Adopt the parameters in `airframes`."""
+        """Copy the controller limits from `airframes` to arrays."""
         self.accels, self.climbs, self.jerks = (
             np.array([getattr(a, name) for a in self.airframes])
             for name in ("accel_mps2", "climb_accel_mps2", "jerk_mps3")
         )
 
     def part(self, rows: NDArray[np.int64]) -> Fleet:
-        """Return some of the drones in their present state, on independent flights."""
+        """Return a copy of the drones in `rows`. The copies fly independently of this fleet."""
         selected = Fleet(np.random.default_rng(0), [self.scenes[i] for i in rows])
         selected.rng = self.rng
         selected.time_s = self.time_s
@@ -285,7 +296,7 @@ class Fleet:
     def sway(self) -> Floats:
         """Return the displacement of each drone by wind.
 
-        It is bounded along a course that began at the observed position.
+        The displacement is relative to the observed position at which the current course began, and is bounded.
         """
         return (self._wind() - self.settled) / 2
 
@@ -305,7 +316,7 @@ class Fleet:
         return self.estimated + self.error
 
     def stop(self, rows: NDArray[np.int64]) -> None:
-        """Send drones to the positions where their controllers can stop."""
+        """Make drones fly to the nearest positions at which their controllers can stop."""
         for axes, accels in ((slice(0, 2), self.accels), (slice(2, 3), self.climbs)):
             accel = accels[rows]
             moving = self.speed[rows, axes]
@@ -332,7 +343,7 @@ class Fleet:
         self.time_s += STEP_S
 
     def _axes(self, axes: slice, accel: Floats, most: Floats, least: Floats) -> None:
-        """Integrate ArduPilot's shape_pos_vel_accel (AP_Math/control.cpp) for some axes together."""
+        """Integrate ArduPilot's shape_pos_vel_accel (AP_Math/control.cpp) jointly for the given axes."""
         off = self.goal[:, axes] - self.place[:, axes]
         away = np.linalg.norm(off, axis=1)
         most = np.where(off[:, -1] < 0, least, most) if off.shape[1] == 1 else most
@@ -345,7 +356,7 @@ class Fleet:
         change = velocity - self.speed[:, axes]
         size = np.linalg.norm(change, axis=1)
         push = np.minimum(_root(size, self.jerks / accel, self.jerks), accel)
-        # A jerk-limited controller plans to finish a step ahead. Without this it oscillates by a step.
+        # The controller plans to reach its target within one step. Otherwise it would oscillate around it.
         target = change / np.maximum(size, 1e-9)[:, None] * np.minimum(push, size / STEP_S)[:, None]
         step = target - self.accel[:, axes]
         jerk = np.linalg.norm(step, axis=1)
@@ -353,7 +364,10 @@ class Fleet:
         self.speed[:, axes] += self.accel[:, axes] * STEP_S
 
     def situation(self, i: int, *, measured: bool) -> Situation:
-        """Return the situation that the engine gets for one drone. Only some services know its acceleration."""
+        """Return the Situation of a drone, as the service passes it to the engine.
+
+        The situation contains the acceleration only if `measured` is set.
+        """
         x, y, z = self.estimated[i]
         drift = self.gust[i] * self.beat[i] * math.cos(self.beat[i] * self.time_s + self.phase[i])
         east, north, up = (float(v) for v in self.speed[i] + drift)
@@ -368,7 +382,7 @@ class Fleet:
         )  # fmt: skip
 
     def _pending(self, i: int) -> tuple[tuple[float, float, float], ...]:
-        """Return the setpoints that the state of a drone may not show yet."""
+        """Return the setpoints that may not yet have affected the reported state of a drone."""
         now = self.time_s
         since = self.time_s - float(self.latency[i]) - COURSE_S
         late = [item for item in self.sent[i] if item[1] >= since]
@@ -378,10 +392,10 @@ class Fleet:
         return tuple(dict.fromkeys(velocity for at, _, velocity in reversed(self.sent[i]) if at <= now))[::-1]
 
     def send(self, i: int, verdict: Verdict, *, returns: bool = False) -> None:
-        """Send the outcome of a request to a drone. It arrives within the latency, after all earlier ones.
+        """Send the command of a verdict to a drone. It arrives within the latency, and after all earlier commands.
 
         Args:
-            returns: True if the engine has verified the return from the end of a leg.
+            returns: True if the engine has verified that the drone can return from the end of the leg.
         """
         self.surely_returns[i] = returns or (self.surely_returns[i] and isinstance(verdict.args, SetSpeedArgs))
         args = verdict.args
@@ -410,7 +424,7 @@ class Fleet:
         self.mail.append((max(before, self.time_s + self.rng.uniform(0, float(self.latency[i]))), i, verdict))
 
     def obey(self, i: int, verdict: Verdict) -> None:
-        """Carry out the outcome of a request."""
+        """Execute the command of a verdict, after it has arrived at the drone."""
         args = verdict.args
         if isinstance(args, SetSpeedArgs):
             self.setpoint[i] = args.speed_mps
@@ -433,15 +447,15 @@ class Fleet:
             self.until[i] = self.time_s + args.hold_s + self.rng.uniform(0, float(self.latency[i]))
 
     def trespassing(self) -> Flags:
-        """Return the zones that each drone breaks, shape (n, ZONES + 1).
+        """Return the zones that each drone violates, shape (drones, ZONES + 1).
 
-        Exclusion zones and limits count one by one, inclusion zones together in slot 0 of a second block.
+        Each exclusion zone and limit has its own column. The last column is True outside all inclusion zones.
         """
         true = self.true
         fast = np.abs(self.speed).max(axis=1) > STANDING_MPS
         if fast.mean() > 0.5:
             return trespasses(true[:, :2], true[:, 2], self.walls, self.kinds, self.bands)
-        # A stationary drone sways slowly and is observed twice a second.
+        # A hovering drone moves slowly, so its position is checked only every tenth step.
         fast |= round(self.time_s / STEP_S) % 10 == 0
         broken = np.zeros((len(true), ZONES + 1), dtype=bool)
         rows = np.flatnonzero(fast)
@@ -452,7 +466,7 @@ class Fleet:
 
 
 def trespasses(points: Floats, heights: Floats, walls: Walls, kinds: NDArray[np.int64], bands: Floats) -> Flags:
-    """Return the zones broken at some points. The last column is True outside all inclusion zones."""
+    """Return the zones violated at the given points. The last column is True outside all inclusion zones."""
     inside = walls.around(points)
     up = heights[:, None]
     within = (bands[..., 0] <= up) & (up <= bands[..., 1])
@@ -465,7 +479,7 @@ def trespasses(points: Floats, heights: Floats, walls: Walls, kinds: NDArray[np.
 
 
 JUST_M = 0.3
-"""Permitted excess over an altitude limit beyond the declared errors: the controller's overshoot."""
+"""Permitted violation of an altitude limit in addition to the declared errors, for overshoot of the controller."""
 
 
 def _root(error: Floats, gain: Floats, limit: Floats) -> Floats:
@@ -476,7 +490,7 @@ def _root(error: Floats, gain: Floats, limit: Floats) -> Floats:
 
 
 def _disc(rng: np.random.Generator, count: int, radius: float) -> Floats:
-    """Return points of a disc, half of them on its rim."""
+    """Return random points of a disc. Half of them are on its rim."""
     angle = rng.uniform(0, 2 * math.pi, count)
     far = np.sqrt(np.minimum(rng.uniform(0, 2, count), 1.0)) * radius
     return np.column_stack((far * np.cos(angle), far * np.sin(angle)))
@@ -484,12 +498,12 @@ def _disc(rng: np.random.Generator, count: int, radius: float) -> Floats:
 
 @dataclass
 class Tally:
-    """Results of the requests, and every violation.
+    """Numbers of requests by verdict, and all violations.
 
     Attributes:
-        changed: Vehicles whose parameters another station changed in flight.
-        system_returns: Return flights by the system.
-        autopilot_returns: Return flights by the autopilot.
+        changed: Number of vehicles whose parameters another station changed in flight.
+        system_returns: Number of return flights by the system.
+        autopilot_returns: Number of return flights by the autopilot.
     """
 
     requests: int = 0
@@ -525,10 +539,10 @@ def flights(
     Args:
         seed: Seed of all random numbers.
         count: Number of drones.
-        shared: Drones per scene, because compiling policies takes longer than judging.
-        requests: Requests per drone. The later ones interrupt the flight of the earlier.
-        watch_every: Steps between two checks of a drone by the monitor. 0 disables the monitor.
-        watched: The monitor checks one drone out of this number.
+        shared: Number of drones that share a scene. Compiling policies takes longer than judging requests.
+        requests: Number of requests per drone. Each request interrupts the flight of the previous request.
+        watch_every: Number of steps between two checks by the motion monitor. 0 disables the monitor.
+        watched: The monitor checks every `watched`-th drone.
         returns: Return flights, or None.
     """
     rng = np.random.default_rng(seed)
@@ -545,7 +559,7 @@ def flights(
         called_s = (
             fleet.time_s + generator.uniform(1.5, 8.0) if returns is not None and turn == requests - 1 else math.inf
         )
-        # Every third request arrives before the previous one can have taken effect.
+        # About one in three requests follows so soon that the previous request may not have taken effect yet.
         span_s = 30.0 if turn == requests - 1 else rng.choice([rng.uniform(0.05, 0.6), *rng.uniform(0.4, 7.0, 2)])
         for n in range(int(span_s / STEP_S)):
             fleet.step()
@@ -563,7 +577,7 @@ def flights(
                 measured(fleet, tally, flown, exempt)
             broken = fleet.trespassing() & ~exempt
             for i in np.flatnonzero(broken.any(axis=1)):
-                # A drone without a permitted command may drift in the wind.
+                # Drift in the wind is no violation if no command was permitted.
                 if not permitted[i]:
                     continue
                 tally.wrong.append(f"seed {seed}, drone {i}, turn {turn}, {fleet.time_s:.2f} s: {permitted[i]}")
@@ -574,19 +588,19 @@ def flights(
 
 
 class Returns(Protocol):
-    """Return flights after the requests of drones, each in a separate world."""
+    """Simulator of return flights that begin after the requests. The given fleet is not changed."""
 
     def fly_by_system(self, fleet: Fleet, exempt: Flags, tally: Tally) -> None:
-        """Let the system fly home some drones that are in flight."""
+        """Simulate return flights of some flying drones by the system."""
 
     def fly_by_autopilot(self, fleet: Fleet, exempt: Flags, tally: Tally) -> None:
-        """Let the autopilots of some drones at rest fly home."""
+        """Simulate return flights of some hovering drones by their autopilots."""
 
 
 def _change(fleet: Fleet, tally: Tally, permitted: list[str], exempt: Flags, rng: np.random.Generator) -> None:
     """Change parameters of some vehicles as another station does, and inform their services.
 
-    Earlier permissions, and motion that no command can prevent, are not judged any longer.
+    Afterwards, the check ignores requests that were permitted before, and motion that no command can prevent.
     """
     expected = {i for _, i, _ in fleet.mail}
     rows = np.array(
@@ -604,11 +618,11 @@ def _change(fleet: Fleet, tally: Tally, permitted: list[str], exempt: Flags, rng
 
 
 Flown = dict[int, tuple[str, GotoArgs | None, bool]]
-"""Per drone: the permitted request, its leg, and whether its acceleration is reported."""
+"""Permitted request of each drone, its leg, and True if the drone reports its acceleration."""
 
 
 def measured(fleet: Fleet, tally: Tally, flown: Flown, exempt: Flags) -> None:
-    """Report drones that the monitor would stop, each once."""
+    """Report each drone that the motion monitor would stop, once per drone."""
     for i, (request, end, measured) in list(flown.items()):
         if np.abs(fleet.speed[i]).max() < STANDING_MPS:
             continue
@@ -623,7 +637,7 @@ def measured(fleet: Fleet, tally: Tally, flown: Flown, exempt: Flags) -> None:
 
 
 def _request_all(fleet: Fleet, tally: Tally, permitted: list[str], rng: np.random.Generator, watched: int) -> Flown:
-    """Make one request per drone. Return the watched drones that the monitor does not object to."""
+    """Make one request per drone. Return the drones to monitor, except those that the monitor would stop already."""
     flown: Flown = {}
     legs: list[tuple[int, GotoArgs]] = []
     near = vicinity(fleet).any(axis=1)
@@ -640,14 +654,14 @@ def _request_all(fleet: Fleet, tally: Tally, permitted: list[str], rng: np.rando
         if verdict.permits and not _flies_faster(fleet, i, verdict, now):
             text = f"{call} in {now} -> {verdict}"
             tally.wrong += [f"{defect}: {text}" for defect in _defects(verdict, now, place)]
-            # SetSpeed moves nothing.
+            # SetSpeed does not start a motion.
             moves = not isinstance(verdict.args, SetSpeedArgs)
             permitted[i] = text if moves else permitted[i] and f"{permitted[i]}, then {text}"
             tally.shortened += "the last legal point" in verdict.reason
             if isinstance(verdict.args, GotoArgs):
                 legs.append((i, verdict.args))
             fleet.send(i, verdict, returns=not near[i])
-            # A drone that starts beyond an altitude limit is at the limit's edge on its way back.
+            # A drone that starts beyond an altitude limit flies back to the limit, so it is not monitored.
             low, high = place.heights
             level = low - HEIGHT_ERROR_M <= now.altitude_m <= high + HEIGHT_ERROR_M
             if moves and level and watched and i % watched == 0 and monitor(now, place.grant) is None:
@@ -658,9 +672,9 @@ def _request_all(fleet: Fleet, tally: Tally, permitted: list[str], rng: np.rando
 
 
 def _flies_faster(fleet: Fleet, i: int, verdict: Verdict, now: Situation) -> bool:
-    """Return True if a drone would fly its leg illegally faster than it was judged.
+    """Return True if a higher speed would make the current leg of a drone illegal.
 
-    The service keeps its speed then.
+    In this case, the service does not change the speed of the leg.
     """
     leg = fleet.legs[i]
     args = verdict.args
@@ -672,7 +686,7 @@ def _flies_faster(fleet: Fleet, i: int, verdict: Verdict, now: Situation) -> boo
 
 
 def _too_near(fleet: Fleet, legs: list[tuple[int, GotoArgs]]) -> Iterator[int]:
-    """Return drones whose legs end inside the margin of a fence."""
+    """Yield the drones whose legs end inside the margin of a fence."""
     rows = np.array([i for i, _ in legs for _ in _CIRCLE], dtype=np.int64)
     heights = np.array([leg.alt for _, leg in legs for _ in _CIRCLE])
     ends = [[(leg.lon - HOME.lon) * EAST_M, (leg.lat - HOME.lat) * NORTH_M] for _, leg in legs]
@@ -682,7 +696,10 @@ def _too_near(fleet: Fleet, legs: list[tuple[int, GotoArgs]]) -> Iterator[int]:
 
 
 def _repeated(rng: np.random.Generator, last: Call | None) -> Call | None:
-    """Repeat the request of half of the drivers that use velocities, with the same or a slightly higher speed."""
+    """Return the last velocity request with the same or a slightly higher speed.
+
+    Return None with a probability of 50 %, or if the last request was not a velocity.
+    """
     if last is None or not isinstance(last.args, VelocityArgs) or rng.random() < 0.5:
         return None
     args = last.args
@@ -704,7 +721,7 @@ def _request(rng: np.random.Generator) -> Call:
 
 
 def _defects(verdict: Verdict, now: Situation, place: Scene) -> Iterator[str]:
-    """Return the defects of corrected arguments."""
+    """Yield the defects of the arguments in a verdict."""
     args = verdict.args
     if verdict.action == "correct":
         verdict_again = judge(Call(METHOD_OF[type(args)], args), now, place.grant)
@@ -724,14 +741,13 @@ def _defects(verdict: Verdict, now: Situation, place: Scene) -> Iterator[str]:
 
 
 SLOWEST_STOP_S = 20.0
-"""Time to stop from 15 m/s with 1 m/s2, including latency and the controller's approach."""
+"""Duration of a stop from 15 m/s with 1 m/s2, including the latency and the slow end of the stop."""
 
 
 def excused(fleet: Fleet) -> Flags:
-    """Return the fences that a drone breaks or approaches before any command can take effect, shape (n, ZONES + 1).
+    """Return the fences that a drone violates or approaches even if it stops now, shape (drones, ZONES + 1).
 
-    Motion before a request can take effect is not caused by the request, nor are the ways back that the engine permits
-    from there. `fleet` is not changed.
+    A request causes neither this motion nor the ways back that the engine permits afterwards. The fleet is not changed.
     """
     trial = fleet.part(np.arange(len(fleet.scenes)))
     trial.held[:] = True
@@ -748,7 +764,7 @@ def excused(fleet: Fleet) -> Flags:
 
 
 def vicinity(fleet: Fleet) -> Flags:
-    """Return the fences that each drone breaks or is closer to than its margin, shape (n, ZONES + 1)."""
+    """Return the fences that each drone violates, or whose margin it violates, shape (drones, ZONES + 1)."""
     tall = HEIGHT_ERROR_M + TRACKING_M + 0.1
     around = np.where((fleet.kinds == EXCLUSION)[..., None], [-tall, tall], [tall, -tall])
     broken = np.zeros((len(fleet.scenes), ZONES + 1), dtype=bool)

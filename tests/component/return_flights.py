@@ -1,6 +1,7 @@
-"""Return flights in the oracle of the policy engine, flown by the system or by the autopilot alone.
+"""Return flights by the system or by the autopilot, in the oracle of the policy engine.
 
-`ReturnFlight` of the service plans each leg of the system. The oracle simulates the motion and checks it for violations.
+The class `ReturnFlight` of the service plans each leg that the system flies. The oracle simulates the motion and checks
+it for violations.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ LIMIT_S = 240.0
 """Maximum duration of a return flight."""
 
 CHECK_EVERY = 4
-"""Steps between two checks whether a drone has reached its target."""
+"""Number of steps between two checks of the distance from a drone to its target."""
 
 AT_REST_MPS = 0.25
 CRUISE_MPS = 5.0
@@ -50,21 +51,24 @@ BRAKE = Verdict("allow", None, brake_first=True)
 
 @dataclass(frozen=True)
 class ReturnFlights:
-    """Flies some drones home.
+    """Simulator of return flights.
 
     Attributes:
-        seed: Seed for the texts of violations.
-        every: Of this number of drones, the system flies one home and the autopilot another one.
+        seed: Seed of the flights, which the texts of violations contain.
+        every: In each group of `every` drones, the system returns the first drone and the autopilot the second.
     """
 
     seed: int
     every: int
 
     def fly_by_system(self, fleet: Fleet, exempt: Flags, tally: Tally) -> None:
-        """Let the system fly home some drones in flight.
+        """Simulate return flights of some flying drones by the system.
 
-        The check ignores fences that a drone breaks or approaches before it stops, zones if no legal return route exists,
-        and altitude limits while the drone returns from beyond them.
+        The check ignores:
+
+        - fences that a drone violates or approaches before it stops,
+        - zones if no legal return route exists,
+        - altitude limits that the drone violates at the beginning, until it has returned within them.
         """
         rows = np.arange(0, len(fleet.scenes), self.every)
         group = _ReturningDrones(fleet.part(rows), exempt[rows])
@@ -78,9 +82,10 @@ class ReturnFlights:
         tally.wrong += [f"seed {self.seed}, return flight of drone {rows[i]}: {text}" for i, text in group.wrong]
 
     def fly_by_autopilot(self, fleet: Fleet, exempt: Flags, tally: Tally) -> None:
-        """Let autopilots that fly home straight return from the ends of permitted legs, where no zone blocks the return.
+        """Simulate straight return flights by the autopilot, from the ends of permitted legs.
 
-        Altitude limits of zones are ignored because the autopilot does not descend for them.
+        The engine has verified that no zone blocks these returns. Altitude limits of zones are ignored, because the
+        autopilot does not descend for them.
         """
         at_rest = np.linalg.norm(fleet.speed, axis=1) < AT_REST_MPS
         at_target = np.linalg.norm(fleet.goal - fleet.place, axis=1) < SETTINGS.reached_m
@@ -115,7 +120,7 @@ class _ReturningDrones:
         self._reached = np.full(self.count, SETTINGS.reached_m)
         self._climbing = np.zeros(self.count, dtype=bool)
         self._ceilings = fleet.heights[:, 1].copy()
-        """Altitude limits that hold everywhere, or the initial altitude of drones that began above them."""
+        """Upper altitude limit of each drone, or its initial altitude if it began above the limit."""
         self._begun = np.zeros(self.count, dtype=bool)
         self._tops = np.full(self.count, np.inf)
 
@@ -133,7 +138,7 @@ class _ReturningDrones:
             self.wrong.append((int(i), f"not home after {LIMIT_S:.0f} s, at {fleet.estimated[i].round(1)}"))
 
     def start_autopilot_return(self, i: int) -> None:
-        """Start a return by the autopilot: a climb, then a straight leg."""
+        """Start a return flight by the autopilot. It climbs, and then flies straight home."""
         fleet = self.fleet
         bounds = return_bounds(self.fleet.situation(i, measured=True), self.fleet.scenes[i].grant)
         owned = {"RTL_ALT": 100.0 * fleet.airframes[i].return_altitude_m, "RTL_SPEED": 0.0, "WPNAV_SPEED": 1000.0}

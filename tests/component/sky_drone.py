@@ -1,4 +1,7 @@
-"""Drone whose driver may arm, with the complete service on the simulated vehicle in virtual time."""
+"""Fixture for tests of the complete service on the simulated vehicle, in virtual time.
+
+Its drone is ready to be armed by its driver.
+"""
 
 from __future__ import annotations
 

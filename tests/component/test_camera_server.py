@@ -32,7 +32,7 @@ async def logged(caplog: pytest.LogCaptureFixture, text: str) -> None:
 async def test_image_store_is_kept_when_the_node_description_changes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """A second image store would delete a picture that the first one is still writing."""
+    """A second image store must not exist, because it would delete a picture that the first store is still writing."""
     monkeypatch.setattr(server, "ImageStore", CountedImageStore)
     monkeypatch.setattr(node_description, "POLL_INTERVAL_S", 0.01)
     node = tmp_path / "node.json"

@@ -1,4 +1,4 @@
-"""The preloaded library that steps the clock of single services in chaos runs."""
+"""Preloaded library for chaos runs: it steps the clock of selected services."""
 
 from __future__ import annotations
 
@@ -31,7 +31,10 @@ for _ in sys.stdin:
 
 
 class ClockProcess:
-    """A process with the library. On request it prints its clocks, and the duration of a wait of 10 ms."""
+    """A process with the preloaded library.
+
+    On request, it prints its clocks and the measured duration of a 10 ms wait.
+    """
 
     def __init__(self, environment: dict[str, str]) -> None:
         self.process = subprocess.Popen(
@@ -43,7 +46,7 @@ class ClockProcess:
         )
 
     def is_ahead(self, offset_s: float) -> bool:
-        """Return True if all clocks of the process differ from the clock of this process by the offset."""
+        """Return True if all clocks of the child process are ahead of the test's clock by the offset."""
         assert self.process.stdin is not None
         assert self.process.stdout is not None
         began_s = time.time()

@@ -1,4 +1,7 @@
-"""Random flights of the complete mobility service on the simulated vehicle. `bench/closed_loop.py` flies hundreds of them."""
+"""Some random flights of the complete mobility service on the simulated vehicle.
+
+`bench/closed_loop.py` runs hundreds of these flights.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Compare each golden flight with its recorded trace: authority, streams, commands, calls, path and missions."""
+"""Golden flights: each flight must reproduce its recorded trace.
+
+A trace contains authority changes, stream events, commands, calls, path and missions.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +19,7 @@ from depth import DEEP
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "control"
 RANDOM_SEEDS = (*range(12), 361)
-"""Seeds of random flights. In 361 a system task is stopped from within its own call while a POI mission begins."""
+"""Seeds of random flights. Seed 361 covers a system task that stops itself while a POI mission begins."""
 
 
 def scripts() -> dict[str, Script]:
@@ -25,7 +28,7 @@ def scripts() -> dict[str, Script]:
 
 
 def features(trace: Trace) -> set[tuple[str, ...]]:
-    """Return the features of a flight: pairs of authority changes, stream events, commands and mission outcomes."""
+    """Return the features of a trace: pairs of authority changes, stream events, commands and mission outcomes."""
     changes = ["", *(" ".join(line.partition(" at ")[0].split()[1:]) for line in trace["authority"])]
     events = {("stream", *line.split()[2:3]) for line in trace["streams"]}
     commands = {("command", *line.split()[1:]) for line in trace["commands"]}
@@ -33,7 +36,10 @@ def features(trace: Trace) -> set[tuple[str, ...]]:
 
 
 def selected_flights() -> list[str]:
-    """Return the flights to fly: all in a deep run, else a small subset that covers the features of all."""
+    """Return the flights to compare.
+
+    A deep run compares all flights, any other run a subset that covers all features.
+    """
     if DEEP:
         return list(scripts())
     traces: dict[str, Trace] = {path.stem: json.loads(path.read_text()) for path in sorted(GOLDEN.glob("*.json"))}

@@ -38,7 +38,7 @@ def written(record: FlightRecord, tmp_path_factory: pytest.TempPathFactory) -> P
 
 def test_flight_metrics_are_computed_from_the_record(record: FlightRecord) -> None:
     assert record.track.max_altitude_m == pytest.approx(50.0, abs=0.2)
-    assert record.track.distance_m == pytest.approx(796, abs=5), "geodesic sum of the legs"
+    assert record.track.distance_m == pytest.approx(796, abs=5), "distance is the sum of the geodesic leg lengths"
     assert record.track.takeoff_s == pytest.approx(demo_flight.TAKEOFF_S)
     assert record.track.landing_s is not None
     assert 100 < record.track.landing_s - record.track.takeoff_s < 110

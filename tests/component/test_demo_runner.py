@@ -1,4 +1,4 @@
-"""The demo follows a mission, assigns nodes, and collects only the data of this mission."""
+"""Demo runner: progress of a mission, assignment of nodes, and collection of the data of this mission only."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def test_mission_progress_is_reported_from_apply_to_landing() -> None:
     stopped = pod("a", False)
     stopped["metadata"]["labels"] = {"fractus.dev/finished": "20260101T000000Z"}
     mission.update([application("Completed", "done"), plan, stopped, flying("landing")], 200.0, lines.append)
-    assert mission.pods == {"a": pod("a", True)}, "the state before the pod was stopped is kept"
+    assert mission.pods == {"a": pod("a", True)}, "the runner keeps the state that the pod had before it was stopped"
     assert mission.ended
     assert not mission.grounded
     mission.update([application("Completed", "done"), plan, flying("inactive")], 230.0, lines.append)

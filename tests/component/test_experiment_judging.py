@@ -1,4 +1,4 @@
-"""Checks hold for evidence that fulfils them, and fail otherwise."""
+"""Checks of experiments: each check passes or fails according to the evidence."""
 
 from __future__ import annotations
 
@@ -121,7 +121,7 @@ def test_zone_checks_consider_area_and_altitude_band() -> None:
     through = flight(east=40.0)
     assert not verdict({"check": "outsideZone", "zone": "z"}, through)[0]
     above = {"altitude": {"upper": 15}}
-    assert verdict({"check": "outsideZone", "zone": "z"}, through, zone=above)[0], "the flight is above the zone"
+    assert verdict({"check": "outsideZone", "zone": "z"}, through, zone=above)[0], "the flight passes above the zone"
     assert not verdict({"check": "outsideZone", "zone": "z", "margin": 6}, through, zone=above)[0]
     wide = {"area": {"circle": {"center": {"lat": 50.0, "lon": 4.0}, "radius": 120}}}
     assert verdict({"check": "insideZone", "zone": "z"}, flight(), zone=wide)[0]

@@ -1,4 +1,4 @@
-"""Imports of programs: commands start quickly, and images need only the libraries that they contain."""
+"""Imports of programs: commands import little to start quickly, and services import only libraries of their image."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_mobility_service_imports_no_image_libraries() -> None:
 
 
 def test_startup_heartbeat_imports_no_large_library() -> None:
-    """A drone in flight needs the first heartbeats soon, and a small computer imports these libraries for seconds."""
+    """A drone in flight needs heartbeats soon. Importing large libraries takes seconds on a companion computer."""
     _, imported = run_program("import fractus_services.commands, fractus_services.mobility.mavlink.startup_heartbeat")
     assert "pymavlink" in imported
     assert not imported & {"grpc", "google", "numpy", "shapely", "pydantic", "yaml", "cryptography", "fractus_core"}

@@ -67,7 +67,7 @@ async def test_request_is_sent_unchanged_and_connection_is_reused() -> None:
 
 
 async def test_dead_connection_is_detected_by_keepalives(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A watch sends no data, so only TCP keepalives detect a broken network."""
+    """The client of a watch sends no data, so only TCP keepalives can detect a broken connection."""
     created = list[socket.socket]()
     create_socket = connection._socket
     monkeypatch.setattr(connection, "_socket", lambda address: created.append(create_socket(address)) or created[-1])

@@ -48,7 +48,10 @@ def test_command_is_sent_once_over_a_slow_link(tmp_path: Path, one_way_s: float)
 def test_late_acknowledgements_are_not_assigned_to_the_next_command(
     tmp_path: Path, one_way_s: float, refused_first: bool
 ) -> None:
-    """The link has just become slow. The service has not measured the delay yet, so it repeats or gives up the first command."""
+    """The link has just become slow.
+
+    The service has not measured the delay yet. It repeats the first command, or gives it up.
+    """
 
     async def flight() -> None:
         async with World(tmp_path) as world:
@@ -59,7 +62,7 @@ def test_late_acknowledgements_are_not_assigned_to_the_next_command(
             first = asyncio.ensure_future(plane.set_speed(5.0))
             await asyncio.wait([first])
             assert was_refused(first) == (refused_first and one_way_s < 1.5)
-            # Pending transmissions of the first command arrive before the second command.
+            # All transmissions of the first command arrive before the second command, so they get the first result.
             asyncio.get_running_loop().call_later(one_way_s - 0.05, plane.refuses.symmetric_difference_update, {SPEED})
             second = asyncio.ensure_future(plane.set_speed(6.0))
             await asyncio.wait([second])
@@ -91,7 +94,10 @@ def was_refused(command: asyncio.Future[None]) -> bool:
 
 
 def test_mode_change_does_not_wait_for_unacknowledged_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A requested return begins at once. The mode change before it is not repeated after it."""
+    """A change to LOITER is unacknowledged when RTL is requested.
+
+    RTL must be commanded at once, and LOITER must not be commanded again afterwards.
+    """
 
     async def flight() -> None:
         async with World(tmp_path) as world:
@@ -118,7 +124,7 @@ def test_mode_change_does_not_wait_for_unacknowledged_one(tmp_path: Path, monkey
             assert isinstance(first.exception(), AutopilotError)
             assert received[1] == (pytest.approx(began + 1.1), plane.stack.mode_parameters(RTL)[0])
             assert [number for _, number in received[1:]] == [received[1][1]] * len(received[1:]), (
-                "no later command changes the mode"
+                "only RTL is commanded after the request"
             )
             assert plane.vehicle.mode == RTL
 
@@ -126,7 +132,10 @@ def test_mode_change_does_not_wait_for_unacknowledged_one(tmp_path: Path, monkey
 
 
 def test_drone_lands_over_a_slow_link(tmp_path: Path) -> None:
-    """The link becomes slow (1.5 s one way), then the Grant of the driver is removed. The drone flies home and lands."""
+    """First the link becomes slow (1.5 s one way).
+
+    When the Grant is then removed, the drone must return home and land.
+    """
 
     async def flight() -> None:
         async with World(tmp_path) as world:

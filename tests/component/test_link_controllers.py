@@ -131,10 +131,10 @@ def test_guards_of_both_ends_follow_the_callers_of_a_service() -> None:
     object.__setattr__(named.spec, "services", services)
     redirector = RecordingRedirector()
     EdgeLinkController("e1", Path(), cast(Redirector, redirector), lambda: None, lambda *_: None).set_links((named,))
-    assert redirector.callers == {Endpoint(IPv4Address("10.88.0.2"), 80): frozenset()}, "before any drone has linked"
+    assert redirector.callers == {Endpoint(IPv4Address("10.88.0.2"), 80): frozenset()}, "no caller is known yet"
     virtual = Endpoint(IPv4Address("10.96.0.5"), 8080)
     assert allowed_callers([named]) == {virtual: {IPv4Address("10.87.0.2")}}
-    # A service without callers has no guard at either end.
+    # If a service does not restrict its callers, neither end of the link filters them.
     object.__setattr__(named.spec, "services", [services[0].model_copy(update={"callers": None})])
     assert not allowed_callers([named])
     assert not isolated_pods([named])
@@ -177,7 +177,7 @@ def test_namespaces_that_cannot_be_entered_are_skipped(tmp_path: Path, monkeypat
 
 
 class FakeAddresses:
-    """Fake of the addresses of a device with some evidence of other traffic."""
+    """Fake of the addresses of a network device. It reports evidence that the device carries other traffic."""
 
     def __init__(self, evidence: str) -> None:
         self._evidence = evidence
@@ -272,7 +272,7 @@ def test_link_is_probed_only_if_its_traffic_leaves_room(
         measured = controller._direct
         using.cancel()
         await asyncio.gather(using, return_exceptions=True)
-        # The first traffic rate needs two readings. The measurements before that are probes.
+        # A traffic rate needs two counter readings. Until then, the rate can only be measured by probes.
         assert session.probed in probes
         assert measured is not None
         return measured.ingress_mbps

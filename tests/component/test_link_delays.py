@@ -1,4 +1,4 @@
-"""Distances that docs/mobility.md guarantees between drone and zone, for each delay of the link and in wind."""
+"""Distances between drone and zone that docs/mobility.md guarantees for each link delay, with and without wind."""
 
 from __future__ import annotations
 
@@ -20,7 +20,10 @@ GUARANTEED_M = 1.0
 def weather(
     delay_s: float, wind_mps: float = 0.0, *, loss: float = 0.0, speedup: int = 1, error_m: float = 0.0
 ) -> Weather:
-    """Return conditions with a link of the given maximum round-trip delay. Its jitter is half of the minimum delay."""
+    """Return an environment whose link has the given maximum round-trip delay.
+
+    The jitter is half of the minimum delay.
+    """
     return Weather(
         uplink_s=delay_s * 0.6 / 1.5, downlink_s=delay_s * 0.4 / 1.5, wind_mps=wind_mps, gusts_mps=wind_mps / 6, loss=loss,
         speedup=speedup, error_m=error_m,
@@ -28,18 +31,21 @@ def weather(
 
 
 DELAY_COST_M = 0.3
-"""Maximum distance lost by a slow link. The service allows for the measured delay, so a slow link mainly needs more room ahead."""
+"""Maximum reduction of the distance by a slow link.
+
+The service knows the measured delay. It therefore stops the drone earlier, at almost the same distance.
+"""
 
 
 @functools.cache
 def flight_without_delay(wind_mps: float, error_m: float) -> Attempt:
-    """Fly without a delay."""
+    """Return the result of a flight without link delay."""
     return attempt(at_highest_permitted_speed, 7, weather(0.0, wind_mps, error_m=error_m))
 
 
 CALM = (0.0, 0.5)
 WINDY = (6.0, 5.0)
-"""Wind in m/s, and the position error in metres."""
+"""Pairs of wind in m/s and position error in metres."""
 
 
 @pytest.mark.parametrize(
@@ -61,7 +67,7 @@ def test_velocities_keep_their_distance(delay_s: float, conditions: tuple[float,
 
 
 def test_unmeasured_delay_reduces_the_distance(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Check that the tests above detect a service that does not measure the delay."""
+    """The service limits the measured delay to 0.3 s here. The tests above would detect this."""
     first = flight_without_delay(0.0, 0.5)
     measured = Timing.latency_s
     monkeypatch.setattr(Timing, "latency_s", lambda self, now: min(measured(self, now), 0.3))
@@ -94,24 +100,30 @@ def test_velocities_keep_their_distance_with_a_faster_simulator(speedup: int) ->
     cells([("vehicle", 3), ("service", 5), ("vehicle", 5)], quick=[("service", 5), ("vehicle", 5)]),
 )
 def test_velocities_keep_their_distance_despite_stalls(process: str, speedup: int) -> None:
-    """A stall of 0.35 s is more than a second for a fast vehicle. Its position is unknown meanwhile."""
+    """A stall of 0.35 s lasts more than a second on the clock of a vehicle that is simulated faster than real time.
+
+    If the vehicle stalls, its position is unknown during the stall.
+    """
     flown = attempt(straight, 10, replace(weather(0.02, speedup=speedup), stall=(process, 0.35)))
     assert flown.least_distance_m >= GUARANTEED_M
-    assert flown.permitted > 2, "the drone flies, although most setpoints arrive late"
+    assert flown.permitted > 2, "the service permits some setpoints although most of them arrive late"
     assert (flown.unavailable > 0) == (process == "vehicle")
     assert flown.account is not None
     assert not any("driver lost" in event for event in flown.account.events[:-3]), "the driver keeps control"
 
 
 AHEAD_M = {0.0: (12.0, 31.0), 0.1: (13.0, 32.0), 0.25: (13.0, 33.0), 0.5: (15.0, 36.0)}
-"""By delay: the distance ahead, at 5 and at 10 m/s, at which a new zone is not entered (last columns of the table)."""
+"""For each delay in s: distances at which the drone can still stop before a new zone, at 5 and at 10 m/s.
+
+The distances are the last columns of the table in docs/mobility.md.
+"""
 
 
 SLOW = (5.0, 0.5)
 FAST = (10.0, 0.5)
 AHEAD = (10.0, 5.0)
 BEHIND = (10.0, -5.0)
-"""Speed in m/s, and how far the true position is ahead of the estimated one, in metres."""
+"""Pairs of speed in m/s and distance of the true position ahead of the estimated position in metres."""
 
 
 @pytest.mark.parametrize(

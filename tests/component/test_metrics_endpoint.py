@@ -1,4 +1,4 @@
-"""HTTP endpoint of metrics. Any host may send requests, and these must not disturb the process."""
+"""HTTP endpoint of metrics. Requests of any host must not disturb the process."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""The motion monitor on flights of the policy oracle: it permits judged legs, and stops drones in time before a new zone."""
+"""The motion monitor on simulated flights of the policy oracle.
+
+The monitor does not stop drones on permitted legs. It stops drones in time before a new zone.
+"""
 
 from __future__ import annotations
 
@@ -74,11 +77,11 @@ def test_monitor_stops_accelerating_drone_before_new_zone(appears_s: float) -> N
         assert monitor(now, grant) is None
         fleet.step()
         checks += 1
-    assert checks > 2, "the monitor permitted some of the motion"
+    assert checks > 2, "the monitor does not stop the drone at once"
     assert (verdict.action, verdict.takeover) == ("deny", "hover"), (
-        "it is not certain that the drone would enter the zone"
+        "the monitor stops the drone without takeover, because the drone might not enter the zone"
     )
-    assert monitor(now, grant) is None, "a leg judged by the same fences has enough room"
+    assert monitor(now, grant) is None, "the monitor would not stop the drone if the fences had not changed"
     for _ in range(int(now.latency_s / STEP_S)):
         fleet.step()
     # The service commands a zero velocity.
@@ -88,4 +91,4 @@ def test_monitor_stops_accelerating_drone_before_new_zone(appears_s: float) -> N
     for _ in range(int(20 / STEP_S)):
         fleet.step()
     rest_m = wall_m - fleet.place[0, 1]
-    assert now.position_error_m < rest_m < 5.0, "the drone stops certainly outside, but close to the zone"
+    assert now.position_error_m < rest_m < 5.0, "the drone stops shortly before the zone"

@@ -20,7 +20,7 @@ FOREIGN = {"manager": "kube-controller-manager", "operation": "Update", "fieldsV
 
 
 class Server:
-    """Fake API server with one object. It refuses the first patches with a conflict."""
+    """Fake API server with one object. It refuses the first `refusals` patches with a conflict."""
 
     def __init__(self, *entries: Body, exists: bool = True, refusals: int = 0) -> None:
         self.metadata: Body = {"name": KEY[1], "namespace": KEY[0], "uid": "u1", "resourceVersion": "7"}

@@ -1,7 +1,7 @@
 """Random fences, states and requests, against an oracle that flies the drone in small steps.
 
-The oracle shares nothing with the engine: it projects on a sphere, casts rays to distinguish inside from outside, and
-integrates a drone with bounded acceleration, wind drift, latency and position error.
+The oracle shares no code with the engine. It projects positions on a sphere, and uses ray casting to distinguish inside
+from outside. It integrates the motion of a drone with bounded acceleration, wind drift, latency and position error.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from return_flights import ReturnFlights
 
 STEP_S = 0.05
 ACCEL_MPS2 = 2.5
-TOLERANCE_M = 0.02  # difference of sphere and ellipsoid at these distances
+TOLERANCE_M = 0.02  # position error of the sphere compared with the ellipsoid, within a few hundred metres
 _cases = settings(max_examples=examples(600), deadline=None, derandomize=True)
 
 
@@ -51,7 +51,10 @@ def inside(point: tuple[float, float], corners: Corners) -> bool:
 def fly(
     start: tuple[float, float], velocity: tuple[float, float], to: tuple[float, float], cruise: float, latency: float
 ) -> list[tuple[float, float]]:
-    """Return positions of a drone that receives its target after a latency and then turns to it, braking in time."""
+    """Return the positions of a drone on a flight to a target.
+
+    The drone receives the target after a latency. It then turns toward the target, and brakes in time.
+    """
     x, y = start
     vx, vy = velocity
     track = [start]
@@ -84,7 +87,10 @@ def fly(
 
 
 def brake(start: tuple[float, float], velocity: tuple[float, float], latency: float) -> list[tuple[float, float]]:
-    """Return the positions of a drone that is commanded to stop, with the tolerance of ArduPilot's formula."""
+    """Return the positions of a drone after a stop command.
+
+    The stopping distance is that of ArduPilot's formula, with its tolerance of 1.25 m.
+    """
     speed = math.hypot(*velocity)
     run = speed * latency + 1.25 + speed * speed / (2 * ACCEL_MPS2) if speed > 0 else 0.0
     return [
@@ -144,7 +150,7 @@ def test_oracle_no_permitted_goto_enters_a_zone(
     track = fly(
         (start[0] + off[0], start[1] + off[1]), velocity, (end[0] + off[0], end[1] + off[1]), 10.0, now.latency_s
     )
-    # Motion that no command can prevent is not caused by the request.
+    # The check ignores zones that the drone enters even if it is commanded to stop.
     braking = [(x + off[0] * k, y + off[1] * k) for x, y in brake(start, velocity, now.latency_s) for k in (-1, 0, 1)]
     unavoidable = any(inside(point, zone) for zone in zones for point in braking)
     if begun_outside and not unavoidable:
@@ -170,9 +176,9 @@ def test_oracle_no_permitted_goto_leaves_an_inclusion_zone(
     outside = [not inside(p, big) for p in track]
     if not outside[0]:
         assert not any(outside)
-    assert outside == sorted(outside, reverse=True), "once inside, it stays inside"
+    assert outside == sorted(outside, reverse=True), "the drone stays inside the zone after it has entered it"
     assert not outside[-1]
-    # A corrected target keeps its margin: the whole circle around it is inside.
+    # A circle around a corrected target, with the size of the margin, is inside the zone.
     ring_of = [(end[0] + 2.4 * math.cos(a / 5), end[1] + 2.4 * math.sin(a / 5)) for a in range(32)]
     assert all(inside(p, big) for p in ring_of)
 
@@ -207,7 +213,7 @@ def test_oracle_altitude_verdicts_match_the_rules(
         elif low and call.method == "Goto":
             assert verdict.code == "AltitudeTooLow"
         elif call.method == "Takeoff" and want < MIN_TAKEOFF_ALTITUDE_M:
-            assert verdict.code == "ConflictingLimits", "no takeoff goes that low"
+            assert verdict.code == "ConflictingLimits", "the altitude is below the minimum of a takeoff"
         else:
             assert verdict.permits
             flown = verdict.args.alt if isinstance(verdict.args, GotoArgs) else verdict.args.altitude_m  # type: ignore[union-attr]
@@ -230,7 +236,7 @@ def test_oracle_every_goto_gets_a_verdict(lat: float, lon: float, alt: float, vn
 
 
 def test_oracle_no_permitted_request_breaks_a_policy() -> None:
-    """A small version of `bench/oracle.py`: velocities, legs in flight, bands, schedules, limits, wind."""
+    """Short version of `bench/oracle.py`: velocities, interrupted legs, altitude bands, schedules, limits and wind."""
     tally = flights(seed=7, count=500)
     assert tally.wrong == []
     assert tally.permitted > tally.requests / 3
@@ -286,7 +292,7 @@ def test_oracle_excuses_drones_that_start_beyond_an_altitude_limit() -> None:
 
 @pytest.fixture
 def shortening(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Use legs only, with fences that shorten them, so that they end at the margins of fences."""
+    """Use only Goto requests, and policies that shorten their legs. The legs then end at the margins of fences."""
     made = policy_flights.policy
 
     def shortens(name: str, *args: Any, **more: Any) -> dict[str, Any]:

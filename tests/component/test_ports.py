@@ -1,4 +1,4 @@
-"""Reservation of ports for programs that are started with a port number. No other process gets a reserved port."""
+"""Reservation of ports for programs that get their port as an argument. No other process gets a reserved port."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ while True:
 
 @pytest.fixture
 def port_range(monkeypatch: pytest.MonkeyPatch) -> Iterator[range]:
-    """Restrict the reservations to ten free ports that no other run of these tests uses."""
+    """Restrict reservations to ten free ports. Concurrent runs of these tests use different ports."""
     reservations: deque[socket.socket] = deque()
     with ExitStack() as claims:
         first = next(first for first in range(19_000, 20_000, 10) if claim_ports(claims, first))

@@ -1,4 +1,7 @@
-"""Flight recordings: content read by independent readers, size limit, recovery after a crash, and failing disks."""
+"""Flight recordings: content, size limit, recovery after a crash, and failing disks.
+
+Independent readers check the content.
+"""
 
 from __future__ import annotations
 
@@ -44,7 +47,7 @@ UNKNOWN = bytes.fromhex("fd 04 00 00 07 01 01 f0 d8 00 01020304 abcd")
 
 
 class Vehicle:
-    """Encoder of an autopilot's messages."""
+    """Fake vehicle that encodes messages of its autopilot."""
 
     def __init__(self) -> None:
         self.endpoint = Endpoint(1, 1)
@@ -87,7 +90,7 @@ open_writers: list[FlightWriter] = []
 
 
 def writer_in(directory: Path, megabytes: float = 4.0, *, always: bool = False) -> FlightWriter:
-    """Return a writer as after a restart of the service: the locks of previous writers are released."""
+    """Return a new writer, as after a restart of the service. The locks of previous writers are released first."""
     while open_writers:
         open_writers.pop().segments.unlock()
     segments = SegmentDirectory(directory, int(megabytes * 1e6), reserve_bytes=0)
@@ -98,7 +101,7 @@ def writer_in(directory: Path, megabytes: float = 4.0, *, always: bool = False) 
 
 
 def wait_for_index(writer: FlightWriter, path: Path) -> None:
-    """Wait until the writer has added the index that is missing after a crash."""
+    """Wait until the writer has added the missing index to the file of a crashed process."""
     until(lambda: writer.tick() or path.read_bytes().endswith(MCAP0_MAGIC))
 
 

@@ -1,4 +1,4 @@
-"""The field experiment: its site, the evidence read from logs, and expectations that hold or fail."""
+"""The field experiment: site, evidence from logs, and evaluation of the expectations."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The links scenario: its site, the evidence read from logs, and the report."""
+"""The links scenario: site, evidence from logs, and report."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def picture(number: int, at_s: float, *nodes: str, delay_s: float = 0.2, answere
 
 
 def run_of(site: Site, *more: LogLine) -> Evidence:
-    """Return a run with pictures to edge-1 from 10 s to 25 s, and to the cloud at other times."""
+    """Return a run whose pictures go to edge-1 between 10 s and 25 s, and to the cloud at other times."""
     links = [
         agent(8.0, "links: decided (on=link peer=edge-1): Connect: edge-1, 60 m away, offers more than the cloud path"),
         agent(8.1, "links: connecting (peer=edge-1 reason=wanted)"),

@@ -1,4 +1,4 @@
-"""Arming: preconditions, concurrent requests, retries, and changes of the failsafe verification meanwhile."""
+"""Arming: preconditions, concurrent requests, retries, and changes of the failsafe verification during arming."""
 
 from __future__ import annotations
 
@@ -18,7 +18,10 @@ from virtual_time import fly
 
 
 class Slow:
-    """Delay raising the fence. `began_armed` records whether the drone was armed at the start of each attempt."""
+    """Slow replacement of the method that loads the fence.
+
+    `began_armed` records for each call if the drone was armed when the call began.
+    """
 
     def __init__(self, world: World) -> None:
         self._world = world
@@ -41,7 +44,7 @@ def test_arming_happens_once_for_two_concurrent_requests(tmp_path: Path) -> None
             await first
             await end(world.service.take_off(grant, TakeoffArgs(10.0)))
             await second
-            assert slow.began_armed == [False], "no preparation while the drone flies"
+            assert slow.began_armed == [False], "no flight is prepared while the drone is armed"
             assert world.plane.commands.count(mavlink.MAV_CMD_COMPONENT_ARM_DISARM) == 1
             assert world.plane.vehicle.armed
 
@@ -66,7 +69,7 @@ def test_queued_arming_is_refused_after_driver_returns_control(tmp_path: Path) -
 
 
 FRESH = FailsafeStatus("", (), Airframe(retraces=True), 8.0, records_path=True)
-"""Failsafe verification after a reconnect, without the return mode chosen for this flight."""
+"""Result of a failsafe verification after a reconnect. It does not contain the return mode chosen for the flight."""
 
 
 @pytest.mark.parametrize("verified", [None, FRESH])
@@ -116,7 +119,7 @@ def test_arming_is_refused_if_failsafe_verification_changes_meanwhile(
             plane._obey = noted  # type: ignore[method-assign]
             why = await refusal(world.service.arm(grant))
             assert why.verdict.code == "FailsafesNotVerified"
-            assert control.failsafe_status is verified, "the newer verification is kept"
+            assert control.failsafe_status is verified, "the result of the newer verification is kept"
             assert 1 not in motors
 
     fly(flight)
@@ -140,7 +143,7 @@ def test_return_mode_is_kept_after_link_reconnects_in_flight(tmp_path: Path) -> 
             assert plane.parameters["FS_GCS_ENABLE"] == 1.0
             world.observer.found()
             assert control.failsafe_status.problem
-            assert world.gate.situation().airframe.accel_mps2 == 1.0, "the known acceleration is kept"
+            assert world.gate.situation().airframe.accel_mps2 == 1.0, "acceleration is unchanged"
             await world.until(lambda: control.failsafe_status is not None and not control.failsafe_status.problem, 10)
             assert plane.parameters["FS_GCS_ENABLE"] == 1.0
             assert not control.retraces

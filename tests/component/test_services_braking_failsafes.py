@@ -1,4 +1,4 @@
-"""Failsafes that brake: the drone hovers without a pilot, so the system returns it home."""
+"""Failsafes whose action is BRAKE. The drone then hovers without a pilot, so the system returns it home."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def test_drone_returns_home_after_radio_failsafe_brakes(tmp_path: Path) -> None:
             assert mavlink.COPTER_MODE_BRAKE in modes
             assert "failsafe" in str(drone.control.state.missions["m1"].outcome)
 
-    # FS_THR_ENABLE 7: brake, or land if braking is impossible.
+    # Value 7 of FS_THR_ENABLE: BRAKE, or LAND if BRAKE is not possible.
     fly(work, tmp_path, {"FS_THR_ENABLE": 7.0})
 
 

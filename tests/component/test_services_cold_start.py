@@ -1,4 +1,4 @@
-"""The service with a vehicle that has just been switched on, in virtual time, on links with frame loss."""
+"""Cold start: the service connects to a vehicle that was just switched on, over links that lose frames."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ async def until(condition: Callable[[], object]) -> None:
 
 
 async def armed(sky: Sky, directory: Path) -> FailsafeStatus:
-    """Return the verified vehicle parameters at the time of arming."""
+    """Arm the drone. Return the result of the failsafe verification at that time."""
     drone = Drone(directory, Account(0))
     turning = asyncio.ensure_future(sky.run_vehicle())
     grant = drone.grants.put(spec())

@@ -1,4 +1,4 @@
-"""An estimator without absolute position: the vehicle dead-reckons although its GPS reports a fix."""
+"""Position estimator without absolute position: the vehicle uses dead reckoning although its GPS reports a fix."""
 
 from __future__ import annotations
 
@@ -22,7 +22,10 @@ FLOW = (
     mavlink.EKF_ATTITUDE | mavlink.EKF_VELOCITY_HORIZ | mavlink.EKF_VELOCITY_VERT
     | mavlink.EKF_POS_HORIZ_REL | mavlink.EKF_POS_VERT_ABS | mavlink.EKF_PRED_POS_HORIZ_REL
 )  # fmt: skip
-"""EKF flags of a vehicle with optical flow that rejects its GPS, or whose pilot switched sources. It stays in GUIDED."""
+"""EKF flags of a vehicle that navigates by optical flow.
+
+The estimator rejects the GPS, or the pilot has selected optical flow. The vehicle stays in GUIDED.
+"""
 
 DRIFT_MPS = 0.3
 
@@ -51,7 +54,7 @@ def test_drone_returns_home_if_estimator_has_no_absolute_position(
             monkeypatch.setattr(Estimator, "estimate", drifting)
             monkeypatch.setattr(Estimator, "flags", FLOW)
             await asyncio.sleep(2.0)
-            assert not located(drone.control), "camera requests must not use this position"
+            assert not located(drone.control), "camera requests must not use a position from dead reckoning"
             await until(lambda: drone.control.state.returning or min(distances_m) <= 0.0)
             assert min(distances_m) > 1.0
 

@@ -102,7 +102,7 @@ def test_accelerating_drone_brakes_before_new_zone_without_takeover(tmp_path: Pa
             why = await going
             assert (why.verdict.code, why.verdict.action) == ("ExclusionZoneAhead", "deny")
             await asyncio.sleep(20)
-            assert world.control.authority is Authority.DRIVER, "the drone neither entered the zone nor was about to"
+            assert world.control.authority is Authority.DRIVER, "a drone that can stop is not taken over"
             assert clearance_m(world, *WALL) > 5
 
     fly(flight)
@@ -383,7 +383,7 @@ def test_pending_command_is_dropped_after_control_is_lost(tmp_path: Path, event:
             grant = world.grants.put(spec())
             stream = await world.up(grant)
             assert world.control.effects.takeover_reason == "", "a driver has control"
-            world.plane.disconnected = True  # the autopilot neither acts nor acknowledges, so commands are retried
+            world.plane.disconnected = True  # the autopilot gets no command, so the service repeats its commands
             asking = asyncio.ensure_future(refusal(world.service.set_speed(grant, SetSpeedArgs(3.0))))
             await asyncio.sleep(0.3)
             if event == "takeover":
@@ -398,11 +398,11 @@ def test_pending_command_is_dropped_after_control_is_lost(tmp_path: Path, event:
             world.plane.disconnected = False
             why = await asking
             assert why.verdict.code in {"NotInControl", "ControlLost"}
-            assert mavlink.MAV_CMD_DO_CHANGE_SPEED not in world.plane.commands, "the retry was dropped"
-            assert world.control.effects.takeover_reason, "the takeover reason is reported to the node"
+            assert mavlink.MAV_CMD_DO_CHANGE_SPEED not in world.plane.commands, "the command is not repeated"
+            assert world.control.effects.takeover_reason, "the service reports the reason of the takeover"
             await world.until(lambda: not world.plane.vehicle.armed)
             world.control.note("landed", "the motors are stopped")
-            assert not world.control.effects.takeover_reason, "the reason does not carry over to the next flight"
+            assert not world.control.effects.takeover_reason, "the reason is cleared after the landing"
 
     fly(flight)
 
@@ -521,7 +521,7 @@ def test_system_takes_over_armed_drone_without_authority_after_restart(tmp_path:
     async def flight() -> None:
         async with World(tmp_path) as world:
             await world.up(world.grants.put(spec()))
-        async with World(tmp_path, after=world) as second:  # the drone is known to be armed, without control authority
+        async with World(tmp_path, after=world) as second:  # a restarted service finds the drone armed
             second.grants.put(spec())
             await second.until(lambda: second.kinds("takeover"))
             assert second.kinds("takeover")[0]["code"] == "NoControlAuthority"

@@ -1,4 +1,7 @@
-"""Home position in flight: altitudes and returns refer to the home fixed at arming, also if another station moves it."""
+"""Home position in flight.
+
+Altitudes and return flights refer to the home at the time of arming, even if another station moves home in flight.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +35,7 @@ CEILING = {"name": "low", "spec": {"type": "LimitControl", "kind": "altitude", "
 
 
 def move(world: World, target: tuple[float, float, float]) -> None:
-    """Move home as a ground station does with "set home here"."""
+    """Move home, like the function "set home here" of a ground station."""
     east, north, up = target
     lat, lon = FRAME.latlon(east, north)
     world.plane.move_home(round(lat * 1e7), round(lon * 1e7), GROUND_M + up)
@@ -71,7 +74,7 @@ def test_moved_home_is_restored_before_flight_continues(tmp_path: Path, target: 
             leg = asyncio.ensure_future(refusal(world.service.goto(grant, GotoArgs(*at(0, 90), 12.0), 0)))
             await world.until(lambda: world.plane.xy[1] > 20)
             move(world, target)
-            # Until home is restored, altitudes are invalid: neither motions nor camera requests may use them.
+            # Altitudes are invalid until home is restored. Motions and camera requests must not use them.
             assert not located(world.control)
             with pytest.raises(Unavailable):
                 world.service.goto(grant, GotoArgs(*at(0, 90), 12.0), 0)
@@ -116,7 +119,10 @@ def test_mission_ends_if_moved_home_cannot_be_restored(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("refused", [True, False])
 def test_drone_lands_at_original_home_if_home_keeps_moving(tmp_path: Path, refused: bool) -> None:
-    """The restore is refused, or home is moved again every time. SmartRTL still leads to where the mission armed."""
+    """The autopilot refuses to restore home, or home is moved again after each restore.
+
+    SmartRTL still returns the drone to the position at which it was armed.
+    """
 
     async def move_home_repeatedly(world: World) -> None:
         while True:
@@ -148,7 +154,7 @@ def test_home_moved_by_pilot_is_restored_after_handback(tmp_path: Path) -> None:
             move(world, AWAY)
             await asyncio.sleep(5.0)
             assert not at_home(world)
-            assert not located(world.control), "heights above the moved home are invalid"
+            assert not located(world.control), "altitudes relative to the moved home are invalid"
             world.plane.set_to(GUIDED)
             await world.until(lambda: at_home(world), 5)
             await world.until(lambda: not world.plane.vehicle.armed)
@@ -228,7 +234,7 @@ def test_pilot_flight_after_landed_mission_uses_new_home(tmp_path: Path) -> None
             plane.goal_height = 20.0
             await world.until(lambda: plane.vehicle.altitude_m > 10)
             assert world.control.state.mission is not None
-            assert located(world.control), "the home of the mission does not apply to this flight"
+            assert located(world.control), "the pilot flight has its own home"
             move(world, (0.0, 0.0, 0.0))
             await asyncio.sleep(1.0)
             assert not located(world.control)
@@ -237,7 +243,10 @@ def test_pilot_flight_after_landed_mission_uses_new_home(tmp_path: Path) -> None
 
 
 def test_failed_arming_does_not_fix_home(tmp_path: Path) -> None:
-    """Arming is refused, for example because of magnetic interference. The drone is carried elsewhere and armed there."""
+    """The autopilot refuses to arm, for example because of magnetic interference.
+
+    The drone is then carried to another place and armed there.
+    """
 
     async def flight() -> None:
         async with World(tmp_path) as world:
@@ -256,7 +265,7 @@ def test_failed_arming_does_not_fix_home(tmp_path: Path) -> None:
             east, north = FRAME.xy(home.lat, home.lon)
             assert abs(east - 30.0) < 0.5
             assert abs(north) < 0.5
-            # After the first flight, landing and arming again must not move home.
+            # If the drone lands and arms again during the mission, home must not change.
             await end(world.service.take_off(grant, TakeoffArgs(10.0)))
             await end(world.service.goto(grant, GotoArgs(*at(0, 40), 10.0), 0))
             await end(world.service.land(grant))
@@ -310,7 +319,7 @@ def test_vertical_home_move_is_detected_without_home_position_message(
 
 
 async def test_home_position_request_is_rate_limited_after_refusal() -> None:
-    """The autopilot refuses immediately. The next request must wait."""
+    """The autopilot refuses each request immediately. The service must not repeat the request at once."""
 
     class Refusing:
         vehicle = Vehicle(stack=ARDUCOPTER, armed=True, heartbeat_at=10.0)

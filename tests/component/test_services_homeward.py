@@ -1,4 +1,4 @@
-"""Return flights: start at rest, retries after refusals, limits and new zones, and cleanup after the mission."""
+"""Return flights: start from standstill, retries after refusals, limits, new zones, and cleanup after the mission."""
 
 from __future__ import annotations
 
@@ -140,7 +140,7 @@ def test_fence_is_lowered_after_mission_ends(tmp_path: Path, how: str) -> None:
                 await world.until(lambda: world.fence.raised)
                 await asyncio.wait([arming])
                 if how == "unused":
-                    assert world.fence.raised, "the fence is kept while the motors run"
+                    assert world.fence.raised, "the fence stays loaded while the motors run"
                     await world.service.disarm(grant)
                 else:
                     assert "command COMPONENT_ARM_DISARM" in str(arming.exception())
@@ -148,7 +148,7 @@ def test_fence_is_lowered_after_mission_ends(tmp_path: Path, how: str) -> None:
                 stream = await world.up(grant)
                 await end(world.service.land(grant))
                 await asyncio.sleep(15)
-                assert world.fence.raised, "the driver may take off again"
+                assert world.fence.raised, "the fence stays loaded, because the driver may take off again"
                 if how == "returned":
                     await world.control.return_control(grant)
                 elif how == "grace":
@@ -420,7 +420,7 @@ def test_landing_takeover_flies_home_if_zone_is_below(tmp_path: Path, upper: flo
             if upper < 20.0:
                 await refusal_of(world, GotoArgs(*at(0, 55), 5.0))
             await world.until(lambda: not world.plane.vehicle.armed)
-            assert (math.hypot(*world.plane.xy) < 2.0) is (upper < 20.0), "inside the zone the drone lands immediately"
+            assert (math.hypot(*world.plane.xy) < 2.0) is (upper < 20.0), "a drone inside the zone lands at once"
             assert world.outcome().startswith("failed:")
 
     fly(flight)
@@ -457,7 +457,7 @@ def test_monitor_stops_failsafe_return_into_zone_after_earlier_return_was_given_
             await world.up(grant)
             for x, y in ((60, 30), (60, 70), (0, 70)):
                 await end(world.service.goto(grant, GotoArgs(*at(x, y), 10.0), 0))
-            world.monitor._return_flight.given_up = grant  # same as after a return flight that its driver stopped
+            world.monitor._return_flight.given_up = grant  # state after a return flight that a driver interrupted
             await asyncio.sleep(2)
             plane.vehicle.failsafe = True
             plane.set_to(RTL)

@@ -98,7 +98,7 @@ def test_corrected_speed_holds_when_leg_is_resent(tmp_path: Path) -> None:
 
 
 SLOW_FROM = 60.0
-"""North of this coordinate the speed is limited, in metres."""
+"""Southern edge of the zone with a speed limit, in metres north of home."""
 
 
 def slow_zone() -> dict[str, Any]:
@@ -243,7 +243,7 @@ def test_late_speed_correction_applies_to_next_motion(tmp_path: Path) -> None:
             await world.until(lambda: world.plane.velocity[1] > 7)
             world.grants.put(spec(limit("speed", 3.0)))
             world.monitor.check()
-            world.control.begin_motion("Goto").speed_mps = 8.0  # before the correction has begun
+            world.control.begin_motion("Goto").speed_mps = 8.0  # a new motion begins before the speed command is sent
             begun = world.plane.now
             await world.until(lambda: world.plane.speed_mps == 3.0, 5)
             assert world.plane.now - begun < 0.5
@@ -341,8 +341,8 @@ def test_goto_is_judged_again_at_current_position_after_lost_command(tmp_path: P
             begun = len(plane.commands)
             final = await end(world.service.goto(grant, goto(-60, 50), 0))
             assert final.verdict.permits
-            assert min(lost_count[:2]) > 5, "the drone continued without a new command"
-            assert plane.commands[begun] == 84, "by then the drone has to stop first"
+            assert min(lost_count[:2]) > 5, "the drone continued its previous leg for some time"
+            assert plane.commands[begun] == 84, "the drone must stop before the turn"
             assert (await first).verdict.code == "Replaced"
             assert clearance_m(world, -200, 63, 200, 100) > 1.0
 
@@ -380,7 +380,7 @@ def test_goto_stops_and_restarts_once_after_lost_speed_command(tmp_path: Path, l
                 with pytest.raises(AutopilotError, match="does not acknowledge the speed"):
                     await flying
                 await world.until(lambda: math.hypot(*plane.velocity) < 0.2, 5)
-            assert top < 4.0, "the drone does not continue at its default speed"
+            assert top < 4.0, "the drone must not fly at its default speed"
 
     fly(flight)
 
@@ -409,7 +409,7 @@ def test_permitted_goto_is_flown_while_drone_brakes_before_new_zone(
             await end(world.service.goto(grant, toward_home, 0))
             assert clearance_m(world, -30, 50, 30, 70) > 0.0
             codes = [note["code"] for note in world.kinds("control") if note["action"] == "brake"]
-            assert codes == ["ExclusionZoneAhead"], "the monitor stopped one motion, not two"
+            assert codes == ["ExclusionZoneAhead"], "the monitor stopped only the first motion"
 
     fly(flight)
 
@@ -425,7 +425,7 @@ def test_altitude_correction_is_not_stopped_by_replaced_motion(tmp_path: Path) -
             assert (await flying).verdict.code == "AltitudeAboveLimit"
             begun = len(world.plane.commands)
             await world.until(lambda: world.plane.height < 16.0, 8)
-            assert 84 not in world.plane.commands[begun:], "the descent is not stopped"
+            assert 84 not in world.plane.commands[begun:], "no stop command interrupts the descent"
             await world.until(lambda: world.control.motion is None, 10)
             assert world.control.state.controller == grant.identity
 
@@ -510,14 +510,14 @@ def test_monitor_flags_fences_changed_until_drone_rests(tmp_path: Path, changed:
             await world.up(grant)
             going = asyncio.ensure_future(end(world.service.goto(grant, goto(0, 90), 1.0)))
             await world.until(lambda: world.plane.xy[1] > 3)
-            assert not any(changed[-20:]), "the leg began at rest under the current fences"
+            assert not any(changed[-20:]), "the fences have not changed since the leg began"
             grant = world.grants.put(spec(zone("far", "ignore", 60, 60, 90, 90)))
             await asyncio.sleep(0.2)
             assert changed[-1]
             await world.service.hover(grant)
             with pytest.raises(Refused):
                 await going
-            assert changed[-1], "the drone is still moving"
+            assert changed[-1], "the drone still moves, so the change of the fences still matters"
             await world.until(lambda: math.hypot(*world.plane.velocity) < 0.01)
             await asyncio.sleep(2.0)
             await end(world.service.goto(grant, goto(0, 40), 1.0))
@@ -535,7 +535,7 @@ def test_monitor_flags_fences_changed_after_immediately_completed_goto(tmp_path:
             assert world.control.motion is None
             world.grants.put(spec(zone("far", "ignore", 60, 60, 90, 90)))
             await world.until(lambda: world.plane.xy[1] > 3)
-            assert changed[-1], "the autopilot is still flying the leg"
+            assert changed[-1], "the change matters, because the autopilot still flies the leg of the completed Goto"
 
     fly(flight)
 

@@ -42,7 +42,7 @@ FLYING = heartbeat(
 
 
 def deliver_first(sky: Sky, *frames: bytes) -> None:
-    """Deliver these frames first on each new connection."""
+    """Deliver the given frames at the beginning of each new connection, before all others."""
     connect = sky.create_connection
 
     async def create_connection(*args: Any, **kwargs: Any) -> Any:
@@ -131,7 +131,7 @@ def test_command_is_resent_if_acknowledgement_belongs_to_another_station(tmp_pat
 
 
 def messages_to(sky: Sky, system: int) -> list[str]:
-    """Return a list that collects the names of messages sent to a system from now on."""
+    """Return a list to which the name of each message is added that is sent to a MAVLink system from now on."""
     names: list[str] = []
     connect = sky.create_connection
 

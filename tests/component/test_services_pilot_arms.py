@@ -1,4 +1,7 @@
-"""A drone armed by another station while a driver waits belongs to the pilot, because its flight was not prepared."""
+"""Arming by another station while a driver waits.
+
+The flight was not prepared for a driver, so the pilot gets control authority.
+"""
 
 from __future__ import annotations
 
@@ -51,7 +54,7 @@ def test_drone_armed_by_another_station_belongs_to_pilot(mode: int, tmp_path: Pa
 
 
 def test_driver_keeps_control_if_link_breaks_before_arming_is_confirmed(tmp_path: Path) -> None:
-    """The autopilot arms, the link breaks at that moment, and the armed heartbeat arrives seconds later."""
+    """The link breaks at the moment of arming. The first heartbeat of the armed drone arrives seconds later."""
 
     async def work(sky: Sky, directory: Path) -> None:
         async with ready(sky, directory) as (drone, grant):
@@ -107,7 +110,10 @@ def test_drone_armed_by_others_stays_with_pilot_after_service_restart(mode: Flig
 
 
 def test_rearmed_motors_belong_to_pilot_after_confirmed_disarm(tmp_path: Path) -> None:
-    """The arm command was acknowledged and the motors stopped again, so no acknowledgement is pending."""
+    """The service's arm command was acknowledged, and the motors stopped again.
+
+    The service therefore expects no further arming. If the motors start again, a pilot has armed them.
+    """
 
     async def work() -> None:
         async with World(tmp_path) as world:

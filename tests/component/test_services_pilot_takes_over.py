@@ -1,4 +1,4 @@
-"""A pilot changes the mode while the system changes it: the system does not overrule the pilot."""
+"""A pilot changes the mode during a mode change by the system. The system must not overrule the pilot."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from sky_drone import fly, ready, until
 
 
 def lose_mode_changes(wire: Wire, count: int, monkeypatch: pytest.MonkeyPatch) -> list[float]:
-    """Drop the first mode commands of the companion, and return the send times of all of them."""
+    """Drop the first `count` mode commands of the companion. Return a list of the send times of all mode commands."""
     write = wire.write
     parser = Parser()
     sent_at = []
@@ -38,7 +38,10 @@ def lose_mode_changes(wire: Wire, count: int, monkeypatch: pytest.MonkeyPatch) -
 def test_pilot_keeps_control_when_taking_over_during_system_mode_change(
     after_s: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The first mode commands are lost. Later retries must not override the mode that the pilot chose meanwhile."""
+    """The first mode commands of the system are lost.
+
+    Their retries must not replace the mode that the pilot has chosen in the meantime.
+    """
 
     async def work(sky: Sky, directory: Path) -> None:
         async with ready(sky, directory) as (drone, grant):

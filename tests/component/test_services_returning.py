@@ -206,8 +206,8 @@ def test_rtl_limits_follow_grant_changes_in_flight(tmp_path: Path) -> None:
             world.grants.put(spec(limited("altitude", 12.0, 50, 50, 60, 60), limited("speed", 3.5, 50, 50, 60, 60)))
             await world.until(lambda: held(world) == LOW, 5)
             assert world.gate.situation().airframe.return_altitude_m == 12.0
-            assert world.control.cruise_mps == 10.0, "the zone of the limits is far from the leg"
-            world.plane.parameters["RTL_ALT"] = 3000.0  # another station, whose message was lost
+            assert world.control.cruise_mps == 10.0, "the leg is outside the zone of the limits"
+            world.plane.parameters["RTL_ALT"] = 3000.0  # changed by another station, without a message to the service
             await world.until(lambda: held(world) == LOW, 15)
             world.grants.put(spec())
             await world.until(lambda: held(world) == OWNED | {"RTL_CLIMB_MIN": 0.0}, 5)

@@ -1,4 +1,4 @@
-"""Another station commands the drone in GUIDED while its driver hovers. The monitor accounts for the acceleration."""
+"""Another station accelerates the drone in GUIDED while its driver hovers. The monitor must stop the drone in time."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Velocity setpoints of a driver: succession, replacement and expiry."""
+"""Velocity setpoints of a driver: repetition, replacement and expiry."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def test_goto_and_velocity_setpoint_replace_each_other(tmp_path: Path) -> None:
             assert (await flying).verdict.code == "Replaced"
             await end(world.service.goto(grant, goto(30, 30), 0))
             await asyncio.sleep(5)
-            assert math.dist(world.plane.xy, (30, 30)) < 1.5, "the watchdog of the setpoint has ended"
+            assert math.dist(world.plane.xy, (30, 30)) < 1.5, "the hold time does not stop the Goto"
 
     fly(flight)
 

@@ -1,4 +1,7 @@
-"""Heartbeats from before arming that arrive in flight. They carry no timestamp, and must not end control."""
+"""Delayed heartbeats that were sent before arming and arrive in flight.
+
+Heartbeats have no timestamp. A delayed heartbeat must not end the control authority.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""An autopilot that reboots, or whose telemetry streams another station stops, on an intact link."""
+"""Events on an intact link: the autopilot reboots, or another station stops its telemetry streams."""
 
 from __future__ import annotations
 

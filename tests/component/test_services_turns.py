@@ -1,4 +1,4 @@
-"""Throttling: long computations and floods of calls do not starve monitor, watchdog and heartbeats."""
+"""Throttling: long computations and many calls must not delay motion monitor, watchdog and heartbeats."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def handlers_of(world: World) -> MobilityHandlers:
 
 
 def costly(world: World, method: str, monkeypatch: pytest.MonkeyPatch) -> list[float]:
-    """Let each policy check of a method cost 0.1 s of computing, and return the times of the checks."""
+    """Make each policy check of a method take 0.1 s of computing time. Return a list of the times of the checks."""
     judge = world.gate.judge
     clock = Clock()
     at_s = list[float]()
@@ -237,7 +237,7 @@ def test_throttled_call_is_replaced_by_later_call(world: Callable[[], World], mo
                 return handlers.SetVelocity(mobility_pb2.SetVelocityRequest(velocity=velocity), Context(grant))
 
             async def waiting(*calls: Any) -> list[asyncio.Future[Any]]:
-                """Start calls in this order while the throttle delay of a check lasts."""
+                """Start the calls in the given order, during the throttle delay that a policy check has caused."""
                 w.service.calls.check(Call("GetSpeed"), grant)
                 tasks = [asyncio.ensure_future(call) for call in calls]
                 await asyncio.sleep(0.02)

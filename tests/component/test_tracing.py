@@ -1,4 +1,4 @@
-"""Spans of calls: setting up the export, the content of spans, and calls that must not fail because of tracing."""
+"""Tracing of calls: set-up of the export, content of spans, and calls that continue if tracing fails."""
 
 from __future__ import annotations
 
@@ -34,7 +34,10 @@ def collector(monkeypatch: pytest.MonkeyPatch) -> Iterator[Collector]:
 
 @pytest.fixture
 def close(collector: Collector, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[], None]]:
-    """Export spans of this process to the collector. The value exports the last ones."""
+    """Export the spans of the test to the collector.
+
+    The fixture returns a function that exports the remaining spans.
+    """
     monkeypatch.setattr(tracing, "_tracer", trace.NoOpTracer())
     close = tracing.configure("mobility", "drone-1", os.environ)
     yield close

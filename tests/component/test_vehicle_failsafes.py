@@ -36,7 +36,7 @@ def test_gcs_failsafe_monitors_only_sysid_mygcs():
     pilot.heartbeats = True
     pilot.fly_on(2.0)
     assert "GCS Failsafe Cleared" in pilot.texts
-    assert vehicle.mode == mavlink.COPTER_MODE_RTL, "clearing the failsafe does not change the mode back"
+    assert vehicle.mode == mavlink.COPTER_MODE_RTL, "the mode stays RTL after the failsafe is cleared"
 
 
 def test_gcs_failsafe_timeout_follows_parameter():

@@ -1,4 +1,4 @@
-"""Motion of the vehicle and preconditions of its commands, in lockstep."""
+"""Motion of the simulated vehicle, and preconditions of its commands."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ def test_takeoff_requires_guided_armed_and_landed():
     assert vehicle.landed_state == mavlink.MAV_LANDED_STATE_TAKEOFF
     assert pilot.command(*takeoff) == mavlink.MAV_RESULT_FAILED
     assert pilot.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 0.0) == mavlink.MAV_RESULT_FAILED, (
-        "in the air only with the force magic"
+        "disarming in the air requires the magic number 21196"
     )
     assert vehicle.armed
     assert pilot.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 0.0, 21196) == mavlink.MAV_RESULT_ACCEPTED
@@ -245,7 +245,7 @@ def test_changed_speed_is_kept_until_controller_changes():
     assert pilot.command(mavlink.MAV_CMD_DO_CHANGE_SPEED, 1, -1.0) == mavlink.MAV_RESULT_FAILED
     pilot.go_to(40.0, 0.0, 10.0)
     pilot.fly_on(4.0)
-    assert vehicle.body.vn > 5.0, "the first position starts the position controller, with the parameter's speed"
+    assert vehicle.body.vn > 5.0, "a started position controller uses the speed parameter"
     assert pilot.command(mavlink.MAV_CMD_DO_CHANGE_SPEED, 1, 2.0) == mavlink.MAV_RESULT_ACCEPTED
     pilot.fly_on(5.0)
     assert vehicle.body.vn == pytest.approx(2.0, abs=0.2)
@@ -256,7 +256,7 @@ def test_changed_speed_is_kept_until_controller_changes():
     pilot.fly_on(3.0)
     pilot.go_to(-60.0, 0.0, 10.0)
     pilot.fly_on(4.0)
-    assert vehicle.body.vn < -5.0, "a velocity target in between resets the speed"
+    assert vehicle.body.vn < -5.0, "an intermediate velocity target resets the speed"
 
 
 def _at_speed(speed_mps: float, **parameters: float) -> tuple[VehicleState, Pilot]:

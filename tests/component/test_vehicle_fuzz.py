@@ -74,7 +74,7 @@ def test_random_valid_frames_do_not_break_vehicle(seed: int):
 
 
 def _restart(vehicle: VehicleState, pilot: Pilot, rng: random.Random) -> None:
-    """Bring the vehicle back into the air in a random mode, so that every mode is fuzzed."""
+    """Put the vehicle back into the air in a random mode. All modes are tested in this way."""
     if not vehicle.armed:
         pilot.craft.vehicle.arm()
     pilot.craft.vehicle.modes.force(rng.choice(sorted(SUPPORTED_MODES)))

@@ -38,7 +38,7 @@ def test_gimbal_turns_at_its_rate_and_reports_attitude() -> None:
         return attitude.pitch_deg < -89.0 and vehicle.gimbal.yaw_deg == 120.0
 
     pilot.wait(turned, 5.0)
-    assert 1.7 < vehicle.time_s - begun_s < 2.5, "120 degrees at 60 a second"
+    assert 1.7 < vehicle.time_s - begun_s < 2.5, "a turn by 120 degrees takes 2 s at 60 degrees per second"
     assert any(-60 < angle < -30 for angle in angles), "the gimbal passes intermediate angles"
 
 

@@ -1,4 +1,4 @@
-"""Digests of all messages sent in recorded flights. Refactoring must not change a message.
+"""Digests of all messages that the simulated vehicle sends in given flights. Refactoring must not change them.
 
 After an intended change of behaviour, `python tests/component/test_vehicle_golden.py` prints the new digests.
 """

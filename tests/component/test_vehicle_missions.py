@@ -189,7 +189,7 @@ def test_jump_tag_selects_tagged_item():
         order.append(at)
     assert order == [1, 2, 3, 2, 3]  # a jump to a missing tag ends the mission
     assert pilot.command(mavlink.MAV_CMD_DO_JUMP_TAG, 7.0) == mavlink.MAV_RESULT_ACCEPTED
-    assert mission.current == 3, "the first navigation item after the tag"
+    assert mission.current == 3, "the current item is the first navigation item after the tag"
     assert pilot.command(mavlink.MAV_CMD_DO_JUMP_TAG, 9.0) == mavlink.MAV_RESULT_FAILED
 
 
@@ -201,7 +201,7 @@ def test_jump_loop_without_waypoint_terminates(times, following):
     points = [_waypoint(north, 0.0, 10.0) for north in (1.0, 2.0)]
     assert upload(pilot, 0, [HOME, points[0], tag, jump, points[1]]) == mavlink.MAV_MISSION_ACCEPTED
     assert vehicle.mission.peek_after(1) == following
-    assert vehicle.mission.peek_after(1) == following, "the repetition counter has not changed"
+    assert vehicle.mission.peek_after(1) == following, "peeking does not change the repetition counter"
 
 
 def test_upload_of_too_many_items_is_refused():

@@ -1,4 +1,4 @@
-"""Real-time loop of the vehicle: number of wake-ups, and response times that do not depend on them."""
+"""Real-time loop of the vehicle: few wake-ups, and short response times despite few wake-ups."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Clock:
 
 
 class Line(Hub):
-    """Fake link whose far end sends bytes at given times and records the arrival time of messages."""
+    """Fake link. The remote end sends bytes at given times, and records when messages arrive."""
 
     def __init__(self, clock: Clock, craft: Craft, letters: dict[float, bytes]) -> None:
         super().__init__()
@@ -47,7 +47,7 @@ class Line(Hub):
         self.flushes: list[float] = []
 
     def wait(self, timeout_s: float) -> bool:
-        """Round down to whole milliseconds, like the real hub."""
+        """Wait for data. The timeout is rounded down to whole milliseconds, as in Hub."""
         end_s = self.clock.now_s + math.floor(max(timeout_s, 0.0) * 1e3) / 1e3
         first_s = min(self.letters, default=math.inf)
         self.clock.wakes += 1

@@ -149,7 +149,7 @@ def test_reposition_requires_position_and_ignores_yaw():
         assert pilot.command_int(mavlink.MAV_CMD_DO_REPOSITION, target | bad) == mavlink.MAV_RESULT_DENIED
     assert pilot.command_int(mavlink.MAV_CMD_DO_REPOSITION, target | {"param4": 180.0}) == mavlink.MAV_RESULT_ACCEPTED
     pilot.fly_on(5.0)
-    assert vehicle.est.yaw == pytest.approx(math.pi / 2, abs=0.2), "along the direction of flight"
+    assert vehicle.est.yaw == pytest.approx(math.pi / 2, abs=0.2), "the heading follows the direction of flight"
 
 
 def test_velocity_target_is_accepted_in_any_frame_if_position_is_ignored():
@@ -225,7 +225,7 @@ def test_current_mission_item_is_a_nav_command():
     )
     assert pilot.command(mavlink.MAV_CMD_DO_SET_MISSION_CURRENT, 5) == mavlink.MAV_RESULT_DENIED
     pilot.send("MISSION_SET_CURRENT", TARGET | {"seq": 2})
-    assert pilot.expect("MISSION_CURRENT").integer("seq") == 2, "the response has the requested number"
+    assert pilot.expect("MISSION_CURRENT").integer("seq") == 2, "the requested number is reported"
 
 
 def test_mission_in_flight_is_not_cleared():

@@ -112,7 +112,7 @@ def test_segment_gap_matches_sampling():
 
 
 def _detour(**parameters: float) -> tuple[VehicleState, Pilot, list[Point]]:
-    """Fly north, then east, so that the direct return would cut the corner."""
+    """Fly north, then east. The recorded path then differs from the direct way home."""
     vehicle, pilot = airborne(10.0, **parameters)
     flown: list[Point] = []
     for north, east, altitude in ((60.0, 0.0, 10.0), (60.0, 60.0, 14.0)):

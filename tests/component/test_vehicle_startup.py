@@ -58,7 +58,7 @@ def test_cold_start_sends_statustexts_of_real_vehicle():
     _, pilot = _cold()
     pilot.fly_on(42.0)
     assert [text for text in pilot.texts if not text.startswith("PreArm: ")] == TEXTS.splitlines()
-    assert pilot.texts.count("PreArm: AHRS: waiting for home") == 1, "every 30 s, from the 15th on"
+    assert pilot.texts.count("PreArm: AHRS: waiting for home") == 1, "the text is repeated every 30 s, first after 15 s"
 
 
 def test_warm_start_sends_same_statustexts():

@@ -1,4 +1,4 @@
-"""Data that the vehicle stores: parameters on disk, and plans and keys across a reboot."""
+"""Data that the vehicle stores: parameters on disk, and missions, fences and signing keys across a reboot."""
 
 from __future__ import annotations
 
@@ -127,6 +127,6 @@ def test_signing_rejects_clients_without_key():
     assert not answers(station(hashlib.sha256(b"other").digest(), 9_000))
     mine = station(key, 9_000)
     assert answers(mine)
-    assert not answers(station(key, 8_000)), "a replayed time must not pass"
+    assert not answers(station(key, 8_000)), "a message with an earlier timestamp is rejected as a replay"
     assert answers(mine)
     assert pilot.craft.vehicle.signing_key == key

@@ -186,7 +186,7 @@ async def test_reconnected_page_receives_only_missed_events() -> None:
         _, missed = parse_event(await anext(stream))
     assert [event["time_ms"] for event in missed] == [2_000, 3_000]
     _, events = await first(hub, "0123abcd-1")
-    assert events[0] == {"type": "reset"}, "the id is of another server, so the page starts again"
+    assert events[0] == {"type": "reset"}, "the event id belongs to another server, so the page must reset"
 
 
 async def test_slow_page_receives_current_state_instead_of_missed_events() -> None:

@@ -25,7 +25,7 @@ RALLY = 2
 class RecordingPilot(Pilot):
     """A pilot that hashes the messages it receives.
 
-    Floats are rounded, because C libraries differ in the last bit of a sine.
+    Floats are rounded before, because the last bit of a sine depends on the C library.
     """
 
     def __init__(self, simulation: Simulation) -> None:
@@ -50,7 +50,7 @@ def _hashed(value: Value, length: int) -> Value:
 
 
 def pilot_of(seed: int, **parameters: float) -> RecordingPilot:
-    """Return a pilot that receives every stream at 10 Hz."""
+    """Return a pilot that receives every stream of a new vehicle at 10 Hz."""
     pilot = RecordingPilot(Simulation([replace(CONFIG, seed=seed, parameters=parameters)]))
     pilot.send("REQUEST_DATA_STREAM", TARGET | {"req_stream_id": 0, "req_message_rate": 10, "start_stop": 1})
     for number in (31, 83, 85, 87, 141, 245):  # messages that belong to no stream
@@ -132,13 +132,13 @@ def smart_return(pilot: Pilot) -> None:
 
 
 def breaches(pilot: Pilot) -> None:
-    """Fence breach by a velocity, a target outside the fence, return to a rally point, and position loss."""
+    """Target outside the fence, fence breach by a velocity, return to a rally point, and position loss."""
     corners = ((-40.0, -40.0), (-40.0, 40.0), (40.0, 40.0), (40.0, -40.0))
     upload(pilot, FENCE, [_item(5001, north, east, 0.0, 4.0) for north, east in corners])
     upload(pilot, RALLY, [_item(mavlink.MAV_CMD_NAV_RALLY_POINT, 12.0, -6.0, 8.0)])
     pilot.parameter("FENCE_ENABLE", 1.0)
     pilot.take_off(10.0)
-    pilot.go_to(60.0, 0.0, 10.0)  # outside: not flown
+    pilot.go_to(60.0, 0.0, 10.0)  # the vehicle ignores a target outside its fence
     pilot.fly_on(3.0)
     for _ in range(6):
         pilot.send(

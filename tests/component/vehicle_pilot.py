@@ -1,4 +1,4 @@
-"""Ground station in the same process that flies a vehicle in lockstep, for tests and benchmarks."""
+"""Ground station for tests and benchmarks. It flies a simulated vehicle in the same process, in lockstep."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class PilotTimeoutError(TimeoutError):
 
 
 class Pilot:
-    """One link to one vehicle. Each wait advances the whole simulation."""
+    """Ground station with a link to one vehicle. Each wait advances the simulation of all vehicles."""
 
     def __init__(
         self, simulation: Simulation, craft: Craft, sysid: int = 255, compid: int = mavlink.MAV_COMP_ID_MISSIONPLANNER
@@ -46,7 +46,7 @@ class Pilot:
         return messages
 
     def step(self) -> list[Message]:
-        """Advance by one control step and receive. Send a heartbeat once a second."""
+        """Advance by one control step, and return the received messages. Send a heartbeat once a second."""
         if self.heartbeats and self.simulation.time_s >= self._next_heartbeat_s:
             self._next_heartbeat_s = self.simulation.time_s + HEARTBEAT_INTERVAL_S
             self.send(
@@ -70,7 +70,7 @@ class Pilot:
         return self.simulation.time_s - begun
 
     def fly_on(self, duration_s: float) -> None:
-        """Advance by a duration."""
+        """Advance the simulation by a duration."""
         end = self.simulation.time_s + duration_s
         while self.simulation.time_s < end:
             self.step()

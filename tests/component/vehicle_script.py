@@ -2,9 +2,11 @@
 
     python tests/component/vehicle_script.py [--autopilot tcp:HOST:PORT] [--all] [--steps FILE]
 
-The steps are in `tests/golden/vehicle/arducopter-4.6.3.tsv`: name, action, recorded response, and a note if the simulated
-vehicle differs intentionally or the step cannot be repeated. The tolerance of a number `4.2~10%` is 10 %, of `4.2~0.5` it is
-0.5. Without --autopilot the script is played on the simulated vehicle after a cold start, in simulated time.
+Each row of `tests/golden/vehicle/arducopter-4.6.3.tsv` is a step: name, action, recorded response and note. A note
+explains an intended difference of the simulated vehicle, or why a step cannot be repeated. Numbers in responses may have
+a tolerance: `4.2~10%` accepts a deviation of 10 %, and `4.2~0.5` a deviation of 0.5.
+
+Without --autopilot, the script is played on the simulated vehicle after a cold start, in simulated time.
 """
 
 from __future__ import annotations
@@ -31,7 +33,7 @@ HOME = Place.from_degrees(50.864, 4.679, 0.1)
 """Position of the recorded vehicle."""
 
 ELSEWHERE_M = 5_000.0
-"""Distance from the recorded position that no step reaches."""
+"""A vehicle at least this far from the recorded position, in metres, has another home."""
 TARGET: dict[str, Value] = {"target_system": 1, "target_component": 1}
 GUIDED = 4
 RTL = 6
@@ -42,7 +44,7 @@ BODY_FRAMES = (8, 9)
 TEXTS_S = 0.6
 # STATUSTEXTs that an autopilot sends without a request.
 SPONTANEOUS = ("EKF3", "GPS 1", "AHRS", "Field", "Barometer", "Calibrating", "RC7", "ArduPilot", "SIM ", "PreArm")
-# Lists to upload: command, frame, metres north and east (or None, or degrees), altitude, first parameters.
+# Item of a list to upload: command, frame, metres north (or None) and east, or degrees, altitude, first parameters.
 Row = tuple[int, int, float | None, float, float, tuple[float, ...]]
 _HOME_ROW: Row = (16, 0, 0.0, 0.0, 0.0, ())
 _TAKEOFF: Row = (22, 3, None, 0.0, 12.0, ())
@@ -223,12 +225,12 @@ class Player:
         return messages
 
     def _set_home(self, position: Place) -> None:
-        """Convert to an offset from the vehicle, if it is not at the recorded position."""
+        """Use the vehicle's position as home, unless the vehicle is near the recorded position."""
         if position.lat_e7 and math.hypot(*self.home.vector_to(position)[:2]) > ELSEWHERE_M:
             self.home = position
 
     def _datum_m(self, frame: int) -> float:
-        """Return the height of home above the zero level of a frame. Two frames refer to mean sea level."""
+        """Return the altitude of home in a frame: above mean sea level in frames 0 and 5, and 0 in all other frames."""
         at = self.last["GLOBAL_POSITION_INT"]
         return (at.integer("alt") - at.integer("relative_alt")) / 1000.0 if frame in {0, 5} else 0.0
 
@@ -459,7 +461,10 @@ class Player:
         return f"{mission_result(ack.integer('type'))} mt={ack.integer('mission_type')}"
 
     def do_stored(self, kind_name: str, bad: str = "") -> str:
-        """Return the number of stored items, after a failed upload only if the step names one."""
+        """Return the number of stored items.
+
+        If `bad` is set, upload a valid list and then the invalid list `bad` before.
+        """
         if bad:
             self.do_upload(kind_name, "good")
             self.do_upload(kind_name, bad)
@@ -498,7 +503,7 @@ class Player:
         return math.hypot(at.integer("vx"), at.integer("vy")) / 100.0, at.integer("lat") / 1e7
 
     def do_goto(self, frame: str, north: str, east: str, up: str) -> str:
-        """Send a position target at an offset. Return the distance flown and the highest speed within 6 s."""
+        """Send a position target relative to the vehicle. Return distance and highest speed of the first 6 s."""
         before = len(self.texts)
         (n0, e0, u0) = self._position()
         place = self.home.offset(n0 + float(north), e0 + float(east))

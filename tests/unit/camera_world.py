@@ -1,4 +1,4 @@
-"""Camera service for tests with a scripted drone, camera and face detector."""
+"""Camera service with a fake drone, camera and face detector, for tests."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def private(action: str = "refuse", name: str = "p", **fields: Any) -> dict[str,
 
 
 class Drone:
-    """Pose provider with a pose set by the test. It records each situation that it returned."""
+    """Fake pose provider. A test sets the pose. All returned situations are recorded."""
 
     def __init__(self) -> None:
         self.x = 0.0
@@ -59,7 +59,7 @@ class Drone:
 
 
 class Scene:
-    """Camera that returns noise and calls a function of the test during the exposure."""
+    """Fake camera. It returns noise, and calls the function `during` of the test during the exposure."""
 
     def __init__(self) -> None:
         self.latency_s = 0.0
@@ -153,5 +153,5 @@ async def refusal(work: Any) -> str:
 
 
 def grain(picture: Pixels) -> float:
-    """Return the mean difference of neighbouring pixels."""
+    """Return the mean difference of adjacent pixels. It is small in blurred pictures."""
     return float(np.abs(np.diff(picture.astype(float), axis=1)).mean())

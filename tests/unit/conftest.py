@@ -1,4 +1,4 @@
-"""Unit tests start no process and open no connection. Tests that do are component tests."""
+"""Check that unit tests start no process and open no connection. Such tests belong to tests/component."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from collections.abc import Iterator
 import pytest
 
 EXTERNAL = {"subprocess.Popen", "os.fork", "os.posix_spawn", "socket.bind", "socket.connect"}
-"""Audit events of Python for processes and connections."""
+"""Python audit events that show a new process or a connection."""
 external_events: list[str] = []
 
 
 def _record_external_event(event: str, args: tuple[object, ...]) -> None:
-    # A thread of an earlier component test in this process may still be running.
+    # Ignore other threads, because threads of earlier component tests may still run in this process.
     if event in EXTERNAL and threading.current_thread() is threading.main_thread():
         external_events.append(f"{event}{args[:2]}")
 

@@ -1,4 +1,4 @@
-"""The operator's signature for tests of what checks it."""
+"""Signed Grants for tests of code that verifies signatures."""
 
 from __future__ import annotations
 
@@ -15,5 +15,8 @@ _SIGNER = GrantSigner(AUTHORITY, lambda: datetime.now(UTC))
 
 
 def signed(manifest: dict[str, Any], before: dict[str, Any] | None = None) -> dict[str, Any]:
-    """The grant, signed later than all before."""
+    """Return a Grant manifest with a signature of the operator.
+
+    Each signature has a later time than all earlier signatures of the process.
+    """
     return _SIGNER.sign(manifest, Grant.from_body(before) if before is not None else None)

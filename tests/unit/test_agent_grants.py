@@ -108,7 +108,7 @@ def test_grants_missing_from_the_list_are_removed(synchronizer: GrantSynchronize
     synchronizer.apply(grant_list(manifest("g1"), manifest("g2")))
     assert on_disk(tmp_path) == {"g1.json", "g2.json"}
     synchronizer.apply(GrantList(1, None, {}, 0))
-    assert on_disk(tmp_path) == {"g1.json", "g2.json"}, "only the reports have changed"
+    assert on_disk(tmp_path) == {"g1.json", "g2.json"}, "a list with changed reports only does not remove files"
     synchronizer.apply(grant_list(manifest("g2"), manifest("g3")))
     assert on_disk(tmp_path) == {"g2.json", "g3.json"}
 
@@ -272,7 +272,9 @@ def test_outdated_grant_is_removed_if_its_change_cannot_be_stored(
     with monkeypatch.context() as patch:
         patch.setattr("fractus_agent.grant_synchronizer.write_file", full)
         synchronizer.apply(grant_list(annotated))
-        assert (tmp_path / "g1.json").read_bytes() == stored, "its spec has not changed"
+        assert (tmp_path / "g1.json").read_bytes() == stored, (
+            "the stored file stays, because only annotations have changed"
+        )
         synchronizer.apply(grant_list(narrower))
         assert on_disk(tmp_path) == set()
         assert synchronizer.counts()["unstored"] == 1
@@ -283,7 +285,10 @@ def test_outdated_grant_is_removed_if_its_change_cannot_be_stored(
 def test_unreadable_grant_file_is_kept_if_the_grant_is_unchanged(
     synchronizer: GrantSynchronizer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Run out of file descriptors. The agent could still remove files, but must not remove a valid Grant."""
+    """The agent has no file descriptors left, so it cannot read files.
+
+    It could still remove files, but must not remove a valid Grant.
+    """
 
     def unreadable(_path: Path) -> bytes:
         raise OSError(24, "Too many open files")
@@ -402,7 +407,7 @@ def test_stored_grant_is_removed_if_the_authority_of_its_replacement_stays_unkno
     verifying.apply(grant_list())
     verifier.error = None
     verifying.on_authority_changed()
-    assert on_disk(tmp_path) == set(), "a removed Grant does not come back"
+    assert on_disk(tmp_path) == set(), "a removed Grant is not stored again when its authority becomes known"
 
 
 async def test_stored_grant_survives_unknown_authority_and_agent_restart(
@@ -471,7 +476,7 @@ async def test_reported_final_phase_is_kept_for_unusable_grant(
 
 
 async def test_report_has_the_current_generation(synchronizer: GrantSynchronizer, store: FakeStore) -> None:
-    """Sign a Grant again, which changes its annotations but not its generation."""
+    """A new signature changes the annotations of a Grant, but not its generation."""
     synchronizer.apply(grant_list(manifest(), reported=[report("Active")]))
     resigned = manifest(metadata={"annotations": {"fractus.dev/signature": "again"}})
     synchronizer.apply(grant_list(resigned, generation=2, reported=[report("Active")]))
@@ -508,7 +513,9 @@ def test_serialized_grant_does_not_depend_on_status() -> None:
     stored = json.loads(serialize_grant(first))
     assert stored["metadata"]["uid"] == "u1"
     assert Grant.from_body(stored).spec == first.spec
-    assert "policies" not in stored["spec"], "unused fields are left out for services of an earlier release"
+    assert "policies" not in stored["spec"], (
+        "unused fields are omitted, because services of an earlier release may not know them"
+    )
 
 
 def test_backoff_doubles_to_its_cap_and_restarts_after_success() -> None:
@@ -535,7 +542,7 @@ class FakeClient:
 
 
 async def test_invalid_status_of_node_grants_does_not_block_grants() -> None:
-    """Use a status of a release with other phases."""
+    """The status comes from a release with other phases."""
     reports = [{"uid": "u1", "name": "g1", "phase": "Paused", "observedGeneration": 1}]
     body = {
         "apiVersion": "fractus.dev/v1alpha1",
@@ -548,5 +555,5 @@ async def test_invalid_status_of_node_grants_does_not_block_grants() -> None:
     assert reported.grants is not None
     assert [grant["metadata"]["name"] for grant in reported.grants] == ["g1"]
     assert (reported.generation, reported.reported, reported.reported_generation) == (3, {}, 0), (
-        "everything is reported again"
+        "all phases are reported again"
     )

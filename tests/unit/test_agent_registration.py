@@ -1,4 +1,4 @@
-"""Registration of a node: creation of its object, edits of the owner, and changed descriptions."""
+"""Registration of a node: creation of its object, changes by the owner, and changed description files."""
 
 import copy
 from pathlib import Path
@@ -31,7 +31,7 @@ MANIFEST: dict[str, Any] = {
 
 
 class FakeStore:
-    """Fake store with the object and labels of one node, and the metadata that an API server sets."""
+    """Fake store with the object and labels of one node. It sets metadata like an API server."""
 
     def __init__(self) -> None:
         self.object: dict[str, Any] | None = None
@@ -291,7 +291,9 @@ async def test_node_object_file_is_emptied_if_the_object_cannot_be_parsed_or_sto
         registration.on_status_written(body)
 
     write_status(2, services={"camera": {"mount": "above"}})
-    assert file.read_bytes() == b"", "an outdated or missing file would be used by the services"
+    assert file.read_bytes() == b"", (
+        "the file is empty, because services would use an outdated description, or their own if it were missing"
+    )
     assert object_file.condition is not None
     assert "cannot parse the object" in object_file.condition.message
     write_status(3)

@@ -1,4 +1,4 @@
-"""Status that the agent writes for its node, and the intervals of the writes."""
+"""Status that the agent writes to its node object, and intervals between the writes."""
 
 from datetime import UTC, datetime, timedelta
 from typing import Any
@@ -145,7 +145,7 @@ def test_flight_state_is_unknown_without_telemetry_and_position_is_kept(blind: d
         assert report_intervals("Drone", status) is FLIGHT_INTERVALS
         assert status["conditions"][0]["status"] == "False"
     assert "controller" not in node_status(observed(snapshot=None), status, 1, NOW), (
-        "the control authority is unknown too"
+        "without telemetry, the control authority is unknown, too"
     )
 
 
@@ -203,7 +203,7 @@ class FakeStore:
 
 
 class ReporterBench:
-    """Status reporter with a simulated clock and telemetry at 1 Hz."""
+    """Test bench of the status reporter, with a simulated clock and telemetry at 1 Hz."""
 
     def __init__(self) -> None:
         self.store = FakeStore()
@@ -232,7 +232,7 @@ async def test_reporter_waits_for_the_first_telemetry_after_start() -> None:
         bench.seconds += 1.0
         bench.observed = observed(snapshot=None)
         await bench.reporter.step()
-    assert not bench.store.writes, "a new agent writes no unknown flight state"
+    assert not bench.store.writes, "a new agent waits for telemetry before it writes an unknown flight state"
     await bench.second(telemetry())
     assert bench.store.writes[0]["flightState"] == "flying"
     silent = ReporterBench()
@@ -303,6 +303,8 @@ def test_audit_heads_are_reported_and_kept(kind: str, model: Any) -> None:
     heads = ["mobility:7:" + "a" * 64]
     first = node_status(observed(kind=kind, audit_heads=heads), {}, 1, NOW)
     assert model.model_validate(first).audit == tuple(heads)
-    assert node_status(observed(kind=kind), first, 1, NOW)["audit"] == heads, "the heads of missing logs stay"
+    assert node_status(observed(kind=kind), first, 1, NOW)["audit"] == heads, (
+        "the reported head of a log is kept if the log is missing"
+    )
     assert "audit" not in node_status(observed(kind=kind), {}, 1, NOW)
     assert due_s(first, first | {"audit": ["mobility:8:" + "b" * 64]}, 0.0, EDGE_INTERVALS) == EDGE_INTERVALS.idle_s

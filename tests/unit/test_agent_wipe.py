@@ -1,4 +1,4 @@
-"""Removal of the node's state at uninstallation."""
+"""Removal of the state of a node when Fractus is uninstalled."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def test_wipe_removes_all_except_the_directory_and_link_targets(state: Path) -> 
     assert main([str(state)]) == 0
     assert list(state.iterdir()) == []
     assert (state.parent / "other" / "kept").read_text() == "x"
-    assert main([str(state)]) == 0, "a repeated run after a container restart"
+    assert main([str(state)]) == 0, "a second run, for example after a container restart, succeeds"
 
 
 def test_wipe_reports_files_that_cannot_be_removed(
@@ -52,8 +52,8 @@ def test_wipe_reports_files_that_cannot_be_removed(
 
 @pytest.fixture
 def unprivileged(state: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Run without root privileges, as the pod does."""
-    monkeypatch.chdir(tmp_path)  # other users cannot access the path from the root
+    """Run the test without root privileges, like the wipe pod."""
+    monkeypatch.chdir(tmp_path)  # the test uses relative paths, because other users cannot access the absolute path
     (state / "tls").chmod(0o700)
     if os.geteuid() != 0:
         yield
@@ -71,7 +71,7 @@ def unprivileged(state: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 def test_wipe_reports_directories_that_cannot_be_read(
     state: Path, folder: str, unprivileged: None, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Use a directory of another user with mode 0700."""
+    """The directory is not readable, like a directory of another user with mode 0700."""
     (state.relative_to(Path.cwd()) / folder).chmod(0)
     try:
         assert main(["fractus"]) == 1
@@ -87,7 +87,7 @@ def test_wipe_reports_directories_that_cannot_be_read(
 def test_wipe_reports_remaining_directories_except_mount_points(
     state: Path, monkeypatch: pytest.MonkeyPatch, number: int, code: int
 ) -> None:
-    """Remove the data of a mounted disk. Its mount point cannot be removed."""
+    """The mount point of a disk cannot be removed (EBUSY), so only the data on the disk is removed."""
     rmdir = os.rmdir
 
     def refused(path: str, *, dir_fd: int | None = None) -> None:

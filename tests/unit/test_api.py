@@ -1,4 +1,4 @@
-"""API models of all kinds: accepted manifests, and error messages of refused ones."""
+"""API models of all kinds: accepted manifests, and error messages for refused manifests."""
 
 import math
 import pathlib
@@ -127,7 +127,10 @@ def star(east, spikes, radius_m=100):
 
 
 def test_regions_with_too_many_crossings_are_refused_before_union():
-    """The union of a few regions with the maximum number of spikes takes minutes and blocks other Applications."""
+    """A region may have so many spikes that the union of a few regions takes minutes.
+
+    Such a union would delay all other Applications.
+    """
 
     def flown(*regions):
         points = [{"navigation": "regionBased", "region": {"polygon": {"exterior": r}}} for r in regions]

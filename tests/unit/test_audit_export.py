@@ -1,4 +1,4 @@
-"""`fractus audit` show, export and verify. Independent readers parse each exported format."""
+"""Commands `fractus audit show`, `export` and `verify`. Independent readers check each exported format."""
 
 from __future__ import annotations
 
@@ -268,7 +268,9 @@ def test_mcap_has_no_topics_of_entries_before_the_window(log: Path, tmp_path: Pa
     assert summary is not None and topics
     assert {channel.topic for channel in summary.channels.values()} == topics
     assert {schema.name for schema in summary.schemas.values()} <= {"foxglove.LocationFix", "fractus.State"}
-    assert all(topic.startswith("/drone-1/") for topic in topics), "the node name is that of an entry before the window"
+    assert all(topic.startswith("/drone-1/") for topic in topics), (
+        "the topics contain the node name, although its entry is before the window"
+    )
 
 
 def test_mcap_is_written_to_a_pipe(log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

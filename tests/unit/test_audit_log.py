@@ -133,7 +133,7 @@ async def test_audit_log_keeps_entries_until_a_full_disk_has_space(tmp_path: Pat
     folder = tmp_path / "log"
     path = folder / "audit.jsonl"
     log = AuditLog(path, lambda: 0.0)
-    shutil.rmtree(folder)  # every write fails now
+    shutil.rmtree(folder)  # all writes fail after the removal of the directory
     log.append("call", {"n": 0})
     await until(lambda: log.failure)
     assert "cannot be written" in log.failure

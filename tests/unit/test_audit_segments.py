@@ -22,7 +22,7 @@ from test_audit_log import AUTHORITY, EPOCH, read, until, written
 
 
 async def filled(path: Path, count: int, **bounds: Any) -> None:
-    """Write entries one at a time, so that segments are closed as often as possible."""
+    """Write entries one by one. The log can then close its segment after each entry."""
     log = AuditLog(path, lambda: 0.0, **bounds)
     for n in range(count):
         log.append("call", {"n": n})
@@ -72,7 +72,7 @@ def node_files(directory: Path, authority: Authority) -> Path:
 
 
 async def checkpoint(path: Path, count: int, tls: Path, **bounds: int) -> Path:
-    """Return a copy of the last checkpoint of a log, to which entries are then added."""
+    """Write entries to a log. Return a copy of the last checkpoint."""
     await filled(path, count, tls=tls, **bounds)
     checkpoint_file = path.parent.parent / f"kept-{len(list(path.parent.parent.iterdir()))}"
     checkpoint_file.write_bytes(path.with_suffix(".checkpoint").read_bytes())
@@ -116,7 +116,7 @@ async def test_checkpoint_detects_a_forged_record_of_pruning(tmp_path: Path, tls
     for segment in pruned:
         segment.unlink()
     assert verified(path)[0] == 1
-    assert verified(path, "--since", checkpoint_file)[0] == 0, "the entries since the checkpoint exist"
+    assert verified(path, "--since", checkpoint_file)[0] == 0, "all entries since the checkpoint still exist"
     for segment in segments(path):
         segment.unlink()
     code, output = verified(path.parent, "--since", checkpoint_file)

@@ -21,7 +21,7 @@ from google.rpc import error_details_pb2, status_pb2
 
 
 class Aborted(Exception):
-    """Raised by the fake context instead of ending the call."""
+    """Raised by the fake gRPC context when the service aborts the call."""
 
     def __init__(self, code: grpc.StatusCode, text: str, details: status_pb2.Status) -> None:
         super().__init__(f"{code.name}: {text}")
@@ -38,7 +38,7 @@ class Aborted(Exception):
 
 
 class Context:
-    """Fake call of one caller."""
+    """Fake gRPC context of one call."""
 
     def __init__(self, remaining_s: float | None = 5.0) -> None:
         self.remaining_s = remaining_s

@@ -1,4 +1,4 @@
-"""Poses of a drone's camera during an exposure, from telemetry. Motion between two messages is included."""
+"""Camera poses during an exposure, derived from telemetry. They include the motion between two messages."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from hypothesis import strategies as st
 from policy_world import FRAME, HOME
 
 NOW_S = 1_800_000_000.0
-"""Unix time at the zero of the tests' monotonic clock."""
+"""Unix time at which the monotonic clock of the tests is 0."""
 LENS = Lens(40.0, 30.0, pitch_deg=-60.0, error_deg=0.0)
 
 
 class Drone:
-    """Fake subscription to telemetry with a clock and messages set by the test."""
+    """Fake telemetry subscription. A test sets the clock and sends the messages."""
 
     def __init__(self) -> None:
         self.now_s = 100.0
@@ -79,7 +79,8 @@ def test_pose_history_returns_poses_since_begin_and_previous_one(drone: Drone) -
         drone.send(100.0 + i / 10, turned=(0.0, 0.0, 10.0 * i))
     poses = drone.poses_since(100.45)
     assert [attitude(now).yaw_deg for now in poses] == [40, 50, 60, 70, 80, 90]
-    # Half the difference to the adjacent poses, plus the largest turn of an airframe in 0.05 s.
+    # The error contains half of the yaw difference to adjacent poses, and the maximum rotation of an airframe in 0.05
+    # s.
     assert attitude(poses[1]).yaw_error_deg == pytest.approx(pose_history.YAW_ERROR_DEG + 5.0 + 0.05 * 60.0)
     assert attitude(poses[1]).tilt_error_deg == pytest.approx(pose_history.TILT_ERROR_DEG + 0.05 * 60.0)
     assert drone.poses.situation(1.0).attitude is not None
@@ -144,7 +145,10 @@ def test_pose_is_unknown_when_telemetry_is_missing(drone: Drone) -> None:
 def test_footprint_contains_view_between_two_messages(
     gaps: list[float], rates: tuple[float, ...], speed: tuple[float, float], ages: tuple[float, float], share: float
 ) -> None:
-    """The drone flies and turns steadily. Telemetry arrives at uneven times, and each measurement has its own age."""
+    """The drone flies and rotates at constant rates.
+
+    Telemetry arrives at irregular intervals, and each measurement has a different age.
+    """
     drone = Drone()
 
     def turned(at_s: float) -> tuple[float, float, float]:
@@ -175,7 +179,7 @@ def test_footprint_contains_view_between_two_messages(
 
 
 def send_gimbal(poses: PoseHistory, at_s: float, turned: tuple[float, float, float] | None, age_s: float = 0.0) -> None:
-    """Send telemetry of a level airframe with a gimbal that turns the camera."""
+    """Send telemetry of a level airframe, and of a gimbal with the given attitude or no attitude."""
     message = mobility_pb2.Telemetry(autopilot_connected=True, position_error_m=1.0, position_age_s=0.0)
     message.position.latitude_deg, message.position.longitude_deg = FRAME.latlon(0.0, 0.0)
     message.position.altitude_m = 40.0
@@ -195,7 +199,9 @@ def test_pose_is_unknown_when_telemetry_is_from_the_future(drone: Drone) -> None
     drone.send(0.1, late_s=-1.0)
     assert all(pose.lat is None and pose.attitude is None for pose in drone.poses_since(0.05))
     drone.send(0.2, late_s=-0.01)
-    assert drone.poses.situation(1.0).lat is not None, "a rounding error of the time is accepted"
+    assert drone.poses.situation(1.0).lat is not None, (
+        "a time in the future is accepted if the difference is a rounding error"
+    )
 
 
 def test_arrival_clock_ignores_step_back_for_a_while() -> None:
@@ -226,7 +232,10 @@ FORWARD = Lens(40.0, 30.0, pitch_deg=0.0, error_deg=0.0)
 def test_footprint_contains_view_of_moving_gimbal(
     gaps: list[float], rates: tuple[float, float], begun: tuple[float, float], age_s: float, share: float
 ) -> None:
-    """The gimbal turns steadily, also around straight down, where only the sum of roll and yaw is meaningful."""
+    """The gimbal rotates at constant rates, also through straight down.
+
+    In that direction, only the sum of roll and yaw is meaningful.
+    """
 
     def turned(at_s: float) -> tuple[float, float, float]:
         return 0.0, begun[0] + rates[0] * (at_s - 100.0), (begun[1] + rates[1] * (at_s - 100.0)) % 360.0
@@ -264,7 +273,7 @@ def test_footprint_is_unbounded_when_gimbal_attitude_is_unknown() -> None:
     for now in situations:
         view = footprint(now, FRAME)
         assert view is None or math.isinf(view.farthest_m), (
-            "the attitude of the airframe must not replace that of the gimbal"
+            "the attitude of the airframe must not be used instead of an unknown gimbal attitude"
         )
     assert [now.attitude is None for now in situations] == [True, True, False]
 

@@ -1,4 +1,4 @@
-"""Chaos runs: repeatable schedules of faults, invariants that detect violations, and faults that repair themselves."""
+"""Chaos runs: repeatable fault schedules, detection of violated invariants, and repair at the end of each fault."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ BEGAN_S = 1_800_000_000.0
 
 
 def grant(application: str = "one", **more: Any) -> GrantSpec:
-    """Return the Grant of a Navigator for the area within 200 m of home and up to 50 m above it."""
+    """Return the Grant of a Navigator. Its area has a radius of 200 m around home, and its maximum altitude is 50 m."""
     area = [{"circle": {"center": {"lat": HOME.lat, "lon": HOME.lon}, "radius": 200}}]
     return GrantSpec.model_validate(
         {
@@ -227,7 +227,10 @@ def test_drained_node_is_uncordoned_after_a_rejected_request(monkeypatch: pytest
     refusals = 1
 
     def kubectl(command: str, *arguments: str, **_: object) -> str:
-        """Behave like kubectl: a rejected uncordon exits with 0, a rejected patch does not."""
+        """Fake kubectl.
+
+        Like the real one, it exits with 0 after a rejected uncordon, but not after a rejected patch.
+        """
         nonlocal cordoned, refusals
         if command == "drain":
             cordoned = True

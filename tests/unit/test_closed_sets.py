@@ -1,4 +1,4 @@
-"""Closed sets: a new member fails a test wherever it must be handled."""
+"""Closed sets: if a member is added, a test fails for each place that does not handle it."""
 
 from __future__ import annotations
 

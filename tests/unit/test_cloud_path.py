@@ -1,4 +1,4 @@
-"""Cloud path: reachability and performance, without a network or a clock."""
+"""Cloud path: reachability and performance, tested with a fake network and simulated time."""
 
 from __future__ import annotations
 
@@ -11,7 +11,10 @@ from fractus_core.api.nodes import Drone
 
 
 def monitor(*responses_s: float, requests_s: range) -> ReachabilityMonitor:
-    """Return a monitor with one request per second, and an immediate response in the given seconds."""
+    """Return a monitor after one request per second.
+
+    Requests in the seconds `responses_s` get an immediate response.
+    """
     path = ReachabilityMonitor()
     for now_s in requests_s:
         path.on_request(now_s)
@@ -21,7 +24,7 @@ def monitor(*responses_s: float, requests_s: range) -> ReachabilityMonitor:
 
 
 def test_path_without_responses_becomes_unreachable() -> None:
-    assert ReachabilityMonitor().is_reachable(0.0), "before the first request"
+    assert ReachabilityMonitor().is_reachable(0.0), "the path counts as reachable before the first request"
     path = monitor(0, requests_s=range(3))
     assert path.is_reachable(SILENT_S + 0.9)
     assert not path.is_reachable(SILENT_S + 1.0)
@@ -80,7 +83,7 @@ def test_latency_is_the_default_of_the_technology_until_measured(monkeypatch: py
         measured = path.metrics()
         assert measured is not None
         assert (measured.ingress_mbps, measured.egress_mbps) == (5.0, 5.0)
-        assert measured.ingress_latency_ms > 4.0, "half of the 10 ms round trip"
+        assert measured.ingress_latency_ms > 4.0, "the latency is half of the round-trip time of 10 ms"
         monkeypatch.setattr(cloud_path, "SILENT_S", 0.0)
         assert path.metrics() is None
         running.cancel()

@@ -1,4 +1,4 @@
-"""Address blocks of clusters are free and disjoint. A node keeps its index."""
+"""Address blocks of clusters are unused and disjoint, and each node keeps its index."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def test_chosen_block_overlaps_no_used_network(taken: list[IPv4Network]) -> None
     block = choose_block(taken)
     first = int(block.network_address)
     last = int(block.broadcast_address)
-    for network in taken:  # the code under test uses `overlaps`, so the oracle does not
+    for network in taken:  # compares addresses, because `overlaps` is used by the code under test
         assert last < int(network.network_address) or int(network.broadcast_address) < first
 
 

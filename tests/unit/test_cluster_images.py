@@ -30,7 +30,7 @@ def layout(tmp_path: Path) -> Layout:
 
 
 def archive_of(layout: Layout, without: set[str]) -> tarfile.TarFile:
-    """Return the archive of the layout's image, open for reading."""
+    """Return an opened archive of the image, without the given layers."""
     out = io.BytesIO()
     layout.write_archive([layout.image(NAME)], without=without, out=out)
     out.seek(0)
@@ -107,7 +107,10 @@ def test_release_builds_on_a_base_digest_that_its_images_name() -> None:
 
 
 def test_actions_of_workflows_with_write_permission_are_pinned_to_commits() -> None:
-    """An attacker who moves the tag of an action could otherwise sign and push as the release workflow."""
+    """Without a pinned commit, an attacker could move the tag of an action.
+
+    The code of the attacker could then sign and push images with the permissions of the release workflow.
+    """
     for path in (ROOT / ".github/workflows").iterdir():
         workflow = yaml.safe_load(path.read_text())
         for job in workflow["jobs"].values():

@@ -1,4 +1,4 @@
-"""Planned redirector in the background: use of the link, cuts on lost paths, and errors."""
+"""Draining of connections before traffic changes its path: use of the link, closed connections, and errors."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ LOADER, ASKER, DIRECT = (Endpoint(IPv4Address(address), 80) for address in ("10.
 
 
 class FakeRedirector:
-    """Redirector whose old connections are busy until `idle` is set."""
+    """Fake redirector. Its old connections carry traffic until `idle` is set."""
 
     def __init__(self) -> None:
         self.redirects: dict[Endpoint, Endpoint] = {}
@@ -46,8 +46,8 @@ async def test_link_is_in_use_until_its_connections_are_drained() -> None:
     ended = asyncio.Event()
     drain = ConnectionDrain(cast(Redirector, redirector), ended.set)
     await drain.begin({LOADER: DIRECT})
-    assert redirector.redirects == {LOADER: DIRECT}, "new connections use the link at once"
-    assert not drain.on_link, "the drained connections are on the cloud path"
+    assert redirector.redirects == {LOADER: DIRECT}, "new connections use the link immediately"
+    assert not drain.on_link, "the connections that are drained still use the cloud path"
     await drain.begin({LOADER: None})
     assert drain.on_link
     redirector.idle.set()
@@ -87,7 +87,7 @@ async def test_switch_refused_by_the_kernel_is_reported(refuses: str, caplog: py
 
 
 class FakeKernel:
-    """Fake of maps, conntrack and sockets that records the deleted service numbers."""
+    """Fake kernel interface with BPF maps, conntrack and sockets. It records the deleted service numbers."""
 
     def __init__(self) -> None:
         self.deleted: list[int] = []

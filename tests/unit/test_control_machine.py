@@ -68,13 +68,13 @@ EVENTS: tuple[events.Event, ...] = (
     events.SystemTaskEnded(0, finished=False), events.PassengerBoarded("t", "T"), events.Tick(),
 )  # fmt: skip
 LATE_S = 60.0
-"""Time at which every deadline has expired, in seconds."""
+"""Time after the expiry of all deadlines, in seconds."""
 
 FOUND_ON_GROUND = transition(ControlState(vehicle=GROUND), events.VehicleFound(), 0.0)[0]
 
 
 def normalized(state: ControlState, now: float) -> ControlState:
-    """Normalize times, task ids and counters of a state, so that states without other differences are equal."""
+    """Return a state with normalized times, task ids and counters. Equivalent states become equal."""
     grace = state.grace
     motion = state.motion
     task = state.task
@@ -97,7 +97,7 @@ def key_of(state: ControlState) -> tuple[Any, ...]:
 
 
 def after(state: ControlState, event: events.Event) -> tuple[ControlState, tuple[Action, ...], ControlState]:
-    """Apply an event, check the transition, and return the new state, the actions and the normalized state."""
+    """Apply an event and check the transition. Return the new state, the actions and the normalized state."""
     now = LATE_S if isinstance(event, events.Tick) else 0.0
     after_state, actions = transition(state, event, now)
     check(state, event, after_state, actions)
@@ -108,7 +108,7 @@ def after(state: ControlState, event: events.Event) -> tuple[ControlState, tuple
 
 
 class TransitionText(tuple[Any, ...]):
-    """Description of a transition. It is formatted only if an assertion fails."""
+    """Text that describes a transition. It is formatted only if an assertion fails, to save time."""
 
     __slots__ = ()
 
@@ -183,7 +183,7 @@ def check_notifications(
     actions: tuple[Action, ...],
     transition_text: TransitionText,
 ) -> None:
-    """Check that streams and motions are notified of their end."""
+    """Check that each ended stream was notified and each ended motion was stopped."""
     lease = before.lease
     motion = before.motion
     if lease is not None and (now.lease is None or now.lease.lease_id != lease.lease_id):
@@ -206,9 +206,10 @@ def check_notifications(
 
 
 def reached(depth: int, every: int = 1) -> Iterator[ControlState]:
-    """Yield every state within `depth` events of a vehicle found on the ground, or in the air after a restart.
+    """Yield every state that is reachable with at most `depth` events.
 
-    The last step expands only one of `every` states.
+    The initial states are a vehicle on the ground, and a vehicle found in the air after a restart. The last step expands
+    only every `every`-th state.
     """
     flying = replace(
         FOUND_ON_GROUND, vehicle=FLYING, armed_seen=True, missions={"a": Mission("a", "A", flown=True)}, active="a"
@@ -259,7 +260,7 @@ def test_flying_vehicle_returns_home_without_further_events(history: list[events
         state, _ = transition(state, event, now)
     if not (state.decided and state.vehicle.armed):
         return
-    # Only time passes, and started tasks end successfully.
+    # No further events arrive, except ticks and the end of successful tasks.
     for _ in range(4):
         now += LATE_S
         state, _ = transition(state, events.Tick(), now)

@@ -77,7 +77,7 @@ def test_mission_fails_if_no_leg_of_its_path_was_flown(done: tuple[events.Event,
     outcome = state.missions["a"].outcome
     assert outcome is not None
     assert outcome.kind is kind
-    assert state.returning, "the drone returns home in any case"
+    assert state.returning, "the drone returns home with either outcome"
 
 
 @pytest.mark.parametrize("action", ["hover", "land", "returnToLaunch", "revoke"])
@@ -102,14 +102,14 @@ def test_vehicle_returns_home_after_grace_of_lost_driver() -> None:
     assert transition(state, events.Tick(), 4.9)[0].task == state.task
     home, actions = transition(state, events.Tick(), 5.0)
     assert [action.code for action in actions if isinstance(action, RecordAudit)] == ["DriverLost"], (
-        "only because of the deadline"
+        "the expired grace is the only cause of the return"
     )
     assert home.task == SystemTask(2, TaskKind.RETURN)
     assert home.missions["a"].outcome == Outcome(OutcomeKind.FAILED, "driver lost")
 
 
 def refused_transit(state: ControlState, lease_id: int, begins: float, ends: float) -> ControlState:
-    """Apply a transit of a waiting driver that ends without control, followed by the end of its stream."""
+    """Apply a transit that ends without control for the waiting driver. The stream of the driver then ends."""
     for event in (
         events.StreamOpened(lease_id, "a", "A"),
         events.TransitRequested(lease_id),
@@ -177,7 +177,7 @@ def test_return_is_left_to_autopilot_after_three_failures() -> None:
         if state.task is not None:
             state, _ = transition(state, events.SystemTaskEnded(state.task.task_id, finished=False), tick * 0.05)
     assert takes == 3
-    assert state.unattended_since == 0.0, "heartbeats to the autopilot must end"
+    assert state.unattended_since == 0.0, "the service must stop sending heartbeats to the autopilot"
     landed, _ = apply_events(
         events.VehicleObserved(replace(FLYING, armed=False, in_air=False)), events.Heartbeat(), state=state
     )
@@ -196,7 +196,7 @@ def test_closed_second_stream_leaves_no_driver_authority() -> None:
 def test_vehicle_armed_by_others_belongs_to_pilot(mode: FlightMode) -> None:
     chosen = events.VehicleObserved(replace(GROUND, mode=mode)), events.Heartbeat()
     state, _ = apply_events(*REQUEST_CONTROL, *chosen)
-    assert state.controller == "A", "a mode change on the ground has no owner"
+    assert state.controller == "A", "a mode change on the ground does not change the authority"
     state, actions = apply_events(events.VehicleObserved(replace(ARMED, mode=mode)), events.Heartbeat(), state=state)
     assert state.authority is Authority.PILOT
     assert state.lease is None
@@ -205,9 +205,11 @@ def test_vehicle_armed_by_others_belongs_to_pilot(mode: FlightMode) -> None:
         state, _ = apply_events(
             events.VehicleObserved(replace(FLYING, mode=flown)), events.Heartbeat(), *REQUEST_CONTROL[1:], state=state
         )
-        assert state.authority is Authority.PILOT, "the mission has no fence, home and limits, so no handover in flight"
+        assert state.authority is Authority.PILOT, (
+            "a driver gets no control in this flight, because fence, home and limits were not prepared"
+        )
     landed, _ = apply_events(events.VehicleObserved(GROUND), events.Heartbeat(), *REQUEST_CONTROL[1:], state=state)
-    assert landed.controller == "A", "the mission has not flown and continues"
+    assert landed.controller == "A", "the mission has not flown yet, so it can begin after the landing"
 
 
 def test_cancelled_motion_hovers_if_driver_is_still_connected() -> None:
@@ -256,7 +258,9 @@ def test_braking_failsafe_starts_return_instead_of_pilot_authority() -> None:
         assert failed.task == SystemTask(1, TaskKind.RETURN)
         assert str(failed.missions["a"].outcome).startswith("failed: the autopilot's own failsafe")
         later, _ = apply_events(events.VehicleObserved(facts), events.Heartbeat(), state=chosen)
-        assert later.authority is Authority.PILOT, "the pilot keeps a vehicle whose mode the pilot chose"
+        assert later.authority is Authority.PILOT, (
+            "a failsafe does not take over a vehicle whose pilot has chosen the mode"
+        )
 
 
 def test_vehicle_found_in_brake_mode_returns_home_if_failsafe_is_active() -> None:
@@ -311,7 +315,7 @@ def test_unconfirmed_mode_change_belongs_to_system_for_limited_time() -> None:
     assert other.authority is Authority.PILOT
     observed, _ = apply_events(shown[0], state=abandoned)
     assert transition(observed, shown[1], LATE_S)[0].authority is Authority.PILOT, (
-        "too late to be a change of the system"
+        "a mode change that appears too late counts as a change by the pilot"
     )
 
 
@@ -330,7 +334,7 @@ def test_late_mode_change_belongs_to_system_while_next_one_is_pending() -> None:
     state, _ = apply_events(*FLY, *abandoned)
     for event in next_change:
         state, _ = transition(state, event, UNCONFIRMED_S + 0.1)
-    assert state.authority is Authority.PILOT, "too late to be a change of the system"
+    assert state.authority is Authority.PILOT, "the late mode change counts as a change by the pilot"
 
 
 def test_late_mode_change_requested_before_failsafe_belongs_to_system() -> None:
@@ -382,7 +386,7 @@ def test_driver_lost_during_return_can_resume_control(mode: FlightMode) -> None:
     assert (resumed.drives, resumed.returning, resumed.task, resumed.grace) == (True, False, None, None)
     expired, actions = transition(after_loss, events.Tick(), 5.0)
     assert expired.missions["a"].outcome == Outcome(OutcomeKind.FAILED, "driver lost")
-    assert not any(isinstance(action, StartSystemTask) for action in actions), "the return is already running"
+    assert not any(isinstance(action, StartSystemTask) for action in actions), "the return flight has already begun"
     assert apply_events(events.StreamOpened(2, "a", "A"), state=expired)[1][0] == RefuseStream(
         2, *ended_refusal(expired.outcomes["a"])
     )
@@ -418,7 +422,9 @@ def test_found_return_is_distinguished_from_return_of_system() -> None:
     recovered, _ = apply_events(events.VehicleFound(), state=replace(known, expected_mode=None))
     assert recovered.task is not None and recovered.task.begun_by_others
     again, _ = apply_events(events.VehicleFound(), state=recovered)
-    assert again.task is not None and again.task.begun_by_others, "a reconnect does not change the owner"
+    assert again.task is not None and again.task.begun_by_others, (
+        "a reconnect does not make the return flight one of the system"
+    )
     begun, _ = apply_events(
         events.TakeoverDemanded("returnToLaunch", "X", "x"), state=replace(known, expected_mode=RTL)
     )

@@ -48,7 +48,7 @@ def script(path: Path, output: str) -> None:
 
 @pytest.mark.parametrize("minor", KUBERNETES_VERSIONS)
 @pytest.mark.parametrize(("program", "module"), REQUIRED.items())
-def test_go_mod_pins_the_version_of_the_catalog(program: str, module: str, minor: str) -> None:
+def test_go_mod_pins_the_version_in_the_catalog(program: str, module: str, minor: str) -> None:
     entry = PROGRAMS[minor][program]
     text = (GOMOD / entry.module / "go.mod").read_text()
     requirement = re.search(rf"^(?:require )?\s*{re.escape(module)} v(\S+)", text, re.MULTILINE)
@@ -106,7 +106,7 @@ def test_programs_of_the_chosen_version_are_used(machine: Path, monkeypatch: pyt
     assert ensure_binaries(["kubectl"], report=print)["kubectl"] == machine / "assets" / "kubectl"
 
 
-def test_builds_of_each_version_have_their_own_directory(machine: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_each_kubernetes_version_has_its_own_build_directory(machine: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for minor, version in KUBERNETES_VERSIONS.items():
         directory = machine / "cache" / f"v{version}"
         script(directory / "bin" / "kubelet", f"Kubernetes v{version}")

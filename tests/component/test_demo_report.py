@@ -65,7 +65,7 @@ def test_repeated_denial_is_listed_again_after_a_minute() -> None:
     assert [call.count for call in record.decisions] == [2, 1]
 
 
-def test_takeover_is_listed_with_the_requests() -> None:
+def test_takeover_is_listed_among_the_requests() -> None:
     takeover = {
         "kind": "takeover",
         "time": demo_flight.stamp(demo_flight.TAKEOFF_S + 40),

@@ -126,7 +126,7 @@ def test_signals_are_deferred_until_the_end_of_an_uninterrupted_block() -> None:
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
-def test_guard_kills_the_groups_that_were_not_released(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_guard_kills_process_groups_that_were_not_released(monkeypatch: pytest.MonkeyPatch) -> None:
     killed: list[int] = []
     monkeypatch.setattr(process_guard.os, "killpg", lambda group, _signal: killed.append(group))
     process_guard.guard(io.StringIO("41\n42\n43\n-42\n"))
@@ -147,7 +147,7 @@ def test_summary_page_is_absent_after_an_incomplete_write(tmp_path: Path, monkey
     assert not list(tmp_path.iterdir())
 
 
-def test_report_is_written_before_figures_and_the_page_after_them(
+def test_report_is_written_first_then_figures_then_the_page(
     experiment: Experiment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail_to_draw(_content: object) -> None:

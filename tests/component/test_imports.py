@@ -55,7 +55,7 @@ def test_environment_cannot_turn_off_the_checksums_of_mavlink(monkeypatch: pytes
     assert printed.strip() == "0"
 
 
-def test_agent_does_not_import_the_control_machine() -> None:
+def test_agent_does_not_import_the_control_state_machine() -> None:
     output, _ = run_program("import fractus_agent.__main__; print(*sys.modules)")
     assert "fractus_core.control.state" in output.split()
     assert "fractus_core.control.machine" not in output.split()

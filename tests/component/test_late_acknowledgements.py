@@ -93,7 +93,9 @@ def was_refused(command: asyncio.Future[None]) -> bool:
     return isinstance(error, AutopilotError) and error.refused
 
 
-def test_mode_change_does_not_wait_for_unacknowledged_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_mode_change_does_not_wait_for_unacknowledged_mode_change(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A change to LOITER is unacknowledged when RTL is requested.
 
     RTL must be commanded at once, and LOITER must not be commanded again afterwards.

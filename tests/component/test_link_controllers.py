@@ -121,7 +121,7 @@ SERVICE = {
 }  # fmt: skip
 
 
-def test_guards_of_both_ends_follow_the_callers_of_a_service() -> None:
+def test_both_ends_of_a_link_admit_only_the_callers_of_a_service() -> None:
     class RecordingRedirector(FakeCollaborator):
         def set_services(self, _services: object, callers: object) -> None:
             self.callers = callers
@@ -233,7 +233,7 @@ def test_session_with_a_peer_that_sends_no_routes_is_lost(monkeypatch: pytest.Mo
 
 
 @pytest.mark.parametrize(("mbps", "probes"), [(16.0, {2, 3}), (8.5, {2, 3}), (2.0, {5, 6})])
-def test_link_is_probed_only_if_its_traffic_leaves_room(
+def test_link_is_probed_only_if_its_traffic_leaves_capacity(
     mbps: float, probes: set[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(drone_link_controller, "PROBE_INTERVAL_S", 0.1)

@@ -54,7 +54,7 @@ WINDY = (6.0, 5.0)
         [0.0, 0.1, 0.25, 0.5], [CALM, (6.0, 0.5), (0.0, 2.0), WINDY], quick=[(0.0, CALM), (0.5, CALM), (0.25, WINDY)]
     ),
 )
-def test_velocities_keep_their_distance(delay_s: float, conditions: tuple[float, float]) -> None:
+def test_velocity_setpoints_keep_the_guaranteed_distance(delay_s: float, conditions: tuple[float, float]) -> None:
     wind_mps, error_m = conditions
     undelayed = flight_without_delay(wind_mps, error_m)
     flown = (
@@ -82,14 +82,14 @@ def test_unreported_position_error_reduces_the_distance() -> None:
     assert attempt(at_highest_permitted_speed, 7, unreported).least_distance_m < GUARANTEED_M
 
 
-def test_velocities_keep_their_distance_despite_frame_loss() -> None:
+def test_velocity_setpoints_keep_the_guaranteed_distance_despite_frame_loss() -> None:
     flown = attempt(both, 8, weather(0.5, 3.0, loss=0.1))
     assert flown.least_distance_m >= GUARANTEED_M
     assert flown.permitted > 50
 
 
 @pytest.mark.parametrize("speedup", cells([2, 3, 5], quick=[5]))
-def test_velocities_keep_their_distance_with_a_faster_simulator(speedup: int) -> None:
+def test_velocity_setpoints_keep_the_guaranteed_distance_with_a_faster_simulator(speedup: int) -> None:
     flown = attempt(both, 9, weather(0.02, speedup=speedup))
     assert flown.least_distance_m >= GUARANTEED_M
     assert flown.permitted > 30
@@ -99,7 +99,7 @@ def test_velocities_keep_their_distance_with_a_faster_simulator(speedup: int) ->
     ("process", "speedup"),
     cells([("vehicle", 3), ("service", 5), ("vehicle", 5)], quick=[("service", 5), ("vehicle", 5)]),
 )
-def test_velocities_keep_their_distance_despite_stalls(process: str, speedup: int) -> None:
+def test_velocity_setpoints_keep_the_guaranteed_distance_despite_stalls(process: str, speedup: int) -> None:
     """A stall of 0.35 s lasts more than a second on the clock of a vehicle that is simulated faster than real time.
 
     If the vehicle stalls, its position is unknown during the stall.

@@ -127,7 +127,7 @@ speeds = st.tuples(st.floats(-8, 8), st.floats(-8, 8)).filter(lambda v: math.hyp
     action=st.sampled_from(["ignore", "adjust"]),
     seed=st.integers(0, 10**6),
 )
-def test_oracle_no_permitted_goto_enters_a_zone(
+def test_oracle_finds_no_permitted_goto_that_enters_a_zone(
     zones: list[Corners],
     start: tuple[float, float],
     to: tuple[float, float],
@@ -163,7 +163,7 @@ def test_oracle_no_permitted_goto_enters_a_zone(
 
 @_cases
 @given(area=polygons(), start=spots, to=spots, action=st.sampled_from(["ignore", "adjust"]))
-def test_oracle_no_permitted_goto_leaves_an_inclusion_zone(
+def test_oracle_finds_no_permitted_goto_that_leaves_an_inclusion_zone(
     area: Corners, start: tuple[float, float], to: tuple[float, float], action: str
 ) -> None:
     big = [(x * 3, y * 3) for x, y in area]
@@ -190,7 +190,7 @@ def test_oracle_no_permitted_goto_leaves_an_inclusion_zone(
     upper=st.one_of(st.none(), st.floats(0, 60)),
     refuse=st.booleans(),
 )
-def test_oracle_altitude_verdicts_match_the_rules(
+def test_altitude_verdicts_match_the_rules_of_the_oracle(
     requested: float, lower: float | None, upper: float | None, refuse: bool
 ) -> None:
     if lower is None and upper is None:
@@ -223,7 +223,7 @@ def test_oracle_altitude_verdicts_match_the_rules(
 
 @_cases
 @given(lat=st.floats(), lon=st.floats(), alt=st.floats(), vn=st.floats(-100, 100), ve=st.floats(-100, 100))
-def test_oracle_every_goto_gets_a_verdict(lat: float, lon: float, alt: float, vn: float, ve: float) -> None:
+def test_every_random_goto_gets_a_verdict(lat: float, lon: float, alt: float, vn: float, ve: float) -> None:
     zone = [(20.0, 20.0), (40.0, 20.0), (40.0, 40.0)]
     grant = compiled(exclusion(ring(zone), "adjust"), altitude(upperLimit=30))
     verdict = ask(grant, Call("Goto", GotoArgs(lat, lon, alt)), at(north_mps=vn, east_mps=ve))
@@ -235,7 +235,7 @@ def test_oracle_every_goto_gets_a_verdict(lat: float, lon: float, alt: float, vn
         assert verdict.code
 
 
-def test_oracle_no_permitted_request_breaks_a_policy() -> None:
+def test_oracle_finds_no_permitted_request_that_violates_a_policy() -> None:
     """Short version of `bench/oracle.py`: velocities, interrupted legs, altitude bands, schedules, limits and wind."""
     tally = flights(seed=7, count=500)
     assert tally.wrong == []
@@ -250,7 +250,7 @@ def test_oracle_detects_too_small_margins(monkeypatch: pytest.MonkeyPatch) -> No
     assert flights(seed=3, count=200).wrong
 
 
-def test_oracle_return_flights_break_no_policy() -> None:
+def test_oracle_finds_no_return_flight_that_violates_a_policy() -> None:
     tally = flights(seed=11, count=160, requests=2, returns=ReturnFlights(11, 4))
     assert tally.wrong == []
     assert tally.system_returns > 30
@@ -267,7 +267,7 @@ def test_oracle_detects_return_flights_through_zones(monkeypatch: pytest.MonkeyP
     assert any("returning by its autopilot" in line for line in wrong)
 
 
-def test_oracle_arms_only_vehicles_with_known_parameters() -> None:
+def test_oracle_finds_no_armed_vehicle_with_unknown_parameters() -> None:
     assert parameter_faults(seed=1, count=300) == []
 
 
@@ -276,7 +276,7 @@ def test_oracle_detects_assumed_parameters(monkeypatch: pytest.MonkeyPatch) -> N
     assert parameter_faults(seed=1, count=50)
 
 
-def test_oracle_excuses_drones_that_start_beyond_an_altitude_limit() -> None:
+def test_oracle_accepts_drones_that_start_beyond_an_altitude_limit() -> None:
     rings = np.full((ZONES, CORNERS, 2), 1e6)
     rings[0] = [(-20, -20)] * 5 + [(20, -20), (20, 20), (-20, 20)]
     limits = np.tile([-np.inf, np.inf], (ZONES, 1))
@@ -311,7 +311,7 @@ def shortening(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("shortening")
 @pytest.mark.parametrize("seed", cells([3, 4], quick=[3]))
-def test_oracle_monitor_never_stops_permitted_flights(seed: int) -> None:
+def test_oracle_finds_no_permitted_flight_stopped_by_monitor(seed: int) -> None:
     tally = flights(seed=seed, count=examples(400, 100), requests=2, watch_every=3)
     assert tally.wrong == []
     assert tally.stopped == []

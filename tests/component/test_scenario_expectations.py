@@ -65,7 +65,7 @@ def test_autopilot_link_must_be_tcp_host_port(text: str):
     assert parse_link("tcp:127.0.0.1:5760") == ("127.0.0.1", 5760)
 
 
-def test_evidence_is_read_on_the_clock_of_the_autopilot(tmp_path: Path):
+def test_evidence_times_use_the_clock_of_the_autopilot(tmp_path: Path):
     vehicle, pilot = alone()
     path = tmp_path / "drone.tlog"
     with path.open("wb") as file:

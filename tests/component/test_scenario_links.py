@@ -154,7 +154,7 @@ def test_pictures_are_counted_by_delivery(site: Site) -> None:
     assert run_of(site).by_node() == {"cloud-1": 25, "edge-1": 15}
 
 
-def test_gains_are_shares_of_the_maximum(site: Site) -> None:
+def test_gain_is_given_as_share_of_the_maximum(site: Site) -> None:
     table = {gain.name: gain for gain in gains(site, run_of(site))}
     assert table["maximum"].share == 1.0
     assert 0.3 < table["flown"].share < 0.6

@@ -74,7 +74,7 @@ FRESH = FailsafeStatus("", (), Airframe(retraces=True), 8.0, records_path=True)
 
 @pytest.mark.parametrize("verified", [None, FRESH])
 @pytest.mark.parametrize("during", ["choice", "fence", "mode"])
-def test_arming_is_refused_if_failsafe_verification_changes_meanwhile(
+def test_arming_is_refused_if_failsafe_verification_changes_during_arming(
     tmp_path: Path, during: str, verified: FailsafeStatus | None
 ) -> None:
     async def flight() -> None:

@@ -71,7 +71,7 @@ def test_transit_replans_around_zone_added_in_flight(tmp_path: Path) -> None:
     fly(flight)
 
 
-def test_transit_ends_revoked_if_zone_with_revoke_appears_ahead(tmp_path: Path) -> None:
+def test_transit_is_revoked_if_zone_with_revoke_action_appears_ahead(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             grant = world.grants.put(partial())

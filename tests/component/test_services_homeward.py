@@ -408,7 +408,7 @@ def test_failsafe_return_above_limit_is_replaced_by_landing(tmp_path: Path, code
 
 
 @pytest.mark.parametrize("upper", [10.0, 40.0])
-def test_landing_takeover_flies_home_if_zone_is_below(tmp_path: Path, upper: float) -> None:
+def test_takeover_with_land_action_returns_home_if_zone_is_below(tmp_path: Path, upper: float) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             grant = world.grants.put(spec())

@@ -58,7 +58,7 @@ def test_return_bounds_forbid_climb_if_limit_datum_is_unknown() -> None:
     assert return_altitudes_m(at(alt=10, airframe=Airframe(return_altitude_m=40)), limited, 100.0)[0] == 20.0
 
 
-def test_return_altitudes_end_with_heights_below_overhead_zones() -> None:
+def test_return_altitudes_include_heights_below_overhead_zones() -> None:
     now = at(50, 0, alt=33, airframe=Airframe(return_altitude_m=40))
     zones = [exclusion(box(*zone_box), name=name, lower=low) for name, low, zone_box in (
         ("above", 35, (20, -20, 80, 20)), ("lower", 20, (0, -5, 10, 5)), ("ground", 12, (0, 5, 10, 15)),
@@ -81,7 +81,7 @@ def test_return_altitudes_end_with_heights_below_overhead_zones() -> None:
         ({}, ReturnBounds(12.0, 3.5), {}),
     ],
 )  # fmt: skip
-def test_rtl_parameters_follow_from_return_bounds(
+def test_rtl_parameters_are_derived_from_return_bounds(
     owned: dict[str, float], bounds: ReturnBounds, expected: dict[str, float]
 ) -> None:
     assert ARDUCOPTER.return_values(owned, bounds) == expected

@@ -181,7 +181,7 @@ def test_delayed_velocity_setpoint_expires_after_hold_time(tmp_path: Path, monke
     fly(flight)
 
 
-def test_deceleration_to_setpoint_is_not_extrapolated_below_it(tmp_path: Path) -> None:
+def test_predicted_deceleration_ends_at_the_setpoint(tmp_path: Path) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             world.plane.measured = True

@@ -114,7 +114,9 @@ def test_spans_are_no_ops_without_a_collector() -> None:
         assert not trace.get_current_span().is_recording()
 
 
-async def test_child_spans_belong_to_the_call_in_its_tasks_too(close: Callable[[], None], collector: Collector) -> None:
+async def test_child_spans_in_tasks_of_a_call_belong_to_the_call(
+    close: Callable[[], None], collector: Collector
+) -> None:
     async def judge() -> None:
         with tracing.child_span("part") as part:
             tracing.set_verdict(part, "deny", "", ())

@@ -139,7 +139,7 @@ def test_target_during_spool_up_cancels_takeoff():
         (mavlink.MAV_CMD_DO_FLIGHTTERMINATION, mavlink.MAV_RESULT_FAILED),
     ],
 )
-def test_results_of_commands(command: int, result: int):
+def test_command_returns_expected_result(command: int, result: int):
     _, pilot = alone()
     assert pilot.command(command) is result
 

@@ -111,7 +111,7 @@ def test_positions_are_shown_five_times_a_second_with_heading(recording: Path) -
     assert {fix.heading_deg for fix in fixes} == {270.0}
 
 
-def test_only_judged_calls_are_verdicts(recording: Path) -> None:
+def test_only_judged_calls_are_shown_as_verdicts(recording: Path) -> None:
     (verdict,) = events_of(Verdict, Replay([recording]).events())
     assert (verdict.component, verdict.method, verdict.action) == ("Navigator", "Goto", "deny")
     assert (verdict.reason, list(verdict.policies)) == ("inside", ["school"])

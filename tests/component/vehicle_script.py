@@ -3,8 +3,8 @@
     python tests/component/vehicle_script.py [--autopilot tcp:HOST:PORT] [--all] [--steps FILE]
 
 Each row of `tests/golden/vehicle/arducopter-4.6.3.tsv` is a step: name, action, recorded response and note. A note
-explains an intended difference of the simulated vehicle, or why a step cannot be repeated. Numbers in responses may have
-a tolerance: `4.2~10%` accepts a deviation of 10 %, and `4.2~0.5` a deviation of 0.5.
+explains an intended difference of the simulated vehicle, or why a step cannot be repeated. Numbers in responses may
+have a tolerance: `4.2~10%` accepts a deviation of 10 %, and `4.2~0.5` a deviation of 0.5.
 
 Without --autopilot, the script is played on the simulated vehicle after a cold start, in simulated time.
 """

@@ -161,7 +161,7 @@ async def test_deleted_object_is_registered_again(path: Path) -> None:
     assert store.object is not None
 
 
-async def test_invalid_description_is_reported_and_the_object_kept(path: Path) -> None:
+async def test_invalid_description_is_reported_and_the_object_is_kept(path: Path) -> None:
     store = FakeStore()
     registration = registration_of(store, path)
     await registration.step()

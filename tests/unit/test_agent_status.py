@@ -156,7 +156,7 @@ def test_drone_without_any_telemetry_has_no_last_flight_state() -> None:
     assert report_intervals("Drone", status) is DRONE_INTERVALS
 
 
-def test_transition_time_moves_only_with_the_status() -> None:
+def test_transition_time_changes_only_with_the_condition_status() -> None:
     first = node_status(observed(), {}, 1, NOW)
     later = node_status(observed(), first, 2, NOW + timedelta(minutes=1))
     assert later["conditions"][0]["lastTransitionTime"] == "2026-05-01T12:00:00Z"
@@ -277,7 +277,7 @@ async def test_change_during_an_outage_is_written_afterwards() -> None:
     assert bench.store.writes[-1]["flightState"] == "landing"
 
 
-async def test_deleted_object_is_reported_and_its_successor_written() -> None:
+async def test_deleted_object_is_reported_and_recreated_object_gets_the_status() -> None:
     bench = ReporterBench()
     await bench.second(telemetry())
     bench.store.absent = True

@@ -173,7 +173,9 @@ async def test_audit_log_has_no_duplicates_after_a_failed_sync(tmp_path: Path, m
     assert (finding.entries, finding.problem) == (2, "")
 
 
-async def test_audit_log_removes_the_rest_of_a_failed_write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_audit_log_removes_the_written_part_of_a_failed_write(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     real = {"fsync": os.fsync, "ftruncate": os.ftruncate}
     failing = [True]
 

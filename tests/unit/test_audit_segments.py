@@ -124,7 +124,7 @@ async def test_checkpoint_detects_a_forged_record_of_pruning(tmp_path: Path, tls
 
 
 @pytest.mark.parametrize("which", ["end", "rewritten", "emptied", "missing", "log"])
-async def test_checkpoint_detects_changes_that_the_chain_does_not(tmp_path: Path, tls: Path, which: str) -> None:
+async def test_checkpoint_detects_changes_that_the_hash_chain_misses(tmp_path: Path, tls: Path, which: str) -> None:
     path = tmp_path / "audit" / "audit.jsonl"
     checkpoint_file = await checkpoint(path, 4, tls)
     if which == "end":
@@ -222,7 +222,7 @@ async def test_checkpoint_is_not_written_without_a_certificate(
     assert verified(path)[0] == 0
 
 
-async def test_checkpoint_covers_the_last_entries_without_further_ones(
+async def test_checkpoint_covers_the_last_entries_if_no_entry_follows(
     tmp_path: Path, tls: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("fractus_runtime.audit.CHECKPOINT_INTERVAL_S", 0.2)

@@ -89,7 +89,7 @@ def test_every_target_is_in_the_dockerfile() -> None:
     assert set(TARGETS) <= stages
 
 
-def test_release_builds_on_a_base_digest_that_its_images_name() -> None:
+def test_release_images_name_the_base_digest_on_which_they_are_built() -> None:
     workflow = yaml.safe_load((ROOT / ".github/workflows/release.yaml").read_text())
     scripts = [step["run"] for job in workflow["jobs"].values() for step in job["steps"] if "run" in step]
     (inspect_step,) = [n for n, script in enumerate(scripts) if "imagetools inspect" in script]

@@ -273,7 +273,7 @@ def test_vehicle_found_in_brake_mode_returns_home_if_failsafe_is_active() -> Non
         assert (recovered.authority, recovered.task.kind if recovered.task is not None else None) == (authority, task)
 
 
-def test_requested_arming_belongs_to_driver_if_seen_late() -> None:
+def test_arming_that_appears_late_belongs_to_driver_that_requested_it() -> None:
     late_arming = (*ARM[:2], ARM[3], events.Heartbeat())
     state, _ = apply_events(*REQUEST_CONTROL, *late_arming)
     assert (state.authority, state.armed_by_others) == (Authority.DRIVER, False)
@@ -319,7 +319,7 @@ def test_unconfirmed_mode_change_belongs_to_system_for_limited_time() -> None:
     )
 
 
-def test_late_mode_change_belongs_to_system_while_next_one_is_pending() -> None:
+def test_late_mode_change_belongs_to_system_while_next_mode_change_is_pending() -> None:
     abandoned = (events.ModeChangeBegan(LAND), events.ModeChangeEnded(LAND, GUIDED, done=False))
     shows = {
         mode: (events.VehicleObserved(replace(FLYING, mode=mode)), events.Heartbeat())
@@ -415,7 +415,7 @@ def test_return_begun_during_link_outage_counts_as_failsafe(
     assert state.returning is (authority is Authority.SYSTEM)
 
 
-def test_found_return_is_distinguished_from_return_of_system() -> None:
+def test_return_found_after_restart_is_distinguished_from_return_of_system() -> None:
     known, _ = apply_events(
         events.ArmingRequested("a", "A", (1.0, 2.0, 3.0)), events.VehicleObserved(replace(FLYING, mode=RTL))
     )

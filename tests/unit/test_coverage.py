@@ -1,4 +1,4 @@
-"""Lazy greedy coverage compared with the plain greedy algorithm, and samples compared with exact areas."""
+"""Lazy greedy coverage compared with the plain greedy algorithm, and sampled areas compared with exact areas."""
 
 import numpy as np
 import pytest
@@ -48,7 +48,10 @@ def test_coverage_samples_of_long_narrow_path_measure_area():
 
 
 def plain_greedy(points, discs, share, unfit):
-    """Return the choices of the textbook algorithm, which tries every candidate in every round. Ties go to the first."""
+    """Return the choices of the plain greedy algorithm.
+
+    It evaluates every candidate in every round, and chooses the first of equal candidates.
+    """
     reached = {
         name: {i for i, p in enumerate(points) if (p[0] - x) ** 2 + (p[1] - y) ** 2 <= r * r}
         for name, (x, y, r) in discs.items()

@@ -1,4 +1,4 @@
-"""The example's manifests are valid, consistent, and planned as the demo shows."""
+"""Manifests of the traffic example: they are valid and consistent, and result in the plan that the demo shows."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def test_demo_cluster_nodes_match_the_manifests() -> None:
     drone = described["drone-1"].to_dict()["spec"]
     camera = drone["services"]["camera"]
     assert camera["connection"] == "http://127.0.0.1:8090/snapshot.jpg"
-    camera["connection"] = "test:"  # the manifest is also for clusters without a simulated camera
+    camera["connection"] = "test:"  # the manifest must also work in clusters without a simulated camera
     assert {k: v.to_dict()["spec"] for k, v in described.items()} | {"drone-1": drone} == {
         k: v.to_dict()["spec"] for k, v in {**named("drone.yaml"), **named("edge-nodes.yaml")}.items()
     }
@@ -135,7 +135,7 @@ def test_passenger_only_application_is_planned(inventory: Inventory) -> None:
 
 
 def test_demo_flight_is_legal_except_for_the_shown_violations(inventory: Inventory, application: Application) -> None:
-    """Each leg is judged for a drone that hovers at the previous waypoint."""
+    """The engine judges each leg for a drone that hovers at the previous waypoint."""
     grants = compile_grants(application, plan(application, inventory), inventory)
     grant = compile_grant(next(g for g in grants if g.component == "Navigator"))
     depot = inventory.depots["depot-1"].spec.location

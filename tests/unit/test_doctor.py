@@ -27,7 +27,7 @@ Body = dict[str, Any]
 
 
 class Cluster:
-    """Fake of a healthy cluster: objects and lists by path. Tests change it to create a problem."""
+    """Fake of a healthy cluster: objects and lists by path. A test changes it to create a problem."""
 
     def __init__(self) -> None:
         ready = {"readyReplicas": 2, "conditions": [{"type": "ReplicaFailure", "status": "False", "reason": "x"}]}
@@ -153,7 +153,10 @@ def ipv6_first(cluster: Cluster) -> None:
 
 
 def weakly_tainted(cluster: Cluster) -> None:
-    """Replace the taint by NoSchedule, which pods with a node name bypass because kubelets check NoExecute only."""
+    """Replace the taint NoExecute by NoSchedule.
+
+    A pod whose spec names the node bypasses NoSchedule, because the kubelet checks only NoExecute.
+    """
     cluster.lists["/api/v1/nodes"][0]["spec"] = {"taints": [{"key": "fractus.dev/class", "effect": "NoSchedule"}]}
 
 
@@ -167,7 +170,9 @@ def test_doctor_remedy_exempts_all_namespaces_with_foreign_pods() -> None:
     plugin = cluster.lists["/api/v1/pods"][0]
     cluster.lists["/api/v1/pods"].append(plugin | {"metadata": {"name": "cni", "namespace": "cilium"}})
     remedies = {finding.remedy for finding in findings(cluster) if finding.level != "ok"}
-    assert len(remedies) == 1, "a second remedy would undo the first"
+    assert len(remedies) == 1, (
+        "one remedy covers all namespaces, because a second one would overwrite the setting of the first"
+    )
     assert "exemptNamespaces={kube-system,cilium,kube-flannel}" in remedies.pop()
 
 

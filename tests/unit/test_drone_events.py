@@ -1,4 +1,7 @@
-"""Events of a drone: one Event for each transition, also after restarts and repeated reports, and few Events of a flapping drone."""
+"""Events of a drone.
+
+Each transition has one Event, even if the operator restarts or a report is repeated. A flapping drone has few Events.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +37,7 @@ def drone(state: str, controller: str | None = "system", *, at_s: int, reason: s
 
 
 class Cluster:
-    """A fake cluster that records Events. The operator can be restarted."""
+    """Fake cluster that records Events. A test can restart the operator."""
 
     def __init__(self) -> None:
         self.drones: dict[str, Drone] = {}
@@ -60,12 +63,12 @@ class Cluster:
         self.failing -= 1
         if self.failing == 0:
             raise KubeError(503, "ServiceUnavailable", "not now")
-        self.posted.setdefault(name, (reason, message))  # The API server refuses a second Event of that name.
+        self.posted.setdefault(name, (reason, message))  # Like the API server, keep only the first Event of a name.
         if reason == "Landed":
             self.landed.set()
 
     async def observe(self, *reports: Drone | None) -> list[str]:
-        """Return the reasons of the Events after these reports."""
+        """Deliver reports of the drone. Return the reasons of the Events that follow."""
         before = len(self.posted)
         for each in reports:
             if each is None:
@@ -116,7 +119,7 @@ async def test_events_of_a_complete_flight(cluster: Cluster) -> None:
 
 
 async def test_drone_on_the_ground_has_no_events(cluster: Cluster) -> None:
-    """The phases before the takeoff cause no Event."""
+    """Changes before the takeoff, such as the choice of the drone, cause no Event."""
     cluster.holders = []
     await cluster.observe(drone("inactive", at_s=0))
     cluster.holders = [APPLICATION]
@@ -134,7 +137,7 @@ async def test_restarted_operator_posts_only_new_events(cluster: Cluster) -> Non
     assert cluster.posted == before
     cluster.holders = []
     assert await cluster.observe(drone("landing", DRIVER, at_s=15)) == ["MissionOver"], (
-        "the drone was in flight when the operator started"
+        "the restarted operator has seen the drone in flight"
     )
     assert cluster.sentences()[-1].endswith("no longer flies drone-1: it was deleted")
     cluster.start()
@@ -189,7 +192,9 @@ async def test_flapping_drone_has_few_events(cluster: Cluster, monkeypatch: pyte
     assert len(cluster.posted) == EVENT_BURST
     assert cluster.sentences()[-1] == "drone-1 took off, flown by system"
     monkeypatch.setattr(drone_events, "EVENT_PERIOD_S", 1e-9)
-    assert await cluster.observe(drone("inactive", at_s=2001)) == ["Landed"], "the current state is posted when allowed"
+    assert await cluster.observe(drone("inactive", at_s=2001)) == ["Landed"], (
+        "the current state is posted as soon as the rate limit permits it"
+    )
 
 
 async def test_delayed_events_are_posted_later(cluster: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,4 +1,4 @@
-"""Traffic monitoring example: a picture that is repeated after a path change counts once."""
+"""Traffic monitoring example: a picture that is sent again after a path change counts once."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ EXAMPLE = EXAMPLES / "traffic-monitoring"
 
 @pytest.fixture
 def programs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> dict[str, Any]:
-    """Modules of the example. ImageCheckers pass their results to one DataStore without a network."""
+    """Return the modules of the example. Their ImageCheckers send results to one DataStore, without a network."""
     monkeypatch.setattr(sys, "path", [str(EXAMPLE), *sys.path])
     names = ("data_store", "image_checker", "pictures", "web")
     for name in names:
@@ -62,7 +62,7 @@ async def test_example_refuses_invalid_picture(programs: dict[str, Any]) -> None
 
 
 class FullCamera:
-    """Fake camera that stores one picture. Every second picture cannot be retrieved."""
+    """Fake camera that can store only one picture. Retrieval of every second picture fails."""
 
     def __init__(self) -> None:
         self.stored: list[str] = []
@@ -72,7 +72,7 @@ class FullCamera:
 
     async def capture(self, *_: int, timeout_s: float) -> SimpleNamespace:
         assert timeout_s > 0
-        assert not self.stored, "the camera stores no second picture"
+        assert not self.stored, "the camera has no space for a second picture"
         self.taken += 1
         self.stored.append(f"picture-{self.taken}")
         return SimpleNamespace(name=self.stored[-1])

@@ -11,7 +11,10 @@ from fractus_runtime.files import read_set, remove_temporary, write_file, write_
 
 
 def stopped_at(call: int, monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Raise at the given rename, as if the process was killed. Return the list of completed steps."""
+    """Raise KeyboardInterrupt at the given file operation, as if the process was killed there.
+
+    Return the list to which completed operations are added.
+    """
     steps: list[str] = []
 
     def step(name: str, real: Callable[..., object]) -> Callable[..., object]:
@@ -52,7 +55,7 @@ def test_write_file_never_leaves_the_path_without_a_file(tmp_path: Path) -> None
         assert sorted(file.name for file in tmp_path.iterdir()) == ["a.json", "a.last.json"]
         if done:
             return
-    raise AssertionError("the write never succeeded")
+    raise AssertionError("write_file did not complete with any number of operations")
 
 
 def test_write_file_keeps_the_previous_file_without_hard_links(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

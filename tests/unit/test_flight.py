@@ -34,7 +34,7 @@ def walk(leg, step=0.25):
 
 
 def visits(leg, points, radius, ordered):
-    """Return True if the path visits all points. Oracle: walks the path in small steps."""
+    """Return True if the path visits all points. This oracle checks the path in small steps."""
     steps = list(walk(leg))
     remaining = list(points)
     if not ordered:

@@ -1,4 +1,4 @@
-"""Local frame and areas against geodesics and closed forms."""
+"""Local frame and areas, compared with geodesics and analytic formulas."""
 
 import itertools
 import math
@@ -86,7 +86,7 @@ def test_circles_and_corridors_are_circumscribed_tightly(radius, pieces):
 
 @given(latitudes, longitudes, st.floats(1, 200_000), st.floats(0, 300_000), st.floats(0, math.tau))
 def test_inscribed_circle_is_never_larger_than_the_circle(lat, lon, radius, away, bearing):
-    """The frame shortens distances far from its origin, so the test uses any distance from it."""
+    """The frame shortens distances far from its origin, so the test uses circles at various distances."""
     frame = LocalFrame(lat, lon)
     centre_lat, centre_lon = frame.latlon(away * math.sin(bearing), away * math.cos(bearing))
     centre = Point(lat=centre_lat, lon=centre_lon)
@@ -132,7 +132,7 @@ def test_polygon_across_the_antimeridian_is_small():
     st.lists(st.tuples(st.floats(0, 2 * math.pi), st.sampled_from([0.0, 0.5, 0.9, 1.1, 2.0])), min_size=5, max_size=20),
 )
 def test_geojson_of_circles_at_the_poles_covers_the_same_area(pole, off, lon, radius, places):
-    # On a map in degrees, an edge past the pole is bent even if it is shorter than a segment.
+    # Near the pole, a straight edge is curved in degrees, even if the edge is short.
     assume(abs(off - radius) > 0.2 * radius)
     lat = pole - math.copysign(off / 111_694, pole)
     frame = LocalFrame(lat, lon)

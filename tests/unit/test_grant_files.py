@@ -86,7 +86,7 @@ async def test_grant_files_revoke_a_removed_grant_within_one_second(tmp_path: Pa
 
 
 async def test_grant_files_grant_nothing_while_their_directory_is_missing(tmp_path: Path) -> None:
-    """A restored directory grants the same as before, for example after its disk was mounted again."""
+    """When the directory is available again, for example after a disk was mounted, its Grants are active again."""
     directory = tmp_path / "grants"
     directory.mkdir()
     (directory / "g.json").write_text(body())
@@ -112,7 +112,7 @@ async def test_grant_files_do_not_block_event_loop_while_compiling(
 
     def slowly(*args: Any, **options: Any) -> CompiledGrant:
         begun.set()
-        assert may_continue.wait(10.0), "the event loop waits for this thread"
+        assert may_continue.wait(10.0), "the event loop must not wait for the compilation in this thread"
         return compile_grant(*args, **options)
 
     monkeypatch.setattr(module, "compile_grant", slowly)
@@ -159,7 +159,7 @@ def test_grant_files_use_later_of_two_files_for_one_instance(tmp_path: Path) -> 
     assert [grant.spec.mission for grant in files.active.values()] == ["second"], "the later Grant is active"
     (tmp_path / "a.json").unlink()
     files.scan()
-    assert not files.active, "the earlier Grant is not activated again"
+    assert not files.active, "the removal of the later Grant does not activate the earlier Grant"
 
 
 def test_grant_files_grant_nothing_when_directory_is_missing(tmp_path: Path) -> None:
@@ -209,7 +209,7 @@ def test_grant_files_call_other_listeners_when_one_fails(tmp_path: Path) -> None
 
 
 def retry_after_s(limiter: RateLimiter, identity: str, time_s: float) -> float:
-    """Take a token. Return 0, or the seconds until the next token if there is none."""
+    """Take a token. Return 0 on success, or the seconds until the next token if none is available."""
     try:
         limiter.take(identity, time_s)
     except ResourceExhausted as refusal:

@@ -195,7 +195,7 @@ def test_signer_detects_foreign_and_invalid_signatures() -> None:
 
 
 class Node:
-    """Directory and verifier of a node's service that can be restarted."""
+    """Grant directory and verifier of a node service. A test can restart the service."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -231,7 +231,7 @@ def test_verifier_refuses_older_grant(node: Node, restarts: bool) -> None:
     old = signed(NOW)
     new = signed(later(), policies=[])
     first = node.take(old)
-    assert node.take(old) == first, "the same Grant may be read again"
+    assert node.take(old) == first, "the same Grant is valid when it is read again"
     digest = node.take(new)
     if restarts:
         node.restart()

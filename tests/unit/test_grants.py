@@ -46,7 +46,7 @@ def compiled(*policies, zones=(), components=None):
 
 
 def comb(name, teeth, across=False, lon=None):
-    """Return a zone with long thin teeth to the north or to the east."""
+    """Return a comb-shaped zone with long thin teeth. They point north, or east if `across` is set."""
     sides = [(500.0 * (((i + 1) // 2) % 2), float(i - teeth)) for i in range(2 * teeth)]
     corners = [*sides, (-1.0, float(teeth)), (-1.0, float(-teeth - 1))]
     ring = [at(*(c if across else reversed(c))) for c in corners]
@@ -56,24 +56,24 @@ def comb(name, teeth, across=False, lon=None):
 
 
 def test_grant_refuses_zones_with_too_many_crossings():
-    """The union of these zones takes minutes. The services would read no other Grant during that time."""
+    """A union of these zones would take minutes. During that time, the services could not read other Grants."""
     spiky = [comb("north", 480), comb("east", 480, across=True)]
     inside = {"type": "GeofenceControl", "kind": "inclusion", "action": "land"}
     with pytest.raises(
         InvalidObject, match=r"Policy in spec\.selector\.zones: edges of its zones cross more than 50000 times"
     ):
         compiled(policy("in", ("north", "east"), **inside), zones=spiky)
-    # The previously granted policy is kept, as for every broken policy.
+    # A refreshed Grant keeps the previous version of the policy, like that of every broken policy.
     (granted,) = compiled(policy("in", ("north",), **inside), zones=spiky)
     stock = inventory([drone("d")], zones={z.name: z for z in spiky})
     broken = dataclasses.replace(stock, policies={"in": policy("in", ("north", "east"), **inside)})
     assert refresh(granted, broken).policies == granted.policies
-    # Exclusion zones need no union.
+    # Exclusion zones are accepted, because they are not united.
     assert compiled(policy("out", ("north", "east"), **FENCE), zones=spiky)
 
 
 def test_zone_validity_cache_is_cleared_with_the_zone():
-    """Each change of a zone, even of its status, creates a new object."""
+    """Each change of a zone, even of its status, creates a new object, so the cache would grow."""
     gc.collect()
     before = len(_VALIDATED)
     near = zone("near", (50, 0))
@@ -271,7 +271,7 @@ def test_grant_keeps_camera_policies_of_distant_zones_in_view(spec):
     app = application(component("Watch", "edge", locations=locations, services=services))
     (grant,) = compile_grants(app, plan(app, stock), stock)
     assert [[z.name for z in p.zones] for p in grant.policies] == [["near"]]
-    # The camera has no description, so it may see everything around it.
+    # A camera without description may see everything around it.
     view = Situation(time_s=0.0, lat=FRAME.lat, lon=FRAME.lon, altitude_m=5.0, home=Home(FRAME.lat, FRAME.lon, 0.0))
     assert not judge(Call("CaptureImage", CaptureArgs()), view, compile_grant(grant)).permits
 

@@ -49,7 +49,10 @@ async def test_capture_is_refused_when_drone_crosses_privacy_zone_during_exposur
 
 
 async def test_capture_is_refused_when_camera_turns_to_privacy_zone_and_back(world: World) -> None:
-    """The view is narrow and oblique. At both ends of the exposure, the zone 60 m to the south is behind the camera."""
+    """The zone is 60 m to the south, behind the narrow oblique view of the camera.
+
+    The camera turns to the zone and back during the exposure.
+    """
     world.drone.lens = Lens(20.0, 20.0, pitch_deg=-15.0, stabilised=True, error_deg=0.0)
 
     def turn_and_return(**changes: float) -> None:
@@ -76,7 +79,7 @@ async def test_capture_is_refused_when_camera_turns_to_privacy_zone_and_back(wor
 
 @pytest.mark.parametrize("model", ["pinhole", "equidistant", None])
 async def test_focal_length_is_in_metadata_only_of_pinhole_camera(tmp_path: Path, model: str | None) -> None:
-    """The view of a fisheye lens is only known by an upper bound."""
+    """For a fisheye lens, only an upper bound of the view is known, so there is no focal length."""
     described = {"methods": ["CaptureImage"], "horizontalFieldOfView": 60} | (
         {"lens": {"model": model}} if model else {}
     )
@@ -119,7 +122,7 @@ async def test_delayed_picture_is_judged_by_zones_active_at_exposure(world: Worl
     assert await refusal(world.camera.capture(grant, CaptureArgs())) == "PrivacyZone"
 
 
-async def test_queued_capture_is_judged_and_located_at_its_turn(world: World) -> None:
+async def test_queued_capture_is_judged_with_the_position_of_its_exposure(world: World) -> None:
     held_up = threading.Event()
     world.scene.during = lambda: held_up.wait(10) and None
     waiting = [asyncio.create_task(world.capture(active_grant())) for _ in range(MAX_PER_OWNER)]
@@ -193,7 +196,7 @@ async def test_audit_contains_filters_that_become_necessary(world: World) -> Non
     await world.capture(faces)  # The drone is too high to detect faces.
     plain = await world.capture(free)
     world.drone.y = 80.0
-    await world.pixels(bound, record)  # This picture is already filtered, the next one is not.
+    await world.pixels(bound, record)  # The filter was applied at capture to `record`, but not to `plain`.
     await world.pixels(bound, plain)
     await world.audit.close()
     assert written() == [
@@ -307,7 +310,7 @@ async def test_faces_cut_by_cropping_are_blurred(
     world = World(tmp_path, (1600, 1600))
     world.drone.y = 0.0
     world.drone.alt = 2.0
-    # The strip shows two thirds of a face that is 97 pixels wide. A detector does not find it.
+    # The cropped picture shows two thirds of a face with a width of 97 pixels. A detector would not find this part.
     scene = np.full((1600, 1600, 3), 90, np.uint8)
     left = 776 - 225
     top = 776 - 114
@@ -326,7 +329,7 @@ async def test_faces_cut_by_cropping_are_blurred(
     world.drone.y = 80.0
     record = await world.capture(later, width=width, height=height)
     assert not record.filters
-    assert not record.face_px, "faces in the picture cannot be detected later either"
+    assert not record.face_px, "face detection is not possible after cropping"
     assert (await world.capture(later, width=800, height=800)).face_px
     world.shutter.close()
 
@@ -353,7 +356,7 @@ async def test_weakly_blurred_faces_get_fallback_of_stricter_policy(tmp_path: Pa
 async def test_stored_picture_shows_only_judged_view(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, size: tuple[int, int], shown: tuple[int, int]
 ) -> None:
-    """The footprint is that of 16:9, so other proportions of the camera are cropped."""
+    """The footprint is computed for 16:9. Pictures with another aspect ratio are cropped to it."""
     world = World(tmp_path, (160, 90))
     picture = np.zeros((size[1], size[0], 3), np.uint8)
     left = (size[0] - shown[0]) // 2
@@ -375,7 +378,7 @@ async def test_face_size_is_unknown_without_lens(world: World) -> None:
     world.drone.lens = None
     verdict, _ = await world.camera.capture(active_grant(private("blurFaces")), CaptureArgs())
     assert "the size of faces is unknown" in verdict.reason
-    assert verdict.policies == ("p",), "80 m away, but the view of the camera is unknown"
+    assert verdict.policies == ("p",), "the zone is 80 m away, but the view of the camera is unknown"
 
 
 async def test_enlarged_picture_does_not_enlarge_smallest_face(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -67,7 +67,7 @@ def test_blur_leaves_16_by_16_values_and_no_face(blur: Any, photo: Pixels, detec
     assert blurred.shape == photo.shape
     assert abs(float(blurred.mean()) - float(photo.mean())) < 12
     assert not covers(detector.detect(blurred, 48, upright=True), FACE)
-    # The picture contains no structure finer than a cell: it can be computed from 16x16 values.
+    # The blurred picture can be computed from 16x16 values, so it contains no finer structure.
     few = cv2.resize(blurred[16::32, 16::32], (512, 512), interpolation=cv2.INTER_LINEAR)
     assert float(np.abs(few.astype(float) - blurred).mean()) < 6
 
@@ -104,7 +104,7 @@ def test_hide_faces_reveals_nothing_when_boxes_overlap(method: Any, photo: Pixel
     coarse[region] = cv2.resize(cells, (168, 168), interpolation=cv2.INTER_NEAREST)
     for boxes in ([face, (140, 130, 30, 30), (110, 150, 24, 24)], [(140, 130, 30, 30), face], [face, (60, 60, 40, 40)]):
         visible, nothing = (hide_faces(source, boxes, method)[region] for source in (photo, coarse))
-        # A box across the edge of the region mixes in adjacent pixels, before or after the face is hidden.
+        # One box crosses the edge of the region, so pixels next to the region affect the result.
         assert float(np.abs(visible.astype(int) - nothing).mean()) < 1, boxes
 
 
@@ -140,7 +140,9 @@ def test_remove_background_keeps_moving_objects_only(photo: Pixels) -> None:
     assert mask is not None
     foreground = remove_background(now, mask)
     assert (foreground[352:378, 202:238] == (0, 0, 255)).all()
-    assert (foreground.max(axis=2) > 0).mean() < 0.08, "the landscape and the earlier place of the car must be black"
+    assert (foreground.max(axis=2) > 0).mean() < 0.08, (
+        "the landscape and the previous position of the car must be black"
+    )
     assert foreground[66:163, 177:274].max() == 0
     standing = detect_motion(frame(0, 100), frame(0, 200), frame(0, 300), fixed=True)
     assert standing is not None

@@ -89,7 +89,7 @@ async def test_picture_of_earlier_release_has_unknown_position(tmp_path: Path) -
 
 
 async def test_faces_are_not_detected_in_picture_that_may_be_cropped(tmp_path: Path) -> None:
-    """Earlier releases cropped pictures before face detection without a record of it."""
+    """Earlier releases cropped pictures before face detection, and did not record this."""
     world = World(tmp_path)
     record = await world.capture(active_grant())
     record_path = world.store.path(owner_of(active_grant()), record.name).with_suffix(".json")

@@ -21,7 +21,7 @@ def zone(name: str, version: int, value: int = 0) -> Body:
 
 
 class Script:
-    """Fake client that returns scripted lists and watches in order, and then waits forever."""
+    """Fake client. It returns the scripted lists and watches in order, and then waits forever."""
 
     def __init__(self, *steps: Any) -> None:
         self.steps = list(steps)
@@ -136,7 +136,10 @@ async def test_informer_reconnects_after_broken_connection(monkeypatch: pytest.M
 
 
 async def test_informer_lists_again_after_long_silence(monkeypatch: pytest.MonkeyPatch) -> None:
-    """An API server restored from a backup sends no events until it reaches the version of the watch again."""
+    """An API server that was restored from a backup has lower versions than the watch.
+
+    It sends no events until it reaches the version of the watch again.
+    """
     monkeypatch.setattr(informer_module, "_SILENCE_S", 0.0)
     silent = [KubeError(0, "Unreachable", "TimeoutError")]
     script = Script(page(50, zone("a", 40, 4), zone("b", 41, 5)), silent, page(9, zone("a", 7, 3)))

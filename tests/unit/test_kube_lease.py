@@ -87,7 +87,7 @@ async def step(*leases: Lease) -> None:
             await asyncio.sleep(0)
         if task.done():
             task.result()
-        # End like a killed process, without releasing the Lease.
+        # End the task without a release of the Lease, like a killed process.
         one_release = candidate._release
         candidate._release = _nothing  # type: ignore[method-assign]
         task.cancel()
@@ -114,12 +114,12 @@ async def test_second_candidate_waits_for_lease_duration() -> None:
     clock.now += 0.1
     await step(second)
     assert second.left_s > 0
-    # The first holder stopped long before.
+    # The first holder must have stopped acting long before the second one acts.
     assert acted_until < clock.now - 0.2 * DURATION_S
     assert first.left_s == 0
 
 
-async def test_renewed_lease_keeps_others_out() -> None:
+async def test_renewed_lease_excludes_other_candidates() -> None:
     shelf = Shelf()
     clock = Clock()
     first = lease(shelf, clock, "first")
@@ -144,8 +144,11 @@ async def test_frozen_holder_loses_lease() -> None:
         await step(first)
 
 
-async def test_restored_lease_is_lost() -> None:
-    """Use the Lease of an older backup. Watches would wait for versions that do not exist yet."""
+async def test_holder_gives_up_lease_that_was_restored_from_backup() -> None:
+    """A Lease from an older backup has a lower version.
+
+    The holder must give up, because its watches would wait for versions that do not exist yet.
+    """
     shelf = Shelf()
     clock = Clock()
     only = lease(shelf, clock, "only")
@@ -273,7 +276,7 @@ async def test_renewal_without_response_is_released() -> None:
     assert second.left_s > 0
     writes = shelf.writes
     await first._release()
-    assert shelf.writes == writes, "a Lease of another holder is not released"
+    assert shelf.writes == writes, "the first candidate does not release the Lease of the second one"
 
 
 class _Closable(Shelf):

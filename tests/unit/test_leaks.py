@@ -1,4 +1,4 @@
-"""The search for secrets finds each secret in all encodings, and has no false positives."""
+"""Search for leaked secrets: it finds each secret in all encodings, and has no false positives."""
 
 from __future__ import annotations
 

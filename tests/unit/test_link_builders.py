@@ -56,7 +56,9 @@ def test_direct_link_target_is_ready_pod() -> None:
     assert target(old, new) == {"address": "10.1.0.6", "port": 8080}
     assert target(new, pod("c", "10.1.0.7", ready=False), pod("d", None)) == {"address": "10.1.0.6", "port": 8080}
     assert target(old) is None
-    assert "target" not in links(pod("b", "10.1.0.6"))["edge-2"]["spec"]["services"][0], "a pod of another node"
+    assert "target" not in links(pod("b", "10.1.0.6"))["edge-2"]["spec"]["services"][0], (
+        "the target is not a pod of another node"
+    )
 
 
 def caller(*pods: PodView) -> object:
@@ -72,7 +74,7 @@ def test_direct_link_callers_are_pods_on_drone_with_access() -> None:
     new = viewer("b", "10.2.0.6")
     assert caller(viewer("a", None)) == [{"instance": "traffic-aerial-viewer"}]
     assert caller(old, new) == [{"instance": "traffic-aerial-viewer", "address": "10.2.0.6"}], (
-        "a new pod may call at once"
+        "the address of the new pod replaces that of the terminating pod"
     )
     assert caller(old, viewer("b", "10.2.0.6", finished=True)) == [
         {"instance": "traffic-aerial-viewer", "address": "10.2.0.5"}
@@ -80,7 +82,7 @@ def test_direct_link_callers_are_pods_on_drone_with_access() -> None:
     assert retargeted(links(old)["edge-1"]["spec"]["services"], [new])[0]["callers"] == caller(new)
 
 
-def test_direct_link_has_no_callers_when_component_names_none() -> None:
+def test_direct_link_has_no_callers_field_when_component_names_no_callers() -> None:
     body = copy.deepcopy(INPUT["application"])
     viewer = next(c for c in body["spec"]["components"] if c["name"] == "AerialViewer")
     del viewer["egress"]

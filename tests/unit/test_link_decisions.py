@@ -1,4 +1,4 @@
-"""Decisions of the drone's link controller, and its range model, without radios, clocks or threads."""
+"""Decisions and range model of the drone's link controller. The tests need no radio, clock or thread."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def test_peer_with_beacons_is_linked_if_a_better_peer_is_silent() -> None:
     assert actions(LinkSituation(NOW_S, STANDING, (traffic,), NO_LINK, both, CLOUD)).peer == "e2"
 
 
-def test_traffic_moves_once_the_link_is_measured_and_serves() -> None:
+def test_traffic_moves_to_link_that_is_measured_and_has_routes() -> None:
     assert actions(replace(LINKED, direct=None)).planned == {}
     unserved = actions(replace(LINKED, routes={}))
     assert (unserved.planned, unserved.targets["ns/app"].code) == ({}, "NotServed")
@@ -78,7 +78,7 @@ def test_link_slower_than_the_cloud_path_carries_no_traffic() -> None:
     assert (restored.planned, restored.abrupt) == ({VIP: None}, {})
 
 
-def test_traffic_leaves_a_lost_link_abruptly() -> None:
+def test_traffic_leaves_a_lost_link_without_drain() -> None:
     decided = actions(replace(DIRECT, link=NO_LINK, direct=None, routes={}))
     assert (decided.abrupt, decided.planned) == ({VIP: None}, {})
 
@@ -135,7 +135,7 @@ def test_traffic_leaves_an_unreachable_cloud_path(heuristic_of: tuple[str, str |
     worse = replace(WIFI, ingress_mbps=0.1, egress_mbps=0.1, ingress_latency_ms=500.0)
     linked = replace(LINKED, traffic=(traffic,), direct=worse, **SILENT)
     decided = actions(linked)
-    # The connections on the cloud path hang, so they are closed without a drain.
+    # The connections on the unreachable cloud path hang, so traffic moves without a drain.
     assert (decided.abrupt, decided.planned, decided.targets["ns/app"].code) == ({VIP: ROUTE}, {}, "CloudSilent")
     unchanged = actions(replace(linked, redirects={VIP: ROUTE}))
     assert unchanged.abrupt == unchanged.planned == {}
@@ -149,11 +149,11 @@ def test_slow_link_is_made_and_kept_without_a_cloud_path() -> None:
     alone = LinkSituation(NOW_S, STANDING, (slow,), NO_LINK, IN_CONTACT, CLOUD)
     assert actions(alone).peer == ""
     assert actions(replace(alone, **SILENT)).peer == "e1"
-    for east in (-69.0, -75.0):  # inside the declared range but about to leave it, and outside of it
+    for east in (-69.0, -75.0):  # shortly before the end of the declared range, and beyond it
         leaving = replace(DIRECT, track=Track((east, 0.0, 0.0), velocity_mps=(-3.0, 0.0, 0.0)), **SILENT)
         decided = actions(leaving)
         assert (decided.peer, decided.planned, decided.abrupt) == ("e1", {}, {})
-        assert not actions(replace(leaving, redirects={})).abrupt, "no traffic moves to a link that is about to end"
+        assert not actions(replace(leaving, redirects={})).abrupt, "traffic must not move to a link that will soon end"
 
 
 def test_traffic_waits_for_the_cloud_path_if_no_path_works() -> None:
@@ -171,7 +171,7 @@ def range_model(distance_m: float, **learned: float) -> RangeModel:
     return model
 
 
-def test_range_grows_with_measurements_beyond_it_but_not_with_beacons() -> None:
+def test_range_grows_after_measurement_beyond_it_but_not_after_beacon() -> None:
     model = range_model(96.0)
     model.on_beacon("e1", NOW_S)
     assert model.ranges["e1"] == LearnedRange(last_beacon_s=NOW_S)
@@ -198,7 +198,7 @@ def test_range_model_forgets_peers_that_are_not_planned() -> None:
     assert set(model.ranges) == {"e2"}
 
 
-def test_loss_well_inside_the_range_does_not_shorten_it() -> None:
+def test_link_loss_well_inside_the_range_does_not_shorten_the_range() -> None:
     near = range_model(10.0)
     far = range_model(64.0)
     near.on_link_lost("e1", NOW_S)
@@ -207,7 +207,7 @@ def test_loss_well_inside_the_range_does_not_shorten_it() -> None:
     assert far.ranges["e1"].range_factor == pytest.approx(0.8 / 1.02)
 
 
-def test_range_is_restored_by_a_beacon_from_where_the_link_broke() -> None:
+def test_beacon_at_the_distance_of_the_link_loss_restores_the_range() -> None:
     model = range_model(64.0)
     model.on_link_lost("e1", NOW_S)
     assert model.ranges["e1"].last_failure_s == NOW_S

@@ -1,4 +1,4 @@
-"""Events of direct links: each change has one Event, in order. A flapping link has few Events."""
+"""Events of direct links: one Event for each change, in the order of the changes, and few Events of a flapping link."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def events(posted: Recorder) -> LinkEventRecorder:
 
 
 async def see(events: LinkEventRecorder, *reports: LinkReport | None) -> None:
-    """Deliver the reports by the watch, one after the other."""
+    """Deliver the reports one by one, like the watch."""
     for now in reports:
         events.changed(KEY, events._current.get(KEY), now)
         await events.reconcile(KEY)

@@ -1,4 +1,7 @@
-"""Link planner compared with exhaustive enumeration, and in closed loop with an oracle that knows the whole flight."""
+"""Link planner: its plans compared with exhaustive enumeration, and its gain compared with other rules.
+
+The gain of a simulated flight is also compared with the maximum gain, which requires knowledge of the whole flight.
+"""
 
 from __future__ import annotations
 
@@ -68,7 +71,7 @@ def decide(track: Track, peers: Sequence[Peer], link: LinkState = NO_LINK, now_s
 
 
 def best_by_enumeration(horizon: Horizon, step: int, state: int) -> float:
-    """Return the best sum of scores from a step on, by exhaustive enumeration of all moves."""
+    """Return the best sum of scores from `step` to the end of the horizon, by enumeration of all moves."""
     if step >= horizon.steps:
         return 0.0
     options = [horizon.cloud + best_by_enumeration(horizon, step + 1, 0)]
@@ -245,7 +248,7 @@ def test_heuristics_are_found_by_name() -> None:
         find_heuristic("fastest")
 
 
-# Closed loop compared with the maximum possible gain and the rule of the thesis
+# Simulated flights: the gain of the planner compared with the maximum gain and with the rule of the thesis
 
 
 def recorded_flight(path: list[LocalPosition], speed: float, peers: list[Peer], factor: float = 1.0) -> RecordedFlight:
@@ -254,7 +257,10 @@ def recorded_flight(path: list[LocalPosition], speed: float, peers: list[Peer], 
 
 
 def fig_8_12(factor: float = 1.0) -> RecordedFlight:
-    """Return a scene like Fig. 8.12: WP1-WP2-WP3 at 3 m/s. E5 covers no part of the path, and E2 has no WiFi."""
+    """Return a flight similar to the simulation experiment of the thesis (Fig. 8.12).
+
+    The drone flies from WP1 over WP2 to WP3 at 3 m/s. E5 covers no part of the path. E2 has no WiFi, so it is omitted.
+    """
     peers = [peer("e1", 40, 45), peer("e3", 175, -30), peer("e4", 262, 60), peer("e5", 60, 320), peer("e6", 265, 190)]
     return recorded_flight([(0, 0, 20), (240, 0, 20), (240, 240, 20)], 3.0, peers, factor)
 
@@ -271,13 +277,13 @@ def random_flight(seed: int) -> RecordedFlight:
 
 @functools.cache
 def most(seed: int) -> float:
-    """Return the gain of the oracle in a random flight."""
+    """Return the maximum possible gain in a random flight."""
     return best_gain(random_flight(seed))
 
 
 @functools.cache
 def gained(seed: int, rule: Rule) -> tuple[float, int]:
-    """Return the gain of a rule in a random scene, and the number of its links."""
+    """Return the gain of a rule in a random flight, and the number of links that it makes."""
     return gain_of_rule(random_flight(seed), rule)
 
 
@@ -306,7 +312,7 @@ def test_planner_gains_more_with_fewer_links_than_the_thesis_rule() -> None:
 
 
 def test_no_rule_gains_more_than_the_best_gain() -> None:
-    """Check the planner, the rule of the thesis and a random rule."""
+    """The rules are the planner, the rule of the thesis, and a random rule."""
     rng = random.Random(3)
 
     def random_rule(flight: RecordedFlight, _step: int, link: LinkState, _ranges: dict[str, LearnedRange]) -> str:

@@ -1,4 +1,4 @@
-"""Log formats, and the rate limit of lines that a caller can cause."""
+"""Log formats, and the rate limit of log lines that callers cause."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class LimitedLog:
         self.limit = CallerLogLimit(lambda: self.now_s)
 
     def write(self, caller: str, line: int = 1) -> str | None:
-        """Return the message of a record, or None if the record is suppressed."""
+        """Log a record of a caller. Return its message, or None if the limit suppresses the record."""
         record = logging.LogRecord("n", logging.ERROR, "module.py", line, "refused (caller=%s)", (caller,), None)
         if caller:
             record.limit_by = caller

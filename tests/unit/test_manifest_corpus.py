@@ -1,4 +1,7 @@
-"""The corpus of manifests as validated by `fractus plan`. tests/integration compares it with the API server."""
+"""Validation of the manifest corpus by `fractus plan`.
+
+A test in tests/integration validates the same corpus by the API server.
+"""
 
 import json
 import re

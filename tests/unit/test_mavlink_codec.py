@@ -1,4 +1,4 @@
-"""The MAVLink codec: encoding by name, and a parser that accepts every stream of bytes without an error."""
+"""MAVLink codec: messages are encoded by name, and the parser raises no error for any bytes."""
 
 from __future__ import annotations
 
@@ -132,7 +132,7 @@ def test_mavlink_1_is_decoded() -> None:
 
 @pytest.mark.parametrize("length", [0, 1, 8, 9, 20, 255])
 def test_payload_of_another_length_than_defined_is_decoded(length: int) -> None:
-    """Senders cut trailing zeros, and a newer dialect appends fields."""
+    """Payloads are shorter if the sender cuts trailing zeros, and longer if a newer dialect has more fields."""
     payload = bytes(range(1, 256))[:length]
     (received,) = Parser().feed(frame_v2(mavlink.MAVLink_heartbeat_message, payload))
     assert received.integer("custom_mode") == int.from_bytes(payload[:4], "little")
@@ -153,8 +153,8 @@ def test_fragmented_frames_between_garbage_are_decoded() -> None:
 
 
 @pytest.mark.parametrize("length", [0, 2, 30, 60, 100, 255])
-def test_frames_behind_a_damaged_length_byte_are_decoded(length: int) -> None:
-    """The parser of pymavlink loses these frames."""
+def test_frames_after_a_damaged_length_byte_are_decoded(length: int) -> None:
+    """Unlike this parser, the parser of pymavlink loses the frames after the damaged byte."""
     damaged = bytearray(heartbeat(99))
     damaged[1] = length
     intact = [heartbeat(number) for number in range(20)]
@@ -164,10 +164,10 @@ def test_frames_behind_a_damaged_length_byte_are_decoded(length: int) -> None:
     assert parser.bad >= 1
 
 
-def test_frame_behind_a_truncated_frame_is_decoded() -> None:
+def test_frame_after_a_truncated_frame_is_decoded() -> None:
     whole = Endpoint(1, 1).encode("ATTITUDE", {"yaw": 1.0})
     for length in range(1, len(whole)):
-        # Enough bytes follow to complete the length in the header of the truncated frame.
+        # The zeros make the stream longer than the length that the truncated header announces.
         received = Parser().feed(whole[:length] + heartbeat(7) * 3 + bytes(300))
         assert [message.integer("custom_mode") for message in received] == [7, 7, 7], length
 
@@ -222,7 +222,7 @@ def test_unknown_incompatibility_flag_is_refused() -> None:
     ),
     st.booleans(),
 )
-def test_any_bytes_give_the_same_messages_however_they_are_cut(chunks: list[bytes], signed: bool) -> None:
+def test_decoded_messages_do_not_depend_on_the_division_of_the_stream(chunks: list[bytes], signed: bool) -> None:
     def parse(parts: list[bytes]) -> tuple[list[Message], int]:
         endpoint = signing_endpoint(KEY, 1000) if signed else Endpoint(1, 1)
         messages = [message for part in parts for message in endpoint.decode(part)]
@@ -233,7 +233,7 @@ def test_any_bytes_give_the_same_messages_however_they_are_cut(chunks: list[byte
     assert repr(parse([stream])) == repr(parse(chunks)) == repr(parse([stream[i : i + 1] for i in range(len(stream))]))
 
 
-def test_only_frames_with_the_key_are_accepted_once_signing_is_on() -> None:
+def test_only_frames_signed_with_the_key_are_accepted_while_signing_is_enabled() -> None:
     receiver = signing_endpoint(KEY, 1000, sysid=1)
     frame = signing_endpoint(KEY, 1000).encode("HEARTBEAT", {})
     (received,) = receiver.decode(frame)
@@ -253,7 +253,7 @@ def test_modem_status_needs_no_signature() -> None:
     assert (received.name, received.signed) == ("RADIO_STATUS", False)
 
 
-def test_forged_signature_with_a_late_timestamp_does_not_shut_out_the_sender() -> None:
+def test_forged_signature_with_a_late_timestamp_does_not_block_the_sender() -> None:
     receiver = signing_endpoint(KEY, 1000, sysid=1)
     sender = signing_endpoint(KEY, 1000)
     assert receiver.decode(signing_endpoint(FOREIGN_KEY, 10**9).encode("HEARTBEAT", {})) == []
@@ -262,7 +262,7 @@ def test_forged_signature_with_a_late_timestamp_does_not_shut_out_the_sender() -
     assert len(receiver.decode(sender.encode("HEARTBEAT", {}))) == 1
 
 
-def test_signing_off_accepts_every_frame_again() -> None:
+def test_every_frame_is_accepted_after_signing_is_disabled() -> None:
     receiver = signing_endpoint(KEY, 1000, sysid=1)
     receiver.set_signing(None)
     assert not receiver.signed
@@ -292,9 +292,9 @@ def test_frame_with_an_unknown_message_id_is_skipped_whole() -> None:
     assert [message.name for message in Parser().feed(bytes(unknown) + heartbeat())] == ["HEARTBEAT"]
 
 
-def test_frame_behind_a_refused_signature_is_decoded_without_delay() -> None:
+def test_frame_after_a_frame_with_refused_signature_is_decoded_without_delay() -> None:
     receiver = signing_endpoint(KEY, 1000, sysid=1)
-    # The unsigned frame holds bytes that look like the start of a long frame.
+    # The payload of the unsigned frame contains bytes that look like the start of a long frame.
     unsigned = Endpoint(255, 190).encode("HEARTBEAT", {"custom_mode": 0xFDFD})
     assert receiver.decode(unsigned) == []
     assert [message.name for message in receiver.decode(signing_endpoint(KEY, 2000).encode("HEARTBEAT", {}))] == [

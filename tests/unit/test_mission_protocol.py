@@ -19,7 +19,10 @@ ITEMS = tuple(MissionItem(5001, 3.0, 393600000 + i, 229500000 - i) for i in rang
 
 
 class ListVehicle(MavlinkAutopilot):
-    """Fake autopilot that stores one list. Messages with the numbers in `lost` are lost, in either direction."""
+    """Fake autopilot that stores one list.
+
+    `lost` contains the numbers of messages that get lost in either direction.
+    """
 
     def __init__(self, *lost: int, result: int = 0) -> None:
         super().__init__("tcp:nowhere:1", ARDUCOPTER)
@@ -41,7 +44,7 @@ class ListVehicle(MavlinkAutopilot):
             if answer is not None and self._passes():
                 self.take(
                     message("MISSION_ACK", mission_type=mavlink.MAV_MISSION_TYPE_MISSION)
-                )  # of another list, which must be ignored
+                )  # an acknowledgement for another list must be ignored
                 self.take(answer)
 
     def _answer(self, outgoing: Message) -> Message | None:
@@ -122,7 +125,7 @@ async def test_refusal_contains_the_status_text_of_the_autopilot(result: int, ki
 
 async def test_lost_acknowledgement_of_the_last_item_is_not_a_refusal() -> None:
     class Finished(ListVehicle):
-        """Respond with ERROR to an unexpected item, as ArduPilot does."""
+        """Fake autopilot that responds with ERROR to an item after the upload has ended, as ArduPilot does."""
 
         def _answer(self, outgoing: Message) -> Message | None:
             if outgoing.name == "MISSION_ITEM_INT" and len(self.items) == self.expected_count:
@@ -138,7 +141,7 @@ async def test_lost_acknowledgement_of_the_last_item_is_not_a_refusal() -> None:
 
 async def test_duplicate_item_does_not_end_the_upload() -> None:
     class Impatient(ListVehicle):
-        """Request the second item again before it arrives, and report the duplicate as out of order."""
+        """Fake autopilot that requests the second item twice, and reports the second copy as out of order."""
 
         def _answer(self, outgoing: Message) -> Message | None:
             if outgoing.name == "MISSION_ITEM_INT" and outgoing.integer("seq") < len(self.items):

@@ -23,7 +23,10 @@ def instance(application, component, node=None):
 
 
 def divisions(tokens):
-    """Return all divisions of words into application, component and optional node, joined by hyphens or dots."""
+    """Return all divisions of the tokens into application, component and optional node.
+
+    The tokens of a name are joined by hyphens or dots.
+    """
     results = []
     for i, j in itertools.combinations(range(1, len(tokens) + 1), 2):
         component = "-".join(tokens[i:j])
@@ -58,7 +61,7 @@ def test_instance_names_differ_when_joined_parts_are_equal(first, second):
 def test_instance_names_differ_for_every_division_of_same_words(tokens):
     divided = divisions(tokens)
     names = [instance(*parts) for parts in divided]
-    # Names that imitate generated names, including the hash, also differ from all other names.
+    # Objects may have names that imitate generated names, including the hash. The results must still be unique.
     generated = {parts for name in names for parts in divisions(name.split("-"))} if len(tokens) < 4 else set()
     everything = list(dict.fromkeys([*divided, *generated]))
     names = [instance(*parts) for parts in everything]

@@ -1,4 +1,4 @@
-"""Description of a node: the object from the agent, the owner's file, or neither."""
+"""Sources of a node description: the object stored by the agent, or the file of the owner."""
 
 from __future__ import annotations
 

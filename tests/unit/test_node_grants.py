@@ -102,7 +102,9 @@ def test_node_grants_refuse_oversized_data_without_unpacking_it() -> None:
 
 @pytest.mark.parametrize("bound", ["MAX_UNPACKED_BYTES", "MAX_PACKED_BYTES"])
 @pytest.mark.parametrize("fits", [0, 1, 5, 9, 10])
-def test_node_grants_pack_oldest_when_too_many(monkeypatch: pytest.MonkeyPatch, bound: str, fits: int) -> None:
+def test_node_grants_contain_oldest_grants_when_space_is_limited(
+    monkeypatch: pytest.MonkeyPatch, bound: str, fits: int
+) -> None:
     chance = random.Random(7)
     bodies = [
         body(f"g{9 - hour}", {"noise": chance.randbytes(500).hex()}, creationTimestamp=f"2026-01-01T0{hour}:00:00Z")

@@ -1,4 +1,4 @@
-"""Claims, bookings and active plans that are updated by events equal those computed from all objects."""
+"""Claims, bookings and active plans: values updated by events must equal values computed from all objects."""
 
 from __future__ import annotations
 
@@ -54,7 +54,10 @@ def plan_spec(node: str, host: Key | None, generation: int, placed_on: str) -> d
 
 
 class EventsOfTheCluster(RuleBasedStateMachine):
-    """Objects are created, changed and deleted. The operator receives events late, repeatedly, or by another list."""
+    """State machine with random changes of objects.
+
+    The operator receives the changes late, repeatedly, or by a new list.
+    """
 
     def __init__(self) -> None:
         super().__init__()
@@ -176,7 +179,7 @@ class EventsOfTheCluster(RuleBasedStateMachine):
         informer = self.informer(kind)
         known = informer.get(key) is not None
         informer._take(type_, copy.deepcopy(body))
-        # An object deleted before the last response is present again, and its plan stays.
+        # The response to a write may bring a deleted object back. Its plan is then kept.
         if kind is kinds.APPLICATION and known and informer.get(key) is None:
             self.decided.pop(key, None)
 
@@ -196,14 +199,17 @@ class EventsOfTheCluster(RuleBasedStateMachine):
 
     @rule(kind=st.sampled_from(KINDS))
     def return_write(self, kind: Kind) -> None:
-        """A write of the operator returns before the watch reports it."""
+        """Deliver the response to a write of the operator before the event of the watch."""
         if self.pending[kind] and self.pending[kind][-1][0] != "DELETED":
             body = copy.deepcopy(self.pending[kind][-1][1])
             self.informer(kind).record_write(key_of(body), body)
 
     @rule(kind=st.sampled_from(KINDS))
     def list_again(self, kind: Kind) -> None:
-        """An object that was deleted meanwhile is only missing in the list."""
+        """List all objects again.
+
+        Objects that were deleted in the meantime are missing in the list, without an event.
+        """
         self.pending[kind] = []
         for body in self.stored[kind].values():
             self.receive(kind, "MODIFIED", body)

@@ -84,5 +84,5 @@ def test_chart_readme_lists_values(chart: str) -> None:
         ]
 
     for name in leaves(yaml.safe_load((CHARTS / chart / "values.yaml").read_text()), ""):
-        # A value in braces has one row.
+        # A value that is an object may have one row for all its fields.
         assert f"`{name}`" in text or f"`{name.rpartition('.')[0]}`" in text, name

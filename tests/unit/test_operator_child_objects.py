@@ -41,7 +41,7 @@ class Copy(dict[Key, Body]):
 
 
 class Webhooks:
-    """A fake API server that never responds to writes of one kind."""
+    """Fake API server. It never responds to writes of the kind `hanging`, as if a webhook was hanging."""
 
     def __init__(self, hanging: Kind | None, full: int = 0) -> None:
         self.hanging = hanging
@@ -116,8 +116,8 @@ def standing(kind: Kind, **metadata: Any) -> Body:
     return {**kind.header("one", "city", uid="1", **metadata), "spec": {"old": True}}
 
 
-async def test_taken_name_is_created_once_and_then_looked_up() -> None:
-    """Each failed creation counts against the quota of the namespace."""
+async def test_object_with_taken_name_is_created_once_and_then_looked_up() -> None:
+    """The operator looks up the existing object, because each failed creation counts against the quota."""
     store = Webhooks(None)
     store.objects[kinds.SERVICE, "one"] = standing(kinds.SERVICE)
     children = child_objects(store)
@@ -175,7 +175,10 @@ async def test_grant_of_another_application_is_not_written() -> None:
 
 
 async def test_endpoint_slice_of_kubernetes_is_not_deleted() -> None:
-    """EndpointSlices created by Kubernetes have the labels of their Service. Kubernetes creates a deleted one again."""
+    """EndpointSlices of Kubernetes have the labels of their Service, so they look like those of the operator.
+
+    If the operator deleted such an EndpointSlice, Kubernetes would create it again.
+    """
     store = Spelling(None)
     copies = {kind: OwnedObjects(cast(Any, store), kind, lambda body: body, lambda *_: None) for kind in kinds.CHILDREN}
     children = ChildObjects(cast(Any, store), copies, cast(Any, None))
@@ -206,7 +209,10 @@ async def test_addresses_are_updated_only_in_endpoint_slices_of_the_operator() -
 
 @pytest.mark.parametrize("owner", ["Application", "Service"])
 async def test_deployment_with_changed_owner_is_deleted(owner: str) -> None:
-    """Users who may edit a namespace may change the owner, so that the Deployment would outlive its Application."""
+    """Users with edit permission in a namespace can change the owner of a Deployment.
+
+    Without explicit deletion, the Deployment would outlive its Application.
+    """
     store = Spelling(None)
     copies = {kind: OwnedObjects(cast(Any, store), kind, lambda body: body, lambda *_: None) for kind in kinds.CHILDREN}
     body = owned_object(kinds.DEPLOYMENT, APPLICATION, "one", {})
@@ -218,7 +224,7 @@ async def test_deployment_with_changed_owner_is_deleted(owner: str) -> None:
 
 @pytest.mark.parametrize("has_finalizer", [True, False])
 async def test_pods_of_deployment_with_foreign_finalizer_are_deleted_one_by_one(has_finalizer: bool) -> None:
-    """The garbage collector deletes the pods of a deleted Deployment."""
+    """The finalizer keeps the Deployment, so the garbage collector does not delete its pods."""
     store = Spelling(None)
     labels = {"app.kubernetes.io/managed-by": "fractus", "fractus.dev/instance": "one"}
 
@@ -226,7 +232,7 @@ async def test_pods_of_deployment_with_foreign_finalizer_are_deleted_one_by_one(
         return kind.header("one", "city", uid=uid, labels=labels, ownerReferences=[{"uid": owner}]) | {"spec": {}}
 
     deployment = owned(kinds.DEPLOYMENT, "d", "app")
-    # The Deployment is not selected by its label, because users may have removed the label too.
+    # The Deployment is not found by its label, because users may have removed the label.
     store.with_finalizer = frozenset({(kinds.DEPLOYMENT, "one")} if has_finalizer else ())
     listed = {
         kinds.DEPLOYMENT: [],
@@ -270,7 +276,7 @@ async def test_teardown_deletes_kept_pods() -> None:
 
 
 class Late(Store):
-    """A fake API server in which requests without a response take effect late, with the reactions of controllers."""
+    """Fake API server for requests that take effect late. A test adds the objects that controllers then create."""
 
     def __init__(self) -> None:
         self.objects: dict[tuple[str, Key], Body] = {}
@@ -305,7 +311,7 @@ class Late(Store):
 
 
 def cache_with_pods(store: Late) -> ClusterCache:
-    """Return a cache that contains the pods."""
+    """Return a synchronized cache that contains the pods of the store."""
     cache = ClusterCache(store)
     for informer in cache.informers:
         informer.synced.set()
@@ -316,7 +322,10 @@ def cache_with_pods(store: Late) -> ClusterCache:
 
 
 async def test_orphaned_pods_created_after_teardown_are_deleted() -> None:
-    """A deletion that orphans pods takes effect late. Meanwhile a controller creates deleted objects again."""
+    """The deletion of a Deployment takes effect late and orphans its pods.
+
+    A controller has created new objects in the meantime.
+    """
     store = Late()
     cache = cache_with_pods(store)
     children = ChildObjects(store, cache.children, cast(Any, None))
@@ -325,10 +334,14 @@ async def test_orphaned_pods_created_after_teardown_are_deleted() -> None:
     store.put(kinds.POD, "one-7f-x", owned)
     orphaned_pods = OrphanedPods(store, cache := cache_with_pods(store))
     await orphaned_pods.step()
-    assert store.names() == {"ReplicaSet/one-7f", "Pod/one-7f-x"}, "the garbage collector gets time to delete the pods"
+    assert store.names() == {"ReplicaSet/one-7f", "Pod/one-7f-x"}, (
+        "the first step gives the garbage collector time to delete the pods"
+    )
     store.put(kinds.APPLICATION, "a")
     await orphaned_pods.step()
-    assert {"ReplicaSet/one-7f", "Pod/one-7f-x"} < store.names(), "the watch of Applications is behind"
+    assert {"ReplicaSet/one-7f", "Pod/one-7f-x"} < store.names(), (
+        "the pods are kept, because their Application still exists at the API server"
+    )
     await store.delete(kinds.APPLICATION, ("city", "a"))
     await orphaned_pods.step()
     assert store.names() == set()
@@ -354,7 +367,7 @@ async def test_copy_of_deployment_without_owner_is_kept() -> None:
 
 
 class Spelling(Webhooks):
-    """Fake API server that normalises written objects. Finalizers prevent the deletion of some objects."""
+    """Fake API server that normalises written objects. Objects in `with_finalizer` cannot be deleted."""
 
     with_finalizer: frozenset[tuple[Kind, str]] = frozenset()
 
@@ -378,7 +391,7 @@ async def test_normalised_object_is_forgotten_when_deleted() -> None:
     deployment = owned_object(kinds.DEPLOYMENT, APPLICATION, "one", {}, spec={"cpu": 0.5})
     for _ in range(2):
         await children.apply(APPLICATION, {kinds.DEPLOYMENT: [deployment]})
-    assert store.requests == ["create Deployment"], "an object that the API server normalised is not written again"
+    assert store.requests == ["create Deployment"], "a difference caused by normalisation does not cause another write"
     nothing: dict[Kind, list[Body]] = {kind: [] for kind in kinds.CHILDREN}
     await children.prune(APPLICATION, nothing)
     assert store.requests[1:] == ["delete Secret", "delete Deployment"]
@@ -439,7 +452,10 @@ async def test_secret_is_written_without_reading_it(reason: Any, existing: bool,
 
 @pytest.mark.parametrize("reason", ["new", "renewed", "lost"])
 async def test_exhausted_quota_is_reported_only_for_missing_secret(reason: Any) -> None:
-    """The API server checks quotas first, so that creating an existing Secret would always be refused."""
+    """The API server checks the quota before it checks if the object exists.
+
+    With an exhausted quota, it therefore refuses to create even an existing Secret.
+    """
     secret = kinds.SECRET.header("one-tls", "city")
     store = Secrets("one-tls")
     store.full = True
@@ -471,7 +487,9 @@ async def test_secret_is_deleted_with_its_deployment_and_retried_after_refusal()
     store.refused = True
     with pytest.raises(KubeError, match="no"):
         await children.remove(APPLICATION.key, kinds.DEPLOYMENT)
-    assert store.requests == ["delete Deployment"], "the Deployment is deleted although its Secret is not"
+    assert store.requests == ["delete Deployment"], (
+        "the Deployment is deleted although the deletion of its Secret fails"
+    )
     store.refused = False
     await children.remove(APPLICATION.key, kinds.SERVICE)
     assert store.objects == set()

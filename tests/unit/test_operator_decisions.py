@@ -1,4 +1,4 @@
-"""Pure decisions of the operator: conditions, comparison, missions, location labels, quantities, settings."""
+"""Decisions of the operator that need no cluster: conditions, differences, missions, labels, quantities, settings."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def test_applied_object_is_current_until_changed() -> None:
         assert not is_current(desired, {**observed, "spec": {**observed["spec"], **spoil}}), spoil
 
 
-def test_dropped_field_is_a_difference() -> None:
+def test_removed_field_is_a_difference() -> None:
     before = stamped({"metadata": {"name": "a"}, "spec": {"x": 1, "y": 2}})
     assert not is_current(stamped({"metadata": {"name": "a"}, "spec": {"x": 1}}), before)
 
@@ -306,7 +306,9 @@ def test_flight_phase_follows_drone_state(drone: Drone | None, begun: bool, phas
     flight_phase = flight("d", drone, {"drone": "d", "conditions": [mission]})
     assert flight_phase.phase == phase
     update = status.deployed(PLAN, [view("a-1")], 0, flight_phase)
-    assert update.phase == ("Deploying" if phase in {"Waiting", "Landed"} else phase), "a pod is missing"
+    assert update.phase == ("Deploying" if phase in {"Waiting", "Landed"} else phase), (
+        "the phase is Deploying, because a pod is missing"
+    )
 
 
 def test_flight_of_another_drone_does_not_begin_mission() -> None:
@@ -377,7 +379,7 @@ def test_pod_requests_are_maximum_of_init_and_main_containers() -> None:
 
 
 def test_pod_requests_include_sidecars_and_overhead() -> None:
-    """A service mesh adds its proxy as an init container that keeps running. The scheduler counts it too."""
+    """The proxy of a service mesh is an init container that keeps running. The scheduler counts its requests."""
 
     def container(cpu: str, **more: str) -> dict:
         return {"resources": {"requests": {"cpu": cpu}}, **more}
@@ -518,11 +520,11 @@ def test_update_policy_and_ttl_do_not_change_the_mission() -> None:
     assert same_mission.mission_digest == spec.mission_digest
     same_mission = tuple(c.model_copy(update={"name": f"{c.name}2"}) for c in spec.components)
     assert spec.model_copy(update={"components": same_mission}).mission_digest != spec.mission_digest
-    # An explicit default value gives the same mission as an omitted field.
+    # A field with its default value has the same digest as an omitted field.
     assert type(spec).model_validate(spec.model_dump(by_alias=True)).mission_digest == spec.mission_digest
 
 
-def test_plan_follows_generation_of_the_same_mission() -> None:
+def test_plan_gets_new_generation_of_unchanged_mission() -> None:
     stamped = of_generation(application(), PLAN)
     assert stamped.application_digest == application().spec.mission_digest
     assert of_generation(application(), stamped) is stamped

@@ -25,7 +25,10 @@ def body(uid: str = "1", **annotations: str) -> kopf.Body:
     "noted", ['{"success":true}', '{"delayed":"9999-12-31T00:00:00+00:00"}', "5", "no JSON", "[]", ""]
 )
 def test_annotations_neither_skip_nor_delay_teardown(noted: str) -> None:
-    """Users who may edit an Application can write its annotations. Other users must still be able to end its flight."""
+    """Users with edit permission for an Application can write any annotation.
+
+    Such annotations must not prevent the teardown that ends the flight of the Application.
+    """
     assert InMemoryProgress("kopf.fractus.dev").fetch(key=TEARDOWN, body=body(**{NOTE: noted})) is None
 
 
@@ -36,7 +39,9 @@ def test_failed_teardown_is_retried() -> None:
     progress.store(key=TEARDOWN, record=record, body=body(), patch=patch)
     assert json.loads(patch["metadata"]["annotations"][NOTE]) == record, "the change of the annotation wakes kopf"
     assert progress.fetch(key=TEARDOWN, body=body()) == record
-    assert progress.fetch(key=TEARDOWN, body=body(uid="2")) is None, "another object with the same name"
+    assert progress.fetch(key=TEARDOWN, body=body(uid="2")) is None, (
+        "the progress does not apply to another object with the same name"
+    )
     patch = kopf.Patch()
     progress.purge(key=TEARDOWN, body=body(**{NOTE: json.dumps(record)}), patch=patch)
     assert patch["metadata"]["annotations"] == {NOTE: None}
@@ -44,7 +49,7 @@ def test_failed_teardown_is_retried() -> None:
 
 
 async def test_unchanged_progress_is_not_stored_again() -> None:
-    """Otherwise kopf waits for an event that a patch without changes never causes."""
+    """After a patch, kopf waits for an event. A patch without changes would never cause this event."""
     progress = InMemoryProgress("kopf.fractus.dev")
     patch = kopf.Patch()
     handler: Any = SimpleNamespace(id=TEARDOWN)

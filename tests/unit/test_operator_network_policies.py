@@ -1,4 +1,4 @@
-"""NetworkPolicies of components, evaluated as a network plug-in does."""
+"""NetworkPolicies of components. The tests evaluate the policies like a network plug-in."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def test_component_without_callers_has_no_network_policy() -> None:
 
 
 @pytest.mark.parametrize(("field", "component"), [("egress", "Navigator"), ("ingress", "ImageChecker")])
-def test_caller_is_declared_by_either_side(field: str, component: str) -> None:
+def test_caller_may_be_declared_by_either_component(field: str, component: str) -> None:
     body = copy.deepcopy(INPUT["application"])
     part = next(c for c in body["spec"]["components"] if c["name"] == component)
     part[field] = ["ImageChecker" if field == "egress" else "Navigator"]

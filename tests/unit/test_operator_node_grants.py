@@ -1,4 +1,4 @@
-"""Objects of each node: NodeGrants, the account, and the reports of its agent."""
+"""Operator objects of each node: NodeGrants, service account, and reports of the agent."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ class Api(Store):
         elif method == "PATCH":
             stored = self.objects[target]
             if path != target:
-                # Like the API server, a patch of the status ignores other fields unless it tests them.
+                # As at the API server, a status patch must test the uid, because it cannot set metadata.
                 test_operation, status_operation = body
                 if test_operation != {"op": "test", "path": "/metadata/uid", "value": stored["metadata"]["uid"]}:
                     raise Invalid(422, "Invalid", path)
@@ -121,7 +121,7 @@ class Api(Store):
 
 
 class Cluster:
-    """Run the controller with the events of its watches."""
+    """Test bench that runs the controller, and delivers the events of its watches."""
 
     def __init__(self) -> None:
         self.api = Api()
@@ -175,7 +175,7 @@ class Cluster:
         return self.api.objects[kinds.GRANT.path("", grant)].get("status")
 
     def report_deleted(self, kind: Kind, node: str) -> None:
-        """Report a deletion by the watch."""
+        """Deliver the event of a deletion, like the watch."""
         objects = self.cache.node_objects
         informer: Any = objects.known if kind is kinds.NODE_GRANTS else objects.accounts[kind]
         informer._drop((NODE_GRANTS_NAMESPACE, node))
@@ -248,7 +248,7 @@ async def test_reports_are_copied_to_grants_of_the_same_node(cluster: Cluster) -
     await cluster.settled()
     assert cluster.status("a") == {"phase": "Complete", "message": "flown", "observedGeneration": 1}
     assert cluster.status("b") is None
-    # A changed status does not cause a write of the NodeGrants. An unchanged report does not cause a write of the status.
+    # A changed status causes no write of the NodeGrants. An unchanged report causes no write of a status.
     assert cluster.api.requests == [("PATCH", f"{kinds.GRANT.path('', 'a')}/status")]
     cluster.report("drone-1", report("Complete", "flown", uid="uid of a"), report("Active", uid="more"))
     await cluster.settled()
@@ -261,7 +261,7 @@ async def test_deleted_node_gets_empty_node_grants_before_removal(cluster: Clust
     await cluster.until(lambda: cluster.api.node("drone-1").keys() == ALL and cluster.api.granted("drone-1") == ["a"])
     cluster.no_drone("drone-1")
     await cluster.settled()
-    assert cluster.api.granted("drone-1") == ["a"], "a Grant names the node"
+    assert cluster.api.granted("drone-1") == ["a"], "the NodeGrants is kept while a Grant names the node"
     cluster.api.requests.clear()
     cluster.no_grant("a")
     await cluster.until(lambda: not cluster.api.node("drone-1"))

@@ -1,4 +1,4 @@
-"""Removal of run-time objects and of data on nodes after Fractus was uninstalled."""
+"""Uninstallation of Fractus: removal of run-time objects and of data on nodes."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def test_node_is_wiped_when_its_pod_is_ready() -> None:
 
 
 class Cluster:
-    """Fake API server. One more pod is ready at each listing of the pods.
+    """Fake API server. In each list of pods, one more pod is ready than in the previous list.
 
     Attributes:
         fails: Numbers of the listings that fail.
@@ -165,13 +165,18 @@ async def test_existing_authority_is_kept() -> None:
 async def test_removal_removes_nothing_while_operator_is_installed(
     monkeypatch: pytest.MonkeyPatch, operator: object, message: str
 ) -> None:
-    """`helm template` renders the Job together with the operator. If the Job removed the authority, no Grant could be signed."""
+    """The output of `helm template` contains the removal Job together with the operator.
+
+    If the Job removed the certificate authority, the operator could sign no Grant.
+    """
     cluster = connect(monkeypatch, Cluster())
     cluster.operator = operator
     output = await run("fractus-system", "/data/fractus", timeout_s=0.05)
     assert output.startswith("nothing was removed")
     assert message in output
-    assert cluster.deleted == ["DaemonSet fractus-wipe"], "the DaemonSet would wipe nodes in use"
+    assert cluster.deleted == ["DaemonSet fractus-wipe"], (
+        "only the DaemonSet is removed, because it would wipe nodes in use"
+    )
     assert not cluster.labels
     cluster.operator = {"metadata": {"name": "fractus-operator", "deletionTimestamp": "2026-01-01T00:00:00Z"}}
     await run("fractus-system", "/data/fractus", timeout_s=0.05)
@@ -203,9 +208,12 @@ def terminable() -> Iterator[None]:
 def test_signal_during_removal_deletes_wipe_daemon_set(
     terminable: None, monkeypatch: pytest.MonkeyPatch, at: str
 ) -> None:
-    """The signal comes from the deadline of the Job or a drained node. A remaining DaemonSet would wipe the next installation."""
+    """The Job gets SIGTERM at its deadline, or when its node is drained.
+
+    A remaining DaemonSet would wipe the data of the next installation.
+    """
     cluster = connect(monkeypatch, Cluster())
-    cluster.ready.append(pod("drone-2", "True"))  # so that the wait ends even without the signal
+    cluster.ready.append(pod("drone-2", "True"))  # ends the wait if the signal has no effect
     answer = getattr(cluster, at)
 
     async def interrupted(*args: Any, **selectors: Any) -> Any:

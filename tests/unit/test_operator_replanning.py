@@ -1,4 +1,4 @@
-"""Choice of the plan: the active plan is kept while it fits."""
+"""Replanning: the operator keeps the active plan while it is feasible."""
 
 from __future__ import annotations
 

@@ -55,13 +55,13 @@ async def test_subscription_pause_ends_only_with_urgent_change() -> None:
     inputs.wake()
     waiting = asyncio.create_task(inputs.changed(20.0, pause_s=20.0))
     await turns()
-    assert not waiting.done(), "an urgent change ends one pause"
+    assert not waiting.done(), "an urgent change ends only the current pause"
     waiting.cancel()
     await asyncio.gather(waiting, return_exceptions=True)
 
 
 class FakeObjects:
-    """Fake child objects in memory. Records the requests in order."""
+    """Fake child objects in memory. All requests are recorded in order."""
 
     def __init__(self, cache: Any) -> None:
         self.cache = cache
@@ -175,7 +175,7 @@ async def test_rollout_applies_plan_then_grants_then_deployments_then_the_rest(s
 async def test_rollout_creates_no_grant_when_rules_changed(scene: Scene) -> None:
     scene.cache.rules_revision = 1
     await scene.apply()
-    assert scene.complete is False, "the Grants are compiled again at once"
+    assert scene.complete is False, "the rollout is incomplete, so that the Grants are compiled again at once"
     assert scene.objects.requests.count("apply Grant") == 1
     assert ("", "new") not in scene.cache.children[kinds.GRANT]
     assert "apply Service" in scene.objects.requests
@@ -186,7 +186,7 @@ async def test_certificate_is_renewed_when_due_and_annotated(scene: Scene) -> No
     assert sorted(scene.objects.secrets) == sorted((instance, "new") for instance in INSTANCES)
     before = scene.certificates()
     await scene.apply()
-    assert len(scene.objects.secrets) == len(INSTANCES), "the certificates are valid"
+    assert len(scene.objects.secrets) == len(INSTANCES), "valid certificates are not renewed"
     scene.clock.now += timedelta(hours=17)
     await scene.rollout.renew_certificates(APPLICATION, PLACED, ())
     renewed = sorted((instance, "renewed") for instance in INSTANCES)
@@ -198,7 +198,7 @@ async def test_certificate_is_renewed_when_due_and_annotated(scene: Scene) -> No
 
 
 async def test_secret_is_written_again_after_failed_write(scene: Scene) -> None:
-    """The annotation of its Deployment already contains the certificate."""
+    """The annotation of the Deployment already names the new certificate, but the write of the Secret failed."""
     scene.objects.refused = kinds.SECRET
     with pytest.raises(KubeError, match="no"):
         await scene.apply()
@@ -242,7 +242,9 @@ async def test_new_authority_renews_all_certificates(scene: Scene) -> None:
 
 
 @pytest.mark.parametrize(("refused", "grants"), [(kinds.DEPLOYMENT, 2), (kinds.SERVICE, 2), (kinds.DEPLOYMENT_PLAN, 0)])
-async def test_refused_object_stops_no_grant_except_a_refused_plan(scene: Scene, refused: Kind, grants: int) -> None:
+async def test_grants_are_applied_despite_refused_object_unless_it_is_the_plan(
+    scene: Scene, refused: Kind, grants: int
+) -> None:
     scene.objects.refused = refused
     with pytest.raises(KubeError, match="no"):
         await scene.apply()
@@ -250,12 +252,12 @@ async def test_refused_object_stops_no_grant_except_a_refused_plan(scene: Scene,
 
 
 async def test_instance_without_deployment_gets_no_secret(scene: Scene) -> None:
-    """If the name of its Deployment is taken, the name of its Secret may be taken, too."""
+    """The Deployment is refused, for example because its name is taken. The name of the Secret may be taken, too."""
     scene.objects.refused = kinds.DEPLOYMENT
     with pytest.raises(KubeError, match="no"):
         await scene.apply()
     assert scene.objects.secrets == []
-    assert "apply Service" in scene.objects.requests, "later steps are not stopped"
+    assert "apply Service" in scene.objects.requests, "the refusal does not stop later steps"
 
 
 async def test_hanging_deployments_delay_no_grant(scene: Scene) -> None:
@@ -267,4 +269,4 @@ async def test_hanging_deployments_delay_no_grant(scene: Scene) -> None:
     stuck.cancel()
     with pytest.raises(asyncio.CancelledError):
         await stuck
-    assert scene.objects.cancelled, "no write is in progress when the next reconciliation begins"
+    assert scene.objects.cancelled, "hanging writes are cancelled before the next reconciliation begins"

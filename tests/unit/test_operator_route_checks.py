@@ -1,4 +1,4 @@
-"""Route checks of active plans run in a worker thread, and apply only to the checked plan and rules."""
+"""Route checks of active plans: they run in a worker thread, and a result is valid for one plan and set of rules."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ async def test_route_check_runs_in_a_thread_and_is_cached(check: FakeCheck) -> N
     check.go.set()
     async with asyncio.timeout(20.0):
         await scene.woken.wait()
-    assert check.plans == [present], "one check for several lookups"
+    assert check.plans == [present], "several lookups share one check"
     assert threading.get_ident() not in check.threads
     result = scene.lookup(present)
     assert result.application_generation == 99

@@ -1,4 +1,4 @@
-"""Rollout of node services, and detection of nodes that stopped reporting."""
+"""Rollout of node services, and detection of nodes that no longer report."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def test_nodes_wait_while_services_of_another_start() -> None:
 @pytest.mark.parametrize("obstacle", ["InTheAir", "OnMission", "NodeUnreachable"])
 def test_services_of_flying_or_unreachable_drone_are_kept(obstacle: str) -> None:
     chosen, conditions = step_of(node("d1", obstacle=obstacle), node("d2"))
-    assert chosen == ["d2"], "no other node waits for this one"
+    assert chosen == ["d2"], "other nodes do not wait for a node whose services are kept"
     assert (conditions["d1"].status, conditions["d1"].reason) == ("False", obstacle)
     assert "d1 is so" in conditions["d1"].message
 
@@ -131,7 +131,7 @@ def test_only_changed_nodes_are_returned() -> None:
     assert services.take_changed() == {"d1", "d2"}
     assert not services.take_changed()
     services.revision_changed(("", "a"), None, Revision("fractus-mobility", 1, "old"))
-    assert services.take_changed() == {"d1", "d2"}, "the other revision makes both nodes outdated"
+    assert services.take_changed() == {"d1", "d2"}, "both nodes may be outdated after a new revision"
     services.revision_changed(("", "b"), None, Revision("fractus-mobility", 0, "older"))
     assert not services.take_changed()
     deleted_pod = pod("d2")
@@ -227,10 +227,13 @@ def test_delayed_step_makes_no_node_stale() -> None:
 
 
 class Api(Store):
-    """A fake API server with drones, which refuses writes to some of them."""
+    """Fake API server with drones.
+
+    It refuses writes to the drones in `refused`, and forbids the methods in `forbidden`.
+    """
 
     def __init__(self) -> None:
-        # There is no connection. `request` returns the response.
+        # The constructor of Store is not called, because `request` needs no connection.
         self.field_manager = "test"
         self.objects: dict[str, dict[str, Any]] = {}
         self.refused: set[str] = set()
@@ -248,7 +251,7 @@ class Api(Store):
         if method == "PUT":
             self.objects[name] = body
         if method == "PATCH":
-            # Apply a list whose items are identified by their type.
+            # Merge the conditions by their type, like the API server.
             status = self.objects[name].setdefault("status", {})
             new = {condition["type"]: condition for condition in body["status"]["conditions"]}
             others = [each for each in status.get("conditions", ()) if each["type"] not in new]
@@ -258,7 +261,7 @@ class Api(Store):
 
 @pytest.fixture
 async def cache() -> ClusterCache:
-    """Three drones on the ground, each with one outdated service."""
+    """Return a cache with three drones on the ground. One service of each drone is outdated."""
     cluster_cache = ClusterCache(Api())
     for informer in cluster_cache.informers:
         informer.synced.set()
@@ -318,7 +321,7 @@ async def test_missing_successor_pod_stops_rollout(cache: ClusterCache) -> None:
     assert await step() == ["m-d2-old"]
     removed(cache, pod("d2", "old"))
     cache.hosts._drop(("", "d2"))
-    assert await step() == ["m-d3-old"], "a deleted node does not delay the rollout"
+    assert await step() == ["m-d3-old"], "the rollout does not wait for a deleted node"
 
 
 async def test_node_that_is_never_ready_does_not_stop_rollout(cache: ClusterCache) -> None:
@@ -381,7 +384,7 @@ async def test_report_times_are_parsed(cache: ClusterCache, last_seen: str | Non
 
 
 def granted(cache: ClusterCache, name: str, node: str | None) -> None:
-    """Add a Grant, or remove it if None."""
+    """Add a Grant for a node. If `node` is None, remove the Grant."""
     owner = {"namespace": "ns", "name": "app", "uid": "u"}
     grants = cache.children[GRANT]
     if node is None:
@@ -404,10 +407,10 @@ async def test_mission_condition_ends_after_two_reports(cache: ClusterCache) -> 
         cache.drones.record_write(("", "d1"), json.loads(json.dumps(api.objects["d1"])))
         return condition_reason(api, "d1", "OnMission")
 
-    assert await mission_reason() == "", "no Grant ever existed"
+    assert await mission_reason() == "", "a drone without any Grant has no condition"
     granted(cache, "ns.a", "d1")
     assert await mission_reason() == "Granted"
-    assert api.requests == [("PATCH", "d1")], "the patch needs no prior GET"
+    assert api.requests == [("PATCH", "d1")], "one patch writes the condition, without a GET before it"
     assert cache.drones.get(("", "d1")).may_take_off  # type: ignore[union-attr]
     granted(cache, "ns.a", None)
     assert await mission_reason() == "AwaitingReports"
@@ -416,14 +419,14 @@ async def test_mission_condition_ends_after_two_reports(cache: ClusterCache) -> 
     assert cache.drones.get(("", "d1")).may_take_off  # type: ignore[union-attr]
     for _ in range(2):
         assert await mission_reason(lastSeen=at(31), flightState="inactive") == "AwaitingReports", (
-            "the report may be older than the removal of the Grant"
+            "the reported state may be older than the removal of the Grant"
         )
     assert await mission_reason(lastSeen=at(59)) == "NoGrant"
     assert not cache.drones.get(("", "d1")).may_take_off  # type: ignore[union-attr]
 
 
 async def test_condition_is_not_written_twice_before_watch_event(cache: ClusterCache) -> None:
-    """Grants of an application are created one by one."""
+    """The Grants of an application are created one by one, and each creation causes a reconciliation."""
     api = Api()
     missions = MissionConditionController(api, cache, reported(cache, api), lambda: datetime(2026, 1, 1, tzinfo=UTC))
     cache.add_listener(GRANT, lambda key: bool(missions.grant_changed(key)))
@@ -448,7 +451,10 @@ def test_grounded_annotation_is_valid_until_next_report() -> None:
 async def test_condition_is_updated_if_patch_is_forbidden(
     cache: ClusterCache, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """After `helm rollback` the role allows only updates. Without OnMission, admission would treat the drone as idle."""
+    """After `helm rollback`, the ClusterRole permits only updates.
+
+    The operator must still write OnMission, because admission treats a drone without it as idle.
+    """
     api = Api()
     api.forbidden = {"PATCH"}
     missions = MissionConditionController(api, cache, reported(cache, api), lambda: datetime(2026, 1, 1, tzinfo=UTC))
@@ -457,7 +463,9 @@ async def test_condition_is_updated_if_patch_is_forbidden(
         granted(cache, "ns.a", "d1" if name else None)
         await missions.reconcile(("", "d1"))
         assert condition_reason(api, "d1", "OnMission") == reason
-    assert api.requests == [("PATCH", "d1"), ("PUT", "d1")] * 2, "a refused request is not repeated"
+    assert api.requests == [("PATCH", "d1"), ("PUT", "d1")] * 2, (
+        "a forbidden patch is replaced by an update, and not repeated"
+    )
     (warning,) = (record.getMessage() for record in caplog.records if record.levelname == "WARNING")
     assert "upgrade the chart fractus, because its ClusterRole belongs to another release" in warning
     api.forbidden = {"PATCH", "PUT"}

@@ -52,7 +52,7 @@ def test_drone_in_flight_offers_remaining_flight() -> None:
     begun = offered_flights([flown("flying", 180)], DEPOTS, 7.0, None)["d"]
     assert begun.legs[0][0].lon == pytest.approx(at(180, 0)["lon"])
     assert offered_flights([flown("flying", 900)], DEPOTS, 7.0, None) == {}
-    # A flight that is already shared is offered completely.
+    # If the application already shares the flight, the complete flight is offered.
     assert offered_flights([flown("flying", 900)], DEPOTS, 7.0, GUEST_PLAN) == {"d": flight_of(HOST, DEPOTS)}
 
 
@@ -71,7 +71,7 @@ def test_flight_of_changed_application_is_not_offered() -> None:
         ("Running", HOST_PLAN, False),
     ],
 )
-def test_guest_is_complete_when_host_is(phase: str, host_plan: Any, done: bool) -> None:
+def test_guest_is_complete_when_host_is_complete(phase: str, host_plan: Any, done: bool) -> None:
     outcome = shared_flight_outcome(GUEST_PLAN, submitted(phase), host_plan)
     assert (outcome is not None and outcome.kind is OutcomeKind.COMPLETE) is done
     assert shared_flight_outcome(HOST_PLAN, submitted("Completed"), None) is None
@@ -111,13 +111,13 @@ def test_guest_claims_no_drone() -> None:
 def test_remaining_grant_of_guest_claims_no_drone(left_by: str | None) -> None:
     plans = {("default", "traffic"): OwnedPlan("t", HOST_PLAN)}
     if left_by is not None:
-        # The guest has a drone of its own now, and its Grant on the previous drone still exists.
+        # The guest now has its own drone, but its Grant for the previous drone still exists.
         plans["default", "guest"] = OwnedPlan("g", HOST_PLAN.model_copy(update={"drone": DroneChoice(node="e")}))
     remaining = grant("guest", "g", "2026-01-01T00:00:00Z")
     flown_by = grant("traffic", "t", "2026-01-02T00:00:00Z")
     for grants in ([remaining, flown_by], [flown_by, remaining]):
         assert claims(plans, grants)["d"].uid == "t"
-    # A plan alone is no claim where another application may still fly by a grant.
+    # A Grant has precedence over a plan of another application that has no Grant yet.
     assert claims(plans, [remaining])["d"].uid == "g"
 
 
@@ -153,7 +153,7 @@ def test_bookings_follow_pods() -> None:
             assert bookings.on(node).get("cpu", 0.0) == sum(p.requests["cpu"] for p in bound_pods)
 
 
-def test_planned_instance_is_booked_once_and_own_pods_are_free() -> None:
+def test_planned_instance_is_booked_once_and_own_pods_are_not_counted() -> None:
     bookings = Bookings()
     own_pod = pod("own", "a", 1.0, app="me")
     for each in (own_pod, pod("other", "a", 2.0, app="other"), pod("bare", "a", 4.0)):

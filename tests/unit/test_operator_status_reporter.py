@@ -54,12 +54,12 @@ def new() -> tuple[Statuses, ClusterCache, StatusReporter, Submitted]:
 async def test_queued_rollout_is_reported() -> None:
     api, _, reporter, submitted = new()
     await reporter.report_queued(submitted, PLAN, 1)
-    assert not api.written, "the rollout writes the first status soon"
+    assert not api.written, "a short queue is not reported, because the rollout soon writes the first status"
     await reporter.report_queued(submitted, PLAN, 20)
     (status,) = api.written
     assert (status["phase"], status["conditions"][0]["reason"]) == ("Pending", "OperatorBusy")
     assert "20 other Applications" in status["message"]
-    assert not api.events, "no Event is posted, which would cost another request"
+    assert not api.events, "no Event is posted, to save a request"
     await reporter.report_queued(submitted, PLAN, 21)
     assert len(api.written) == 1, "an Application with a status is not reported as queued"
 
@@ -71,8 +71,11 @@ async def test_refused_first_status_is_ignored() -> None:
     assert not reporter.last(submitted)
 
 
-async def test_conflicting_outcome_is_not_taken_for_recorded() -> None:
-    """The next step deletes the Grants. Without the status the outcome would be lost, and the mission would be flown again."""
+async def test_outcome_is_not_recorded_after_write_conflict() -> None:
+    """The reporter must raise the conflict, because the next step deletes the Grants.
+
+    The outcome would then be lost, and the mission would be flown again.
+    """
     api, cache, reporter, submitted = new()
     api.refusal = Conflict(409, "Conflict", "it changed meanwhile")
     with pytest.raises(Conflict):
@@ -83,13 +86,13 @@ async def test_conflicting_outcome_is_not_taken_for_recorded() -> None:
 
 
 async def test_persistent_failure_replaces_outdated_message() -> None:
-    """Example: the status still reports a queue, although a webhook refuses all Deployments."""
+    """In this test, the status reports a queue, although a webhook now refuses all Deployments."""
     api, _, reporter, submitted = new()
     await reporter.report_queued(submitted, PLAN, 20)
     error = KubeError(500, "InternalError", "failed calling webhook")
     for attempts in (1, 2):
         await reporter.report_failure(submitted, attempts, error)
-    assert len(api.written) == 1, "a short failure causes no request"
+    assert len(api.written) == 1, "the first failures are not reported"
     for attempts in (3, 4):
         await reporter.report_failure(
             submitted, attempts, KubeError(500, "InternalError", f"failed calling webhook in {attempts} s")

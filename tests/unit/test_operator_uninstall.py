@@ -1,4 +1,4 @@
-"""Conditions under which Fractus may be uninstalled: no Application, and no drone in the air."""
+"""Check before uninstallation: Fractus may be removed if no Application exists and no drone is in the air."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ async def test_uninstall_is_refused_without_response(monkeypatch: pytest.MonkeyP
 
 
 class Lists:
-    """Fake API server with a scripted response, or an error, for the list of each kind."""
+    """Fake API server. For each kind, its list request returns given objects or raises a given error."""
 
     def __init__(self, **of: Any) -> None:
         self.of = of
@@ -99,7 +99,7 @@ class Lists:
 
 
 async def test_uninstall_is_allowed_without_kinds(monkeypatch: pytest.MonkeyPatch) -> None:
-    """If the CRDs are removed before the chart, the missing kinds must not block its removal."""
+    """If the CRDs are removed before the chart, the missing kinds must not block the removal of the chart."""
     missing = NotFound(404, "NotFound", "the server could not find the requested resource")
     lists = Lists(Application=missing, Drone=missing)
 

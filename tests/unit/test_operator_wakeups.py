@@ -89,8 +89,8 @@ async def test_changed_spec_ends_pause_but_changed_status_does_not() -> None:
         assert inputs._urgent.is_set(), "a changed spec is urgent"
 
 
-async def test_planning_inputs_of_node_wake_all_but_labels_do_not() -> None:
-    """A flying drone gets a new geohash every minute."""
+async def test_planning_inputs_of_node_wake_all_applications_but_labels_do_not() -> None:
+    """Labels must not wake Applications, because the geohash label of a flying drone changes every minute."""
     cache = ClusterCache(cast(Store, None))
     version = iter(range(1, 100))
 
@@ -140,14 +140,14 @@ async def test_released_capacity_wakes_applications_that_need_the_node() -> None
         cache.pods.record_write(key, pod_body(3, "n", "Succeeded"))
         assert await woken.changed(0)
         cache.pods._drop(key)
-        assert not await woken.changed(0), "the node has no free capacity"
+        assert not await woken.changed(0), "deletion of a finished pod releases no capacity"
         cache.pods.record_write(key, pod_body(4, "n"))
         cache.pods._drop(key)
-        assert await woken.changed(0), "a killed pod releases capacity as well"
+        assert await woken.changed(0), "deletion of a running pod releases capacity"
         cache.subscriptions.set_placed(("ns", "here"), placed=True)
         cache.pods.record_write(key, pod_body(5, "n"))
         cache.pods._drop(key)
-        assert not await woken.changed(0), "the application is placed completely"
+        assert not await woken.changed(0), "a completely placed Application needs no capacity"
         assert not await unaffected.changed(0)
     assert not cache.subscriptions._full_nodes
 
@@ -173,7 +173,7 @@ def test_application_is_validated_again_when_it_or_rules_change() -> None:
 
 
 def full_node() -> Inventory:
-    """Edge node with too little free capacity for the test components."""
+    """Return an inventory with one edge node. Its free capacity is too small for the test components."""
     return inventory([], [edge("e1", (0, 0))], [host("e1", "edge", cpu=0.01)])
 
 
@@ -276,7 +276,7 @@ async def test_deleted_plan_wakes_waiting_applications(shared: ClusterCache) -> 
     shared.drones.record_write(("", "d"), drone_body(2, "inactive"))
     stored.record_write(HOST, plan_body("d", 1))
     with shared.subscriptions.subscribe(("ns", "waiting")) as waiting:
-        # The decided plan is dropped before the watch reports the deletion of the object, which claims the drone until then.
+        # The decided plan is dropped first. The stored plan claims the drone until the watch reports its deletion.
         shared.forget(HOST)
         assert await waiting.changed(0)
         assert "d" in shared.fleet.claims()

@@ -1,4 +1,4 @@
-"""Changes of an active plan: scale-up, running instances that stay, and passengers on the remaining flight."""
+"""Changes of an active plan: scale-up, running instances on their nodes, and passengers on the remaining flight."""
 
 import pytest
 from fractus_core.api.geometry import Position

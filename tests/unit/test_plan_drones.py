@@ -118,7 +118,7 @@ def test_drone_with_too_low_maximum_altitude_is_rejected_with_figures():
     assert "climbs to 80 m; the path goes up to 95 m" in caught.value.message
 
 
-def test_claimed_drone_with_too_short_flight_time_is_not_waited_for():
+def test_plan_does_not_wait_for_claimed_drone_with_too_short_flight_time():
     with pytest.raises(Infeasible) as caught:
         plan(application(navigator(PATH)), inventory([drone("d", minutes=2)], claimed={"d": OTHER}))
     assert caught.value.reason == "NoDrone"

@@ -164,7 +164,7 @@ def _utc(time_s):
     return datetime.fromtimestamp(time_s, UTC).isoformat()
 
 
-def test_legality_permits_zone_inside_region_of_driver():
+def test_legality_reports_no_denied_leg_for_zone_inside_region_of_driver():
     region = {"polygon": {"exterior": [at(100, -100), at(300, -100), at(300, 100), at(100, 100)]}}
     driver = navigator(PATH) | {"controlPoints": [{"navigation": "regionBased", "region": region, "duration": 5}]}
     choice = plan(application(driver), fenced(200, 0, radius=10), FORBID).drone
@@ -263,4 +263,4 @@ def test_legality_reports_waypoints_unreachable_after_denied_waypoint():
     up = application(navigator([at(100, 0, 10), at(200, 0, 50), at(300, 0, 10)]))
     legs = [leg for leg in plan(up, above, WARN).drone.legality if leg.outcome == "Denied"]
     assert legs
-    assert "skips it" not in legs[0].message, "the driver passes below"
+    assert "skips it" not in legs[0].message, "the driver can pass below the zone, so no waypoint is unreachable"

@@ -1,4 +1,4 @@
-"""Properties of plans of random scenes: candidates, stable placements, independence of order."""
+"""Properties of plans of random scenes: rejected nodes, stable placements, and independence of the input order."""
 
 import dataclasses
 import itertools
@@ -53,7 +53,7 @@ interfaces = st.lists(
 
 @given(interfaces, interfaces)
 def test_direct_reach_is_smaller_range_of_matching_interfaces(first, second):
-    """An agent links only over its first interface with a device, range and pairing."""
+    """An agent uses only its first interface that has a device, a range and a pairing."""
     firsts = [
         [i for i in node_interfaces if i.device and i.range and i.pairing][:1] for node_interfaces in (first, second)
     ]
@@ -314,9 +314,9 @@ def test_plan_at_80_degrees_across_the_antimeridian():
 
 
 def anywhere(rng, lat, lon):
-    """Return a random position near (lat, lon), which may be a pole or on the antimeridian.
+    """Return a random position near (lat, lon).
 
-    Near a pole, the longitude is arbitrary.
+    The given position may be a pole or on the antimeridian. Near a pole, the longitude of the result is arbitrary.
     """
     spread = rng.choice([0, 1e-6, 1e-4, 1e-2, 0.1, 1])
     position = rng.choice([lon + rng.uniform(-spread, spread), rng.uniform(-180, 180) if abs(lat) > 80 else lon])

@@ -77,7 +77,7 @@ def test_edge_nodes_are_filled_but_never_overbooked(demands, rooms):
     for r in result.rejected:
         assert r.reason == "InsufficientResources"
         assert requested[r.component] > free[r.node]
-    # The planner tries each component on every node. A node with room at the end also had room before.
+    # The planner tries to place each component on every node. If a node has room at the end, it had room before, too.
     placed = {(p.component, p.node) for p in result.placements}
     for name, milli in statics:
         assert all((name, node) in placed or milli > room for node, room in free.items())
@@ -95,7 +95,7 @@ def component_at(name, *locations, milli=100):
 
 
 def hosted(app, stock):
-    """Return the nodes of each location of each component, or the component with a location that has no node."""
+    """Return the nodes of each location. If a location has no node, return the name of its component instead."""
     try:
         result = plan(app, stock)
     except Infeasible as error:
@@ -107,9 +107,9 @@ def hosted(app, stock):
 
 
 def most_that_can_be_hosted(app, stock, rooms):
-    """Return the largest number of instances with at least one at each location, or None if impossible.
+    """Return the largest number of instances if each location has at least one. Return None if this is impossible.
 
-    Oracle: tries all combinations. All instances request the same resources.
+    This oracle tries all combinations. All instances request the same resources.
     """
     slots = [(c.name, spot) for c in app.spec.components for spot in c.locations]
     inside = [

@@ -16,7 +16,7 @@ Body = dict[str, Any]
 
 
 def application(change: str = "{}", component: str = "ImageChecker") -> Application:
-    """Return the application with changed fields of a component. A field that is set to None is removed."""
+    """Return the application with changed fields of one component. `change` is YAML, and null removes a field."""
     body = copy.deepcopy(INPUT["application"])
     for part in body["spec"]["components"]:
         if part["name"] == component:

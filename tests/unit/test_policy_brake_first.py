@@ -1,4 +1,7 @@
-"""Legs that a moving drone cannot begin: it stops first if stop and leg are both legal."""
+"""Legs that a moving drone cannot begin legally.
+
+If the stop and a leg from standstill are both legal, the drone stops before the leg.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +34,9 @@ def test_goto_turning_back_in_narrow_corridor_brakes_first() -> None:
     assert (beyond.action, beyond.brake_first) == ("deny", False), "the drone cannot even stop inside"
     earlier = at(0.5, 64, north_mps=5)
     straight_back = judge(goto(0, 10), earlier, grant)
-    assert (straight_back.action, straight_back.brake_first) == ("allow", False), "a leg straight back needs no turn"
+    assert (straight_back.action, straight_back.brake_first) == ("allow", False), (
+        "the drone reverses on its own path, so it makes no turn"
+    )
     turning = judge(goto(40, 80), at(0, 68, north_mps=5, east_mps=0.3), grant)
     assert turning.permits
     assert turning.brake_first
@@ -48,7 +53,7 @@ def test_goto_after_stop_gets_the_verdict_of_a_goto_from_standstill() -> None:
     assert (again.action, again.args, again.brake_first) == (verdict.action, verdict.args, False)
 
 
-def test_goto_with_wide_turn_is_no_takeover() -> None:
+def test_goto_with_wide_turn_causes_no_takeover() -> None:
     grant = compiled(exclusion(box(10, 15, 30, 30), "land"))
     assert ask(grant, goto(0, 60), at(0, 0, east_mps=5)).brake_first
     through = ask(grant, goto(20, 60), at(0, 0, east_mps=5))
@@ -73,7 +78,7 @@ def test_goto_prefers_whole_leg_after_stop_to_shortened_leg() -> None:
 
 
 @pytest.mark.parametrize("speed", [0.6, 2.0, 5.0, 8.0])
-def test_brake_first_stops_end_at_legal_positions(speed: float) -> None:
+def test_stops_before_a_leg_end_at_legal_positions(speed: float) -> None:
     grant = compiled(exclusion(box(10, 15, 30, 30)), inclusion(box(-40, -40, 60, 80)), operationArea=[])
     offered = 0
     for degrees in range(0, 360, 15):
@@ -88,7 +93,7 @@ def test_brake_first_stops_end_at_legal_positions(speed: float) -> None:
 
 
 RETRACES = Airframe(retraces=True)
-"""Airframe that returns along its path, so that no request is denied because of its return."""
+"""Airframe that returns along its outbound path. No request is then denied because of a blocked return."""
 
 
 @pytest.mark.parametrize(
@@ -119,10 +124,10 @@ def test_goto_outside_area_is_denied_when_the_drone_may_stop_inside() -> None:
     for grant in (compiled(operationArea=[area]), compiled(inclusion(area), operationArea=[])):
         leg = goto(10, 40, speed_mps=9.0)
         assert not ask(grant, leg, at(6, 0, east_mps=5)).permits, (
-            "the drone may already accelerate, or may be stopped in time"
+            "the drone may already accelerate outside, or may stop inside the area"
         )
         assert ask(grant, leg, at(14, 0, east_mps=5)).permits, (
-            "the drone comes too close in any case, and the leg leads back"
+            "the drone enters the margin even if it stops, and the leg leads back"
         )
 
 
@@ -143,7 +148,7 @@ def test_goto_of_accelerating_drone_needs_more_room() -> None:
     assert steady == known
     assert slowing < known - 2
     assert unknown == measured > steady + 3
-    # Computed in steps: latency, end of the acceleration by the jerk limit, then ArduPilot's stopping distance.
+    # Numerical integration: latency, jerk-limited end of the acceleration, then ArduPilot's stopping distance.
     x = 0.0
     v = 4.0
     a = 2.5

@@ -1,4 +1,4 @@
-"""Corrected calls are allowed unchanged, and comply with all policies according to a separate plain implementation."""
+"""Corrected calls: the engine allows them unchanged, and an independent implementation finds no violated policy."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ SERVICES = [{"service": "mobility", "methods": [*METHODS, "SetVelocity"]}, {"ser
 
 
 def holds(grant: CompiledGrant, call: Call, verdict: Verdict, now: Situation) -> bool:
-    """Return True if a corrected call is allowed unchanged."""
+    """Return True if the engine allows a corrected call without another correction."""
     again = ask(grant, Call(call.method, verdict.args), now)
     return again.action == "allow" and again.args == verdict.args
 
@@ -96,7 +96,7 @@ def test_correction_never_causes_takeover() -> None:
     assert (over.action, over.code, over.policies) == ("deny", "ConflictingLimits", ("altitudes", "no-fly"))
     assert ask(grant, goto(150, 0, 45), at(alt=45)).takeover == "revoke", "the requested leg enters the zone"
     assert ask(grant, goto(150, 0, 55), at(alt=55)).takeover == "revoke", (
-        "the leg enters the zone with and without correction"
+        "the leg enters the zone, whether it is corrected or not"
     )
     climb = ask(
         compiled(altitude(lowerLimit=30), exclusion(EVERYWHERE, lower=20)), Call("Takeoff", TakeoffArgs(5)), at(alt=0.0)
@@ -141,7 +141,7 @@ def test_speed_is_not_corrected_to_infinity(limit: float) -> None:
 
 @dataclass
 class Plain:
-    """Rule in the representation of the oracle. Without corners it holds everywhere."""
+    """Rule in the representation of the oracle. A rule without corners applies everywhere."""
 
     kind: str
     corners: Corners
@@ -270,7 +270,7 @@ class World:
 
 @dataclass(frozen=True)
 class Motion:
-    """Motion that results from arguments: points on the ground, altitude range, and speed."""
+    """Motion that the arguments of a call cause: points on the ground, altitude range, and speed."""
 
     points: list[tuple[float, float]]
     heights: tuple[float, float]
@@ -294,7 +294,7 @@ def motion(args: Args, now: Situation) -> Motion:
         case SetSpeedArgs(speed_mps):
             return Motion([(x, y)], (altitude_now_m, altitude_now_m), speed_mps, "SetSpeed")
         case VelocityArgs(north, east, _, _, hold_s):
-            # A moving drone drifts off this line. tests/component/policy_flights.py flies such cases.
+            # A moving drone deviates from the straight line. tests/component/policy_flights.py covers this case.
             resting = math.hypot(now.north_mps, now.east_mps) == 0
             points = [(x + east * hold_s * n / 10, y + north * hold_s * n / 10) for n in range(11 if resting else 1)]
             return Motion(points, (altitude_now_m, altitude_now_m), math.hypot(north, east), "SetVelocity")
@@ -302,7 +302,7 @@ def motion(args: Args, now: Situation) -> Motion:
 
 
 def broken(rules: list[Plain], args: Args, now: Situation) -> Iterator[str]:
-    """Return the policies that arguments break according to the oracle."""
+    """Yield the rules of the oracle that the arguments of a call violate."""
     done = motion(args, now)
     if done.fast is not None and not (0 <= done.fast < math.inf and (done.fast > 0 or done.method == "SetVelocity")):
         yield f"flies at {done.fast}"
@@ -324,7 +324,7 @@ def _breaks(rule: Plain, done: Motion, along: list[bool]) -> bool:
         case "altitude" if done.method in {"Goto", "Takeoff"}:
             return met and not rule.lower - 1e-3 <= end <= rule.upper + 1e-3
         case "exclusion" if done.method != "SetSpeed":
-            # A drone may leave a zone that contains it.
+            # A drone inside a zone may leave it.
             return (met and not along[0]) or (along[-1] and rule.meets(end, end) and done.method == "Goto")
         case "inclusion" if done.method in {"Goto", "Takeoff"}:
             return not along[-1] or not rule.band[0] <= end <= rule.band[1]
@@ -332,7 +332,7 @@ def _breaks(rule: Plain, done: Motion, along: list[bool]) -> bool:
 
 
 def corrections(seeds: range) -> Iterator[tuple[World, Call, Situation, Verdict]]:
-    """Yield random calls that are corrected, or cannot be corrected."""
+    """Yield random calls that the engine corrects, or denies because no correction complies with all limits."""
     for seed in seeds:
         world = World(seed)
         for _ in range(4):
@@ -355,7 +355,7 @@ def test_corrected_calls_are_allowed_unchanged_and_break_no_policy() -> None:
         corrected[call.method] += 1
         again += verdict.reason.count("corrected") > 1
         assert holds(world.grant, call, verdict, now), context
-        # A call that begins with a stop is judged again after it.
+        # The oracle skips calls that begin with a stop, because the engine judges them again after the stop.
         assert verdict.brake_first or not list(broken(world.rules, verdict.args, now)), context
     assert min(corrected.values()) > 10, corrected
     assert again > 5

@@ -1,4 +1,4 @@
-"""The engine with unusual and malicious input: positions, zones, numbers and clocks."""
+"""Policy engine with unusual and malicious input: positions, zones, numbers and clocks."""
 
 from __future__ import annotations
 
@@ -40,9 +40,9 @@ RETRACING = Airframe(retraces=True)
 
 
 def test_judge_is_fast_near_outline_with_many_corners() -> None:
-    """Any application may have a region with ten thousand corners.
+    """A region of an application may have ten thousand corners.
 
-    Motion monitor and heartbeats wait while the engine judges.
+    The engine must be fast, because motion monitor and heartbeats wait while it judges a call.
     """
     corners = [
         ((300.0 if i % 2 else 150.0) * math.sin(math.tau * i / 10_000), (300.0 if i % 2 else 150.0) * math.cos(math.tau * i / 10_000))
@@ -52,8 +52,8 @@ def test_judge_is_fast_near_outline_with_many_corners() -> None:
     zones = compiled(exclusion(ring(corners), "adjust"), operationArea=[box(-900, -900, 900, 900)], home=None)
     away = Home(*FRAME.latlon(0.0, 500.0), 100.0)
     begun_s = time.process_time()
-    assert ask(region, goto(0, 0), at(0, 149)).action == "allow", "the leg leads back from the border"
-    assert ask(region, goto(0, 0), at(0, 315)).action == "allow", "the leg leads in from outside"
+    assert ask(region, goto(0, 0), at(0, 149)).action == "allow", "the leg leads away from the border"
+    assert ask(region, goto(0, 0), at(0, 315)).action == "allow", "the leg leads from outside into the region"
     assert ask(zones, goto(0, 0), at(0, 400, home=away)).code == "LegShortened"
     assert ask(zones, goto(0, 400), at(0, 301, home=away)).action == "allow", "the leg leads out of the margin"
     assert time.process_time() - begun_s < 1.0
@@ -130,7 +130,9 @@ def test_goto_into_hole_of_zone_is_judged_by_the_ring() -> None:
     assert ask(grant, goto(100, 0)).code == "LegThroughExclusionZone"
     assert find_route((0, 0), (100, 0), at(airframe=RETRACING), grant, 10) is None
     inclusion_grant = compiled(inclusion(_court()), operationArea=[])
-    assert ask(inclusion_grant, goto(50, 20), at(50, 0)).code == "WayHomeBlocked", "home lies in the hole"
+    assert ask(inclusion_grant, goto(50, 20), at(50, 0)).code == "WayHomeBlocked", (
+        "the return is blocked, because home lies in the hole"
+    )
     assert ask(inclusion_grant, goto(30, 0), at(50, 0)).action == "deny"
 
 
@@ -144,11 +146,11 @@ def test_touching_zones_leave_no_gap() -> None:
     assert ask(compiled(union), goto(30, 0), at(-30, 0)).action == "allow", "there is no gap at the common border"
 
 
-def test_goto_to_present_position_is_allowed() -> None:
+def test_goto_to_current_position_is_allowed() -> None:
     grant = compiled(exclusion(box(10, -20, 30, 20)), services=SERVICES)
     assert ask(grant, goto(0, 0)).action == "allow"
     assert ask(grant, goto(0, 0, 30)).action == "allow"
-    assert ask(grant, goto(8.5, 0), at(8.5, 0)).action == "deny", "too close to stay"
+    assert ask(grant, goto(8.5, 0), at(8.5, 0)).action == "deny", "the position is too close to the zone"
     assert ask(grant, Call("SetVelocity", VelocityArgs(0, 0, 0))).action == "allow"
     assert ask(grant, goto(20, 0), at(20, 0)).action == "deny"
 
@@ -187,7 +189,7 @@ def test_clock_set_back_in_flight_keeps_restrictions() -> None:
     fence["spec"] |= shut
     grant = compiled(fence, services=SERVICES)
     after_step = replace(at(0, 10, north_mps=5), time_s=UncertainTime(NOW, NOW - 7200.0))
-    assert monitor(after_step, grant) is not None, "the time may be any time in between"
+    assert monitor(after_step, grant) is not None, "the true time may be anywhere between the two readings"
     assert not ask(grant, Call("SetVelocity", VelocityArgs(5, 0)), after_step).permits
     assert not ask(grant, goto(0, 40), replace(after_step, time_s=UncertainTime(NOW + 7200, NOW))).permits
 
@@ -217,10 +219,10 @@ def test_altitude_bands_of_every_datum_are_respected() -> None:
     low = at(40, 0, alt=10)
     high = at(40, 0, alt=30)
     push = Call("SetVelocity", VelocityArgs(0, 9, hold_s=2))
-    assert ask(amsl, push, low).action == "deny", "home lies at 100 m"
+    assert ask(amsl, push, low).action == "deny", "home is 100 m above sea level, so 10 m above home is inside the band"
     assert ask(amsl, push, high).action == "allow"
     sunk = replace(high, home=Home(39.36, 22.95, 80.0))
-    assert ask(amsl, push, sunk).action == "deny", "home is lower, so the drone is lower too"
+    assert ask(amsl, push, sunk).action == "deny", "home is 20 m lower, so the drone is inside the band"
     terrain = exclusion(box(50, -20, 80, 20), lower=0, upper=15, reference="terrain")
     assert ask(compiled(terrain, services=SERVICES), push, high).action == "deny", "the terrain is unknown"
     assert ask(compiled(terrain, services=SERVICES, flat_terrain=True), push, high).action == "allow"
@@ -231,12 +233,14 @@ def test_leg_out_of_zone_may_not_climb_into_it() -> None:
     under = at(25, 0, alt=12.5, airframe=RETRACING)
     assert ask(above, goto(60, 0, 11), under).action == "allow", "the leg leads out from under the zone"
     assert ask(above, goto(60, 0, 30), under).action == "deny", "the drone would climb into the zone on its way out"
-    assert ask(above, goto(60, 0, 12.7), under).action == "allow", "the leg keeps the height within its error"
-    assert ask(above, goto(60, 0, 13.6), under).action == "deny", "the leg comes even closer to the zone above"
+    assert ask(above, goto(60, 0, 12.7), under).action == "allow", "the change of height is within the altitude error"
+    assert ask(above, goto(60, 0, 13.6), under).action == "deny", "the leg brings the drone closer to the zone above"
     for alt in (13.2, 13.6):
         close = replace(under, altitude_m=alt)
         assert ask(above, goto(60, 0, alt), close).action == "allow", "the leg keeps the height"
-        assert ask(above, goto(60, 0, alt + 0.1), close).action == "deny", "repeated legs would come closer and closer"
+        assert ask(above, goto(60, 0, alt + 0.1), close).action == "deny", (
+            "a sequence of such legs would enter the zone"
+        )
     lower = replace(under, altitude_m=10.0)
     assert ask(above, goto(60, 0, 11.9), lower).action == "allow"
     assert ask(above, goto(60, 0, 12.5), lower).action == "deny", "the leg enters the height margin"
@@ -253,7 +257,9 @@ def test_leg_may_not_sink_out_of_inclusion_zone() -> None:
     grant = compiled(two, operationArea=[])
     assert ask(grant, goto(-30, 0, 5), at(-20, 0, alt=25)).action == "allow"
     sinking = ask(grant, goto(-30, 0, 5), at(30, 0, alt=25))
-    assert sinking.action == "deny", "the drone may sink below the high zone before it is above the ground zone"
+    assert sinking.action == "deny", (
+        "the drone may leave the high zone through its bottom before it reaches the ground zone"
+    )
     assert ask(grant, goto(-30, 0, 5), at(30, 0, alt=8)).action == "allow", (
-        "the drone is already below, so the leg leads back in"
+        "the drone is already below the high zone, so the leg leads back into an inclusion zone"
     )

@@ -1,4 +1,4 @@
-"""Camera footprint compared with rays of a camera that is turned, moved and raised within the error bounds."""
+"""Camera footprint compared with rays of a camera whose true pose differs within the error bounds."""
 
 from __future__ import annotations
 
@@ -33,7 +33,10 @@ def rotation(axis: int, degrees: float) -> np.ndarray:
 
 
 def ray(lens: Lens, attitude: Attitude, u: float, v: float) -> np.ndarray:
-    """Return the ray through a point of the picture as north, east, down. u and v range from -1 to 1, right and down."""
+    """Return the direction (north, east, down) of the ray through the point (u, v) of the picture.
+
+    u points right and v down. Both range from -1 to 1.
+    """
     half = [math.tan(math.radians(d / 2)) for d in (lens.horizontal_deg, lens.vertical_deg)]
     camera = np.array([1.0, u * half[0], v * half[1]])
     tilt = np.eye(3)
@@ -66,7 +69,8 @@ def test_footprint_contains_everything_a_picture_may_show(
 ) -> None:
     now = at(0, 0, alt=alt, lens=lens, attitude=attitude, position_error_m=errors[0], altitude_error_m=errors[1],
              relief_m=errors[2])  # fmt: skip
-    # Roll and pitch have one common bound. The error of the mount is a turn about any axis, in this test about the camera axis.
+    # Roll and pitch errors share one bound. The mount error is a rotation about any axis. This test uses the camera
+    # axis.
     share = (1 + turn[5]) / 2
     actual = replace(
         attitude,
@@ -90,7 +94,7 @@ def test_footprint_contains_everything_a_picture_may_show(
         assert shown.sight.dwithin(point, shown.margin_m + 1e-6)
         assert shown.shows(point.buffer(1e-3), -math.inf, ground_m + 1e-3)
         assert math.dist((0, 0, 0), direction * reach) <= shown.farthest_m + errors[0] + 1e-6
-        # The footprint also contains the air that the ray passes on its way down.
+        # The footprint also contains the points in the air through which the ray passes.
         for share in (0.3, 0.8):
             height = above_m - share * (above_m - ground_m)
             passed = shapely.Point(x + east * share, y + north * share).buffer(1e-3)
@@ -123,7 +127,7 @@ def test_footprint_of_downward_lens_is_rectangle_rotated_by_yaw() -> None:
     assert north.sight.bounds == pytest.approx((-20, -10, 20, 10))
     east = view(at(0, 0, alt=20, attitude=Attitude(0, 0, 90, 0, 0), **sharp))
     assert east.sight.bounds == pytest.approx((-10, -20, 10, 20))
-    # With the nose up by 30 degrees, the camera under it looks ahead.
+    # If the nose is 30 degrees up, a camera that is mounted downward looks ahead.
     ahead = view(at(0, 0, alt=20, attitude=Attitude(0, 30, 0, 0, 0), **sharp))
     assert ahead.sight.bounds[3] == pytest.approx(20 * math.tan(math.radians(30) + math.atan(0.5)))
 
@@ -137,7 +141,7 @@ def test_footprint_of_camera_showing_horizon_is_sector_ahead() -> None:
 
 
 def test_footprint_shows_zones_with_altitude_bands() -> None:
-    # 45 degrees down to the east, with a narrow view: the ground shown is about 20 m ahead.
+    # The narrow view points east, 45 degrees down. It shows the ground about 20 m ahead.
     lens = Lens(10, 10, pitch_deg=-45, stabilised=True, error_deg=0)
     now = at(0, 0, alt=20, lens=lens, attitude=Attitude(0, 0, 90, 0, 0), position_error_m=0.1, altitude_error_m=0.1)
 
@@ -146,8 +150,8 @@ def test_footprint_shows_zones_with_altitude_bands() -> None:
         return ask(compiled(private), _CAPTURE, now).code
 
     assert verdict(15, 25) == "PrivacyZone"
-    assert verdict(5, 10) == "PrivacyZone", "the picture may show a house there"
-    assert verdict(5, 10, upper=3) == "", "the picture cannot show a pool there"
+    assert verdict(5, 10) == "PrivacyZone", "the picture may show a building in the zone"
+    assert verdict(5, 10, upper=3) == "", "the view passes above a low zone"
     assert verdict(5, 10, lower=8, upper=14) == "PrivacyZone"
     assert verdict(-30, -5) == "", "behind"
     assert verdict(40, 60) == "", "beyond"
@@ -186,7 +190,7 @@ def test_combined_filters_satisfy_each_filter(required: list[Filter], more: list
     for filter_ in required:
         assert filter_.action in done or "black" in done or (filter_.action == "blurFaces" and done & hidden)
     assert remaining_filters(required, composed) == ()
-    # Filters applied later replace missing or milder earlier filters.
+    # The remaining filters complete earlier filters that are missing or less strict.
     both = (*composed, *remaining_filters(more, composed))
     assert remaining_filters(combine_filters([*required, *more]), both) == ()
 

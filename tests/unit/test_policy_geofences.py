@@ -1,4 +1,4 @@
-"""Fences of the engine: operation areas, exclusion and inclusion zones, near and on the far side of the globe."""
+"""Geofences of the policy engine: operation areas, exclusion zones and inclusion zones."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_goto_along_corridor_and_home_is_allowed() -> None:
     assert ask(grant, goto(0, 0), at(100, 0)).action == "allow", "home"
     assert ask(grant, Call("Takeoff", TakeoffArgs(10)), at(0, 0, 0)).action == "allow"
     partial = compiled(operationArea=[box(50, -20, 150, 20)], corridor=[box(-30, -30, 150, 30)], control="partial")
-    assert ask(partial, goto(100, 0), at(0, 0)).action == "allow", "the leg leads in"
+    assert ask(partial, goto(100, 0), at(0, 0)).action == "allow", "the leg leads into the operation area"
     assert ask(partial, Call("Arm"), at(0, 0, 0)).code == "OutsideOperationArea"
 
 
@@ -66,7 +66,7 @@ def test_goto_from_home_may_leave_operation_area_into_corridor() -> None:
     grant = compiled(operationArea=[bend], corridor=[box(-30, -30, 100, 100)])
     assert ask(grant, goto(55, 50), at(0, 0)).action == "allow"
     assert ask(grant, goto(55, 50), at(20, 0)).code == "OutsideOperationArea", (
-        "a driver in the operation area stays inside"
+        "a driver inside the operation area must stay inside"
     )
     partial = compiled(operationArea=[bend], corridor=[box(-30, -30, 100, 100)], control="partial")
     assert ask(partial, goto(55, 50), at(0, 0)).code == "OutsideOperationArea", (
@@ -82,7 +82,7 @@ def test_partial_control_driver_may_fly_where_system_can_return_around_zone() ->
     assert ask(compiled(beside, **fields), goto(100, 0), retracing).action == "allow"
     assert ask(compiled(across, **fields), goto(100, 0), retracing).code == "WayHomeBlocked"
     assert ask(compiled(beside, **fields), goto(100, 0), at(60, 0)).code == "WayHomeBlocked", (
-        "the drone returns straight"
+        "the drone returns straight through the zone"
     )
 
 
@@ -129,7 +129,9 @@ def test_reason_distinguishes_turn_from_leg_through_zone() -> None:
 def test_zone_with_altitude_band_may_be_overflown() -> None:
     grant = compiled(exclusion(box(50, -20, 80, 20), upper=20))
     assert ask(grant, goto(150, 0, 30), at(alt=30)).action == "allow"
-    assert ask(grant, goto(150, 0, 30), at(alt=10)).code == "LegThroughExclusionZone", "the drone may climb too late"
+    assert ask(grant, goto(150, 0, 30), at(alt=10)).code == "LegThroughExclusionZone", (
+        "the drone may still climb when it reaches the zone"
+    )
     assert ask(grant, goto(150, 0, 21), at(alt=21)).code == "LegThroughExclusionZone", (
         "the leg is inside the altitude margin"
     )
@@ -148,7 +150,7 @@ def test_geofence_action_determines_takeover(action: str) -> None:
     verdict = ask(grant, goto(60, 0))
     assert (verdict.action, verdict.takeover, verdict.policies) == ("takeover", action, ("no-fly",))
     assert ask(grant, goto(150, 0)).takeover == action, "a leg through the zone also breaks the policy"
-    assert ask(grant, goto(48, 0)).action == "deny", "a leg inside the margin is only denied"
+    assert ask(grant, goto(48, 0)).action == "deny", "a leg that only enters the margin causes no takeover"
 
 
 def test_most_restrictive_fence_decides() -> None:
@@ -184,9 +186,9 @@ def test_adjust_action_shortens_leg_inside_inclusion_zone() -> None:
 
 @pytest.mark.parametrize("radius_m", [20_000.0, 100_000.0])
 def test_inclusion_circle_of_large_radius_is_not_left(radius_m: float) -> None:
-    """The border is 100 m north of home, and the center far to the south."""
+    """The border of the circle is 100 m north of home. Its center is far to the south."""
     lat, lon = FRAME.latlon(0.0, -(radius_m - 100.0))
-    # Unlike the local frame, geodesics are true to scale.
+    # The local frame distorts large distances, so the radius is a geodesic distance.
     south_m = distance_m(Point(lat=lat, lon=lon), Point(lat=HOME.lat, lon=HOME.lon))
     circle = {"circle": {"center": {"lat": lat, "lon": lon}, "radius": south_m + 100.0}}
     grant = compiled(inclusion(circle))
@@ -225,7 +227,9 @@ def test_goto_from_inside_zone_may_only_lead_out() -> None:
     inside = at(60, 0)
     assert ask(grant, goto(40, 0), inside).action == "allow"
     assert ask(grant, goto(80, 0), inside).action != "allow"
-    assert ask(grant, goto(100, 0), inside).action != "allow", "the longer leg out leads deeper first"
+    assert ask(grant, goto(100, 0), inside).action != "allow", (
+        "on the longer leg, the drone flies deeper into the zone before it leaves"
+    )
     assert ask(grant, goto(49, 0), inside).action != "allow", "the target is outside, but inside the margin"
     assert ask(grant, goto(80, 0), inside).action == "deny", (
         "the monitor already handles the violation, so there is no second takeover"
@@ -254,7 +258,7 @@ def test_goto_is_denied_when_straight_return_is_blocked() -> None:
 
 
 def test_straight_return_near_home_is_checked_at_lower_altitude() -> None:
-    """Near home the autopilot climbs only to three times its distance from home, not to its return altitude."""
+    """Near home, the autopilot climbs only to three times its distance from home instead of its return altitude."""
     grant = compiled(exclusion(box(-20, 15, 20, 17), name="mast", upper=70))
     high = at(60, 60, airframe=Airframe(return_altitude_m=100.0))
     assert ask(grant, goto(0, 60), high).action == "allow", "from the target the drone returns at 100 m"
@@ -285,7 +289,7 @@ def test_drone_too_close_below_or_above_zone_may_sink_or_climb_away(
         assert ask(grant, goto(x, 0, closer), beside).action == "deny"
         assert ask(grant, goto(x, 0, 10.0), beside).action == "deny", "the drone stays too close"
         assert ask(grant, goto(x - 20, 0, away), beside).action == "deny", (
-            "the drone may be above or below the zone first"
+            "the drone may fly above or below the zone before it has changed its altitude"
         )
     moving = at(x=40.5, alt=10.0, east_mps=-8.0)
     assert ask(grant, goto(40.5, 0, away), moving).action == "deny"

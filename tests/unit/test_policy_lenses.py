@@ -1,4 +1,4 @@
-"""Footprints of lens models compared with projections of OpenCV: a footprint contains everything in the picture."""
+"""Footprints of lens models compared with projections of OpenCV. A footprint must contain everything in the picture."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def rotation(axis: int, degrees: float) -> np.ndarray:
 
 
 def projected(model: str, rays: np.ndarray, focal: float, centre: tuple[float, float], k: tuple[float, ...]) -> Any:
-    """Return pixels of rays (right, down, ahead) that lie ahead of the camera."""
+    """Return the pixels of rays (right, down, ahead) in front of the camera, projected by OpenCV."""
     matrix = np.array([[focal, 0, centre[0]], [0, focal, centre[1]], [0, 0, 1]])
     still = np.zeros(3)
     if model == "equidistant":
@@ -56,7 +56,7 @@ def described(model: str, half: float, height: int, k: tuple[float, ...], *, has
 
 
 def folds_at(k: tuple[float, ...], reach: float) -> float:
-    """Return the tangent beyond which the model of a lens folds back, unlike a real lens."""
+    """Return the tangent of the angle beyond which the lens model is not monotonic. Real lenses are monotonic."""
     r = np.linspace(0, reach, 20_000)
     shown = r * (1 + k[0] * r**2 + k[1] * r**4 + k[4] * r**6)
     falling = np.flatnonzero(np.diff(shown) <= 0)
@@ -91,9 +91,9 @@ def test_bounding_lens_covers_every_zone_a_picture_shows(
     else:
         fold = folds_at(k, 200.0)
         assume(fold > math.tan(half) * 1.3)
-        # The bound for a camera without lens description assumes little decentring.
+        # Without a lens description, the bound does not cover tangential distortion.
         k = k if has_lens else (*k[:2], 0.0, 0.0, k[4])
-    # Focal length at which the sides of the picture are at that angle.
+    # Choose the focal length so that the sides of the picture are at the angle `half`.
     side = projected(model, np.array([[math.tan(half), 0.0, 1.0]]), 1.0, (0.0, 0.0), k)[0][0]
     assume(side > 0.01)
     focal = _WIDTH / 2 / side
@@ -104,7 +104,7 @@ def test_bounding_lens_covers_every_zone_a_picture_shows(
     now = at(0, 0, alt=alt, lens=exact, attitude=Attitude(*turn, 0, 0), position_error_m=0.0, altitude_error_m=0.0)
     shown = footprint(now, FRAME)
     assert shown is not None
-    # Points of the ground, nearer ones more often, and their positions in the picture.
+    # Sample points of the ground, with a higher density near the drone, and project them into the picture.
     rng = np.random.default_rng(seed)
     reach = alt * 10 ** rng.uniform(-2, 1.7, _POINTS)
     bearing = rng.uniform(0, 2 * math.pi, _POINTS)
@@ -120,7 +120,7 @@ def test_bounding_lens_covers_every_zone_a_picture_shows(
     u, v = projected(model, np.where(visible[:, None], rays, [0.0, 0.0, 1.0]), focal, centre, k).T
     visible &= (u >= 0) & (u <= _WIDTH) & (v >= 0) & (v <= height)
     if not has_lens and model == "brownConrady":
-        # The bound for a camera without lens description assumes at most an orthographic fisheye at the corners.
+        # Without a lens description, the bound covers at most an orthographic fisheye lens at the corners.
         angle = np.arctan2(np.hypot(right, down), ahead)
         across = np.hypot(u - centre[0], v - centre[1]) / (_WIDTH / 2)
         visible &= np.sin(np.minimum(angle, math.pi / 2)) <= np.maximum(across, 1.0) * math.sin(half) + 1e-9

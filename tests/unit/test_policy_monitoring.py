@@ -1,4 +1,4 @@
-"""Motion monitor: violations that it prevents, and motion that it permits."""
+"""Motion monitor: prevented violations and permitted motion."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from policy_world import NOW, altitude, at, box, compiled, exclusion, goto, incl
 WALL = box(-50, 50, 50, 90)
 
 
-def test_monitor_returns_none_when_nothing_is_wrong() -> None:
+def test_monitor_permits_motion_without_violation() -> None:
     grant = compiled(exclusion(WALL), altitude(upperLimit=30), speed(upperLimit=10))
     assert monitor(at(), grant) is None
     assert monitor(at(0, 20, north_mps=5), grant) is None
@@ -80,7 +80,7 @@ def test_monitor_stops_drone_leaving_operation_area_or_inclusion_zone() -> None:
     assert (verdict.code, verdict.takeover) == ("InclusionBorderAhead", "returnToLaunch")
 
 
-def test_monitor_stops_system_flight_only_when_it_makes_things_worse() -> None:
+def test_monitor_stops_system_flight_only_if_it_increases_a_violation() -> None:
     inclusion_grant = compiled(inclusion(box(-50, -50, 50, 50), "land"))
     out = compiled(exclusion(WALL, "revoke"))
     for state, grant, code in (
@@ -98,7 +98,7 @@ def test_monitor_stops_system_flight_only_when_it_makes_things_worse() -> None:
         (at(0, 60, north_mps=-6), inclusion_grant),
         (at(0, 55, north_mps=-6), out),
     ):
-        assert monitor(state, grant, system_flies=True) is None, "it leads back"
+        assert monitor(state, grant, system_flies=True) is None, "the motion leads back"
         assert monitor(state, grant) is not None
 
 
@@ -130,14 +130,14 @@ def test_monitor_corrects_altitude_and_speed() -> None:
     assert high is not None
     assert isinstance(high.args, GotoArgs)
     assert (high.action, high.args.alt, high.policies) == ("correct", 15, ("altitudes",))
-    assert monitor(at(alt=15.5), grant) is None, "the climb may end at the limit"
+    assert monitor(at(alt=15.5), grant) is None, "the excess is within the tolerance"
     fast = monitor(at(north_mps=9), grant)
     assert fast is not None
     assert fast.args == SetSpeedArgs(5)
     assert monitor(at(north_mps=5.5), grant) is None
 
 
-def test_known_altitude_limit_holds_beside_limit_of_unknown_datum() -> None:
+def test_known_altitude_limit_applies_despite_limit_of_unknown_datum() -> None:
     grant = compiled(altitude(upperLimit=15), altitude("terrain", lowerLimit=5, altitudeReference="terrain"))
     high = monitor(at(alt=18), grant)
     assert high is not None
@@ -193,7 +193,7 @@ def test_monitor_handles_zone_appearing_around_drone() -> None:
     for action, want in (("ignore", None), ("hover", "hover"), ("land", "land"), ("revoke", "revoke")):
         verdict = monitor(at(0, 70, north_mps=-4), compiled(exclusion(WALL, action)))
         assert (verdict.takeover if verdict else None) == want, (
-            "the drone leaves the zone without a command if the policy permits"
+            "a drone on its way out is stopped only if the policy has a takeover action"
         )
     deeper = monitor(at(0, 60, north_mps=6), compiled(exclusion(WALL, "adjust")))
     assert deeper is not None
@@ -209,7 +209,7 @@ def test_monitor_permits_climb_to_allowed_altitude_despite_link_latency() -> Non
     assert correction(monitor(climbing, grant)) == "AltitudeAboveLimit"
     past = at(0, 0, 17.5, down_mps=-2.6, latency_s=0.77)
     assert correction(monitor(past, grant, current_leg=leg)) == "AltitudeAboveLimit", (
-        "the drone may not brake at the end of the leg"
+        "the drone is already above the end of the leg, so it may not stop climbing"
     )
     higher = goto(100, 0, 12.0).args
     assert isinstance(higher, GotoArgs)
@@ -218,7 +218,7 @@ def test_monitor_permits_climb_to_allowed_altitude_despite_link_latency() -> Non
 
 
 def test_monitor_stops_leg_crossing_new_zone_at_once() -> None:
-    """The monitor does not wait until the last possible moment, because the link may fail before."""
+    """The monitor stops the leg early, because the link may fail before the last possible moment."""
     leg = goto(180, 0, 12.0).args
     climbing = goto(180, 0, 30.0).args
     short = goto(60, 0, 12.0).args
@@ -236,7 +236,7 @@ def test_monitor_stops_leg_crossing_new_zone_at_once() -> None:
     assert monitor(flying, above, current_leg=leg, fences_changed=True) is None, "it passes below"
     assert monitor(flying, above, current_leg=climbing, fences_changed=True) is not None
     around = compiled(exclusion(box(-20, -20, 20, 20)))
-    assert monitor(flying, around, current_leg=leg, fences_changed=True, system_flies=True) is None, "it leads out"
+    assert monitor(flying, around, current_leg=leg, fences_changed=True, system_flies=True) is None, "the leg leads out"
 
 
 def test_monitor_permits_climb_ended_by_velocity_despite_link_latency() -> None:
@@ -280,7 +280,9 @@ def test_monitor_stops_drone_below_and_above_altitude_band(
     assert stop_m < (15 - stopped[0]) * up < stop_m + 1.5, "the drone stops neither too early nor too late"
     assert len(stopped) > 100, "the monitor also stops a drone that has entered the zone"
     away = at(0, 0, 15 + up, down_mps=climb_mps)
-    assert (monitor(away, grant) is None) is (action == "ignore"), "the drone may turn back"
+    assert (monitor(away, grant) is None) is (action == "ignore"), (
+        "a drone that flies away from the altitude band is stopped only with a takeover action"
+    )
     assert monitor(at(0, 0, 15 - 3 * up), grant) is None
     assert monitor(at(60 * up, 0, 12, down_mps=-climb_mps), compiled(exclusion(AROUND, lower=15))) is None
 
@@ -291,7 +293,7 @@ def test_monitor_stops_drone_creeping_up_into_zone() -> None:
     assert verdict.takeover == "hover"
 
 
-def test_monitor_permits_climb_to_below_zone_and_landing() -> None:
+def test_monitor_permits_landing_and_climb_that_ends_below_zone() -> None:
     grant = compiled(exclusion(AROUND, "returnToLaunch", lower=18))
     leg = goto(0, 0, 16.0).args
     assert isinstance(leg, GotoArgs)
@@ -308,7 +310,7 @@ def test_monitor_permits_climb_to_below_zone_and_landing() -> None:
 
 
 def correction(verdict: Verdict | None) -> str:
-    """Return the code of a correction."""
+    """Return the code of a verdict that corrects, or an empty text for any other verdict."""
     return verdict.code if verdict is not None and verdict.action == "correct" else ""
 
 
@@ -316,8 +318,12 @@ def test_monitor_ends_unjudged_climb_at_half_the_tolerance() -> None:
     grant = compiled(altitude(upperLimit=10))
     climbing = at(0, 0, 10.8, down_mps=-0.7)
     assert correction(monitor(climbing, grant, system_flies=True)) == "AltitudeAboveLimit"
-    assert monitor(climbing, grant) is None, "the climb of the driver was judged before"
+    assert monitor(climbing, grant) is None, "the engine has judged the climb of the driver"
     leg = goto(0, 50, 10.0).args
     assert isinstance(leg, GotoArgs)
-    assert monitor(climbing, grant, system_flies=True, current_leg=leg) is None, "the system flies the leg itself"
-    assert monitor(at(0, 0, 11.4, down_mps=-0.1), grant, system_flies=True) is None, "the drone holds its height"
+    assert monitor(climbing, grant, system_flies=True, current_leg=leg) is None, (
+        "the climb belongs to the current leg of the system"
+    )
+    assert monitor(at(0, 0, 11.4, down_mps=-0.1), grant, system_flies=True) is None, (
+        "the drone does not climb noticeably"
+    )

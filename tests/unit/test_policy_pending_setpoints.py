@@ -1,4 +1,4 @@
-"""Setpoints in quick succession are judged for all possible times at which pending setpoints arrive."""
+"""Setpoints in quick succession: the engine considers all possible arrival times of pending setpoints."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ BRAKES = -2.5
 
 
 def flown(rng: random.Random, now: Situation, pending: list[Velocity], requested: VelocityArgs) -> list[Velocity]:
-    """Return possible positions of a drone that receives setpoints in order, within the latency, and then stops."""
+    """Return positions of a drone that receives the setpoints at random times within the latency, and then stops."""
     moments = sorted(rng.choice([0.0, rng.uniform(0, now.latency_s), now.latency_s]) for _ in (*pending, requested))
     velocities = [
         (0.0, 0.0) if now.forward_mps2 == BRAKES else (now.east_mps, now.north_mps),
@@ -74,7 +74,7 @@ def test_velocity_leg_contains_the_flown_path_with_pending_setpoints(seed: int) 
             missed_m, float(shapely.distance(velocity_leg(blind, (0.0, 0.0), requested).ground, places).max())
         )
     assert furthest_m < now.airframe.tracking_m, "legs keep a larger margin than this deviation"
-    assert missed_m > 2.0, "the pending setpoint makes the difference"
+    assert missed_m > 2.0, "a leg that ignores the pending setpoints does not contain the path"
 
 
 def test_pending_setpoint_may_end_braking() -> None:

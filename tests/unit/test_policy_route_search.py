@@ -1,4 +1,4 @@
-"""Routes around zones: the engine permits every leg, and routes are no longer than necessary."""
+"""Routes around zones: the engine permits every leg, and the routes are not much longer than the shortest ones."""
 
 from __future__ import annotations
 
@@ -35,7 +35,10 @@ def length(start: tuple[float, float], route: Route) -> float:
 
 
 def legal(grant: CompiledGrant, start: tuple[float, float], route: Route, now: Situation) -> None:
-    """Return True if every leg is permitted for a stationary drone within a metre of the end of the previous leg."""
+    """Check that the engine permits every leg.
+
+    The drone starts each leg from standstill, within a metre of the end of the previous leg.
+    """
     for a, b in itertools.pairwise((start, *route)):
         for dx, dy in ((0.0, 0.0), (0.7, 0.7), (-0.7, 0.7), (0.7, -0.7), (-0.7, -0.7)):
             x, y = (a[0] + dx, a[1] + dy) if a != start else a
@@ -78,14 +81,14 @@ def test_route_respects_altitude_bands_and_limits() -> None:
     assert find(low, (0, 0), (0, 100), alt=30) == ((0, 100),)
     assert len(find(low, (0, 0), (0, 100), alt=21) or ()) == 3, "the straight leg is too close above the zone"
     climbing = find_route((0, 0), (0, 100), at(airframe=RETRACING), low, 30.0, from_m=5.0)
-    assert len(climbing or ()) == 3, "the drone may climb too late"
+    assert len(climbing or ()) == 3, "the drone may still climb when it reaches the zone"
     limited = free(altitude(zones=[zone("low", box(-100, 40, 30, 50))], upperLimit=15))
     assert find(limited, (0, 0), (0, 100)) == ((0, 100),)
     assert len(find(limited, (0, 0), (0, 100), alt=30) or ()) == 3
     above_terrain = free(
         altitude(zones=[zone("low", box(-100, 40, 30, 50))], upperLimit=15, altitudeReference="terrain")
     )
-    assert len(find(above_terrain, (0, 0), (0, 100)) or ()) == 3, "the altitude is unknown"
+    assert len(find(above_terrain, (0, 0), (0, 100)) or ()) == 3, "the altitude above terrain is unknown"
 
 
 def test_route_stays_inside_inclusion_zone() -> None:
@@ -141,11 +144,16 @@ def test_route_uses_narrow_gap_when_no_wider_one_exists() -> None:
     assert route is not None
     assert length((-30, 0), route) < 130
     shut = free(exclusion(box(-500, 40, 0, 50), name="west"), exclusion(box(4.9, 40, 500, 50), name="east"))
-    assert length((-30, 0), find(shut, (-30, 0), (-30, 100)) or ()) > 900, "the route leads around the whole wall"
+    assert length((-30, 0), find(shut, (-30, 0), (-30, 100)) or ()) > 900, (
+        "the gap is too narrow, so the route leads around both zones"
+    )
 
 
 def _shortest(zones: list[Corners], start: tuple[float, float], to: tuple[float, float]) -> float:
-    """Return the shortest route by Dijkstra over all pairs of corners of finely buffered zones, independently of the engine."""
+    """Return the length of the shortest route, computed independently of the engine.
+
+    The nodes of Dijkstra's algorithm are all corners of the finely buffered zones.
+    """
     walls = shapely.union_all([shapely.Polygon(z).buffer(2.5 + CLEARANCES_M[0], quad_segs=4) for z in zones])
     nodes = [start, to, *map(tuple, shapely.get_coordinates(walls.buffer(0.01)))]
     inner = walls.buffer(-1e-3)
@@ -230,4 +238,6 @@ def test_route_checks_both_altitudes_on_the_first_leg_only() -> None:
     level = find_route((0, 0), (150, 0), at(alt=5, airframe=RETRACING), grant, 5.0)
     assert level is not None
     assert climbing is not None
-    assert length((0, 0), climbing) < 155 < length((0, 0), level), "it is above the second zone after its first leg"
+    assert length((0, 0), climbing) < 155 < length((0, 0), level), (
+        "after its first leg, the climbing drone is above the second zone"
+    )

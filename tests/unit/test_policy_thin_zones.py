@@ -1,4 +1,7 @@
-"""A zone is crossed only if the drone certainly cannot stop before it, never because it may come to rest behind it."""
+"""Thin zones: a leg may cross a zone only if the drone certainly cannot stop before the zone.
+
+It is not sufficient that the drone would come to rest behind the zone.
+"""
 
 from __future__ import annotations
 
@@ -39,9 +42,9 @@ def test_leg_through_thin_zone_is_allowed_only_when_the_drone_cannot_stop_before
     if verdict.permits and not verdict.brake_first:
         flown = verdict.args
         if isinstance(flown, VelocityArgs) and math.hypot(flown.north_mps, flown.east_mps) < speed - 0.1:
-            return  # scaled: the drone stays before the zone
+            return  # the velocity was scaled so that the drone stays before the zone
         reach = speed * speed / (2 * now.airframe.accel_mps2)
-        assert reach >= away or (velocity and away > reach + 2.0 * speed), "it could stop before it"
+        assert reach >= away or (velocity and away > reach + 2.0 * speed), "the drone could stop before the zone"
 
 
 @pytest.mark.parametrize("thick", [0.5, 2.0, 4.0])

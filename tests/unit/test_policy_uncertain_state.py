@@ -1,4 +1,4 @@
-"""Unknown state counts against a request: numbers that are not finite, uncertain clocks, and camera footprints."""
+"""Uncertain state: the engine denies a request if non-finite numbers, the clock or the footprint allow no decision."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def _with(body: dict[str, Any], **spec: Any) -> dict[str, Any]:
     return {**body, "spec": {**body["spec"], **spec}}
 
 
-def test_uncertain_time_applies_restrictions_at_either_and_permissions_at_both_readings() -> None:
+def test_uncertain_time_applies_restrictions_of_either_reading_and_permissions_of_both() -> None:
     day = 86_400.0
     doubtful = replace(at(), time_s=UncertainTime(NOW + 3 * day, NOW))
     fence = compiled(_with(exclusion(box(-20, 20, 20, 60)), **_until(NOW + day)))

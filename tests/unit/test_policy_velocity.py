@@ -1,4 +1,4 @@
-"""Velocity setpoints are judged by everything the drone sweeps until it stops."""
+"""Velocity setpoints: the engine judges the whole path of the drone until it stops."""
 
 from __future__ import annotations
 
@@ -54,7 +54,8 @@ def test_velocity_is_denied_when_position_is_unknown() -> None:
 
 def test_velocity_leg_includes_latency_hold_and_stop() -> None:
     grant = compiled(exclusion(box(-50, 30, 50, 60)), operationArea=[])
-    # 5 m/s from standstill: 0.8 s of latency and hold, mostly acceleration, and the stop, with a margin of 2.5 m.
+    # 5 m/s from standstill: 0.8 s of latency and hold time, in which the drone mostly accelerates, then the stop. The
+    # margin is 2.5 m.
     near = [y for y in range(31) if ask(grant, fly(5), at(0, float(y))).permits]
     assert 19 <= max(near) <= 26
     longer = [y for y in range(31) if ask(grant, fly(5, hold=2.0), at(0, float(y))).permits]
@@ -83,7 +84,7 @@ def test_velocity_is_scaled_by_adjusting_fence() -> None:
     assert 1 < new.north_mps < 7
     assert new.east_mps == pytest.approx(new.north_mps / 8)
     assert ask(grant, Call("SetVelocity", new)).action == "allow", "the corrected velocity is legal"
-    assert ask(grant, fly(8, hold=2.0), at(0, 11.4)).action == "deny", "nothing worth flying is left"
+    assert ask(grant, fly(8, hold=2.0), at(0, 11.4)).action == "deny", "the remaining velocity would be too small"
 
 
 def test_velocity_from_inside_zone_may_only_lead_out() -> None:
@@ -106,10 +107,12 @@ def test_velocity_is_limited_to_operation_area_and_corridor() -> None:
     assert ask(grant, fly(5), at(0, 195)).code == "OutsideOperationArea"
     assert ask(grant, fly(-5), at(0, 195)).permits
     apart = compiled(operationArea=[box(50, -20, 150, 20)], corridor=[box(-30, -30, 150, 30)])
-    assert ask(apart, fly(0, 5), at(0, 0)).permits, "it leads to the area"
-    assert ask(apart, fly(0, -5), at(-10, 0)).code == "OutsideOperationArea", "it leads away from area and home"
-    assert ask(apart, fly(0, -5), at(30, 0)).permits, "it leads home"
-    assert ask(apart, fly(5, 0), at(40, 22)).code == "OutsideOperationArea", "out of the corridor"
+    assert ask(apart, fly(0, 5), at(0, 0)).permits, "the velocity leads toward the operation area"
+    assert ask(apart, fly(0, -5), at(-10, 0)).code == "OutsideOperationArea", (
+        "the velocity leads away from operation area and home"
+    )
+    assert ask(apart, fly(0, -5), at(30, 0)).permits, "the velocity leads home"
+    assert ask(apart, fly(5, 0), at(40, 22)).code == "OutsideOperationArea", "the velocity leads out of the corridor"
 
 
 def test_velocity_out_of_inclusion_zone_is_denied() -> None:
@@ -124,9 +127,11 @@ def test_velocity_horizontal_part_is_scaled_to_speed_limit() -> None:
     new = flown(verdict)
     assert (verdict.action, verdict.code, verdict.policies) == ("correct", "SpeedAboveLimit", ("speeds",))
     assert (new.north_mps, new.east_mps, new.down_mps) == pytest.approx((2.4, 3.2, -1))
-    assert ask(grant, fly(0.1)).action == "allow", "lower limits do not keep a drone from hovering"
+    assert ask(grant, fly(0.1)).action == "allow", (
+        "lower speed limits do not apply to velocities, because hovering is permitted"
+    )
     assert ask(compiled(speed(upperLimit=4, action="refuse")), fly(6)).code == "SpeedAboveLimit"
-    assert ask(compiled(), fly(99)).action == "correct", "the drone's own limit"
+    assert ask(compiled(), fly(99)).action == "correct", "the maximum speed of the drone applies"
 
 
 def test_velocity_vertical_part_is_scaled_to_altitude_limit() -> None:
@@ -138,7 +143,9 @@ def test_velocity_vertical_part_is_scaled_to_altitude_limit() -> None:
     sinking = ask(grant, fly(2, 0, 3, hold=2.0), at(alt=8))
     assert sinking.code == "AltitudeBelowLimit"
     assert 0 < flown(sinking).down_mps < 1.5
-    assert ask(grant, fly(2, 0, 0), at(alt=15.3)).action == "allow", "within what the autopilot strays"
+    assert ask(grant, fly(2, 0, 0), at(alt=15.3)).action == "allow", (
+        "the excess is within the altitude deviation of the autopilot"
+    )
     assert ask(compiled(altitude(upperLimit=15, action="refuse")), fly(0, 0, -3, hold=2.0), at(alt=12)).action == "deny"
 
 
@@ -176,13 +183,15 @@ def test_velocity_is_denied_when_straight_return_is_blocked() -> None:
     toward = fly(0, -8, hold=2.0)
     assert ask(free, toward, behind).code == "WayHomeBlocked"
     assert ask(free, fly(0, 5), behind).permits
-    assert ask(free, toward, at(110, 60, airframe=Airframe(retraces=True))).permits, "back as it came"
+    assert ask(free, toward, at(110, 60, airframe=Airframe(retraces=True))).permits, (
+        "a drone that retraces its path can return"
+    )
 
 
 def test_velocity_is_denied_when_altitude_limits_are_too_close_to_stop() -> None:
     rising = at(alt=30.7, down_mps=-1.5, altitude_error_m=1.0)
     low = ask(compiled(altitude(lowerLimit=31.0)), fly(3, 0, 1.0, hold=1.7), rising)
-    assert flown(low).down_mps < 0, "sinking, it would come below the limit"
+    assert flown(low).down_mps < 0, "a sinking drone would violate the lower limit"
     band = ask(compiled(altitude(upperLimit=31.2, lowerLimit=31.0)), fly(3, 0, 1.0, hold=1.7), rising)
     assert (band.action, band.code, band.policies) == ("deny", "AltitudeAboveLimit", ("altitudes",))
     assert "Goto" in band.reason

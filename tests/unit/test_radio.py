@@ -1,4 +1,7 @@
-"""The simulated radio compared with 802.11g of ns-3: rates over distance, half duplex and faults. Also the mobile uplink."""
+"""Simulated radio and mobile uplink.
+
+The radio is compared with 802.11g of ns-3: rates over distance, half duplex and faults.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +35,7 @@ def pair(distance_m: float, propagation: Propagation, seed: int = 1) -> Medium:
 
 
 def udp_mbps(medium: Medium, seconds: float = 2.0) -> float:
-    """Return the received payload in Mbit/s while the sender's queue is never empty."""
+    """Return the received payload in Mbit/s. The queue of the sender is never empty."""
     now = 0.0
     arrived = 0
     while now < seconds:
@@ -100,7 +103,7 @@ def test_frames_arrive_once_and_in_order() -> None:
             received += [arrival.frame for arrival in medium.advance(now)]
     assert len(received) == len(set(received))
     assert received == sorted(received)
-    assert len(received) < len(sent)  # a frame is dropped after its last attempt
+    assert len(received) < len(sent)  # some frames are dropped after their last attempt
 
 
 def test_only_stations_of_one_network_in_range_receive_frames() -> None:
@@ -125,7 +128,7 @@ def test_full_radio_queue_drops_frames() -> None:
     medium = pair(10, Propagation.reaching(100))
     for _ in range(QUEUE_FRAMES + 11):
         medium.offer("a", frame(B), 0.0)
-    assert medium.stations["a"].dropped == 10  # one frame is being sent
+    assert medium.stations["a"].dropped == 10  # the queue does not count the frame in transmission
 
 
 def test_sending_out_of_range_ends_after_the_last_attempt() -> None:

@@ -1,4 +1,4 @@
-"""Recent setpoints: how long the vehicle may still be reacting to them."""
+"""Recent setpoints: a setpoint is pending as long as the vehicle may still react to it."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ WEST = (0.0, -LEG_MPS, 0.0)
 
 
 def legs(*targets: tuple[float, float, float]) -> RecentSetpoints:
-    """Return legs, each with metres east and north and the time of its start."""
+    """Return setpoints with one leg for each target (metres east, metres north, start time in s)."""
     setpoints = RecentSetpoints()
     vehicle = VehicleState(lat=POSITION[0], lon=POSITION[1], altitude_m=10.0)
     for east, north, at in targets:
@@ -38,11 +38,11 @@ def test_leg_is_pending_until_the_drone_has_turned_onto_it(velocity: Velocity, t
         assert pending[0] == pytest.approx(WEST, abs=0.01)
 
 
-def test_later_leg_replaces_the_earlier_one_when_it_is_old_enough() -> None:
+def test_earlier_leg_is_not_pending_if_the_later_leg_is_old_enough() -> None:
     setpoints = legs((-100.0, 0.0, 1.0), (100.0, 0.0, 9.5))
     assert [leg[1] for leg in setpoints.pending_since(9.0, (5.0, -2.0, 0.0))] == pytest.approx([-LEG_MPS, LEG_MPS])
     assert [leg[1] for leg in setpoints.pending_since(9.6, (5.0, -2.0, 0.0))] == pytest.approx([LEG_MPS])
-    assert setpoints.pending_since(10.0, (0.0, 6.0, 0.0)) == (), "the drone flies east by then"
+    assert setpoints.pending_since(10.0, (0.0, 6.0, 0.0)) == (), "the drone flies to the east, along the later leg"
 
 
 def test_held_velocity_is_pending_until_another_setpoint_is_sent() -> None:

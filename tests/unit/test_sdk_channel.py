@@ -18,13 +18,13 @@ from grpc.aio import Metadata
 
 
 class Restarting(ServiceChannel):
-    """A service that is away when it is called first."""
+    """Channel to a service that is unavailable during the first call."""
 
     def __init__(self) -> None:
         super().__init__(Endpoint("127.0.0.1:1", "drone-1", Path("tls")), lambda _channel: None)
         self.calls: list[Any] = []
 
-    async def _answer(self, request: Any, *, timeout: float) -> str:  # noqa: ASYNC109 - as stubs have it
+    async def _answer(self, request: Any, *, timeout: float) -> str:  # noqa: ASYNC109 - same signature as gRPC stubs
         assert timeout > 0
         self.calls.append(request)
         if len(self.calls) == 1:

@@ -18,7 +18,7 @@ from fractus_services.errors import Refused, ResourceExhausted, denied
 
 
 async def failed(refusal: Refused) -> grpc.aio.AioRpcError:
-    """The error that a client gets of a refusal."""
+    """Return the gRPC error that a client receives if the service refuses a call."""
     seen: list[grpc.aio.AioRpcError] = []
 
     class Context:
@@ -39,7 +39,7 @@ async def test_busy_error_contains_retry_delay(again_s: float) -> None:
     assert isinstance(found, Busy)
     assert str(found) == "GetSpeed: more than 50 calls per second; slow down"
     assert found.retry_after_s == (again_s or None)
-    assert bool(found.remedy) == bool(again_s), "if waiting does not help, the message names another remedy"
+    assert bool(found.remedy) == bool(again_s), "only an error with a retry delay has the remedy to wait"
 
 
 async def test_policy_denied_contains_decision() -> None:

@@ -26,7 +26,7 @@ def test_orbit_keeps_radius_and_faces_centre(turns: float) -> None:
         assert math.cos(math.radians(waypoint.yaw_deg - to_middle)) > 0.999
         assert waypoint.position.alt == 25.0
     second = frame.xy(waypoints[1].position.lat, waypoints[1].position.lon)
-    assert math.copysign(1.0, second[0]) == math.copysign(1.0, turns), "clockwise begins to the east"
+    assert math.copysign(1.0, second[0]) == math.copysign(1.0, turns), "a clockwise orbit begins to the east"
 
 
 @pytest.mark.parametrize(("radius_m", "points"), [(0.0, 16), (math.nan, 16), (30.0, 2)])
@@ -88,7 +88,7 @@ def test_unsupported_plan_is_refused_with_reason(tmp_path: Path, items: list[dic
 
 
 class Remembered:
-    """Control that counts waypoints."""
+    """Fake control that stores the number of reached waypoints."""
 
     begun = None
     waypoints_reached = 0

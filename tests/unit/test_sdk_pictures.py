@@ -1,4 +1,4 @@
-"""`Camera.take` if the picture cannot be deleted from the node."""
+"""`Camera.take`: behaviour if the picture cannot be deleted from the node."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from fractus.values import ImageInfo, Result
 
 
 class Node(Camera):
-    """A camera whose transfers break off."""
+    """Fake camera. Deletions fail, and so do retrievals if `data` is None."""
 
     def __init__(self, data: bytes | None) -> None:
         self.data = data

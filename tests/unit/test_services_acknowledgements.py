@@ -1,4 +1,7 @@
-"""Assignment of acknowledgements: each belongs to the oldest possible transmission, and to no later command."""
+"""Assignment of acknowledgements to commands.
+
+An acknowledgement belongs to the oldest transmission that it can answer. It must not be assigned to a later command.
+"""
 
 from __future__ import annotations
 
@@ -29,12 +32,12 @@ def ack(result: int = ACCEPTED, command: int = SPEED, target: int = 245) -> Mess
 
 
 def link(delay_s: float = 1.0) -> Acknowledgements:
-    """Return acknowledgements for a link with a measured delay and regular responses."""
+    """Return Acknowledgements for a link with a measured delay and regular responses."""
     return Acknowledgements(245, measured(delay_s))
 
 
 class SilentTiming(Timing):
-    """Timing of a link with a given time since the last response."""
+    """Fake timing. A function of the test returns the time since the last response."""
 
     def __init__(self, silence: Callable[[float], float]) -> None:
         super().__init__()
@@ -62,7 +65,7 @@ def test_transmission_is_lost_after_the_longest_measured_delay(delay_s: float, t
     assert link(delay_s).timeout_s == pytest.approx(timeout_s)
 
 
-async def test_second_acknowledgement_of_a_repeated_command_does_not_deny_the_next_one() -> None:
+async def test_second_acknowledgement_of_a_repeated_command_does_not_deny_the_next_command() -> None:
     acks = link()
     first = Answer()
     later = Answer()
@@ -222,7 +225,7 @@ async def test_number_of_open_transmissions_is_limited() -> None:
     assert len(acks._sent[SPEED]) == MAX_UNACKNOWLEDGED
 
 
-async def test_later_command_overtakes_an_unanswered_one() -> None:
+async def test_later_command_overtakes_an_unanswered_command() -> None:
     acks = link()
     first = Answer()
     later = Answer()

@@ -17,7 +17,7 @@ def unused(_motion: Any) -> Any:
 
 
 def route(*_: Any, **__: Any) -> Iterator[None]:
-    """Return a route with its first waypoint beside the drone."""
+    """Fake route search. The first waypoint of its route is beside the drone."""
     yield from ()
     return ((0.2, 0.0), (100.0, 50.0))
 

@@ -1,4 +1,4 @@
-"""Superseded commands are not sent, and heartbeats end when the companion does not work."""
+"""Autopilot link: superseded commands are not repeated, and heartbeats stop if the companion fails."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from fractus_services.mobility.mavlink.mavlink_autopilot import MavlinkAutopilot
 
 
 class Superseded(Exception):
-    """Raised by the permit of a superseded command."""
+    """Raised by the permit of a command after a later command was sent."""
 
 
 @pytest.fixture
@@ -45,7 +45,7 @@ async def test_no_heartbeat_is_sent_while_the_companion_does_not_work(monkeypatc
     monkeypatch.setattr(autopilot, "send", sent.append)
     autopilot.send_heartbeat()
     assert [m.name for m in sent] == ["PARAM_REQUEST_READ"], (
-        "the companion sends a probe, to which the autopilot responds"
+        "a companion without target sends a probe instead of a heartbeat"
     )
     autopilot.target = (1, 1)
     autopilot.send_heartbeat()

@@ -17,7 +17,7 @@ def test_each_mode_maps_to_its_flight_state() -> None:
     assert kinds.pop(mavlink.COPTER_MODE_BRAKE) is ModeKind.BRAKING
     for mode in (mavlink.COPTER_MODE_RTL, mavlink.COPTER_MODE_SMART_RTL, mavlink.COPTER_MODE_AUTO_RTL):
         assert kinds.pop(mode) is ModeKind.RETURNING
-    assert set(kinds.values()) == {ModeKind.OTHER}, "in every other mode, a pilot flies"
+    assert set(kinds.values()) == {ModeKind.OTHER}, "all other modes are modes of a pilot"
 
 
 def test_modes_are_requested_by_number() -> None:
@@ -45,7 +45,7 @@ def test_failsafe_statustexts_are_recognised(text: str, is_failsafe: bool) -> No
 
 
 class TwoNumbers(ArduCopter):
-    """Use a firmware with main and sub modes packed into one number, like PX4."""
+    """Flight stack whose custom mode contains a main and a sub mode, like that of PX4."""
 
     land = FlightMode("AUTO.LAND", ModeKind.LANDING)
 

@@ -1,4 +1,7 @@
-"""Gimbal attitude reported by the autopilot. An attitude that may not be measured is unknown."""
+"""Gimbal attitude reported by the autopilot.
+
+If the attitude may be a target instead of a measurement, it is unknown.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +32,7 @@ SERVO = 1.0
 
 
 def quaternion(roll_deg: float, pitch_deg: float, yaw_deg: float) -> tuple[float, ...]:
-    """Return the quaternion of a rotation about z, then y, then x, as a product of three quaternions."""
+    """Return the quaternion of a rotation about z, then y, then x. It is the product of three quaternions."""
 
     def times(a: tuple[float, ...], b: tuple[float, ...]) -> tuple[float, ...]:
         return (
@@ -121,8 +124,8 @@ def test_attitude_of_a_gimbal_that_reports_its_target_is_unknown(kind: float | N
 def test_changed_gimbal_type_takes_effect_after_a_restart() -> None:
     drone = vehicle(SERVO)
     drone.take(message("PARAM_VALUE", param_id=b"MNT1_TYPE", param_value=SIYI), 10.0)
-    assert report(drone) is None, "the servos are still driven"
-    drone.gimbal_measured = None  # as after a loss of the link
+    assert report(drone) is None, "the autopilot still uses the servo gimbal, because it reads the type at startup"
+    drone.gimbal_measured = None  # state after a reconnect
     drone.take(message("PARAM_VALUE", param_id=b"MNT1_TYPE", param_value=SIYI), 11.0)
     assert report(drone) is not None
 
@@ -144,7 +147,10 @@ def test_gimbal_attitude_is_as_old_as_the_heading() -> None:
 
 
 class Commanded:
-    """Fake autopilot that acknowledges, refuses or ignores commands, and reports the limits of its gimbal or not."""
+    """Fake autopilot for gimbal commands.
+
+    Commands raise `error`, if given. Gimbal limits are reported only if `limits` is given.
+    """
 
     def __init__(self, error: AutopilotError | None = None, limits: dict[str, float] | None = None) -> None:
         self.vehicle = vehicle()

@@ -15,7 +15,7 @@ from fractus_services.mobility.authority.journal import Journal, JournalContent
 
 
 def record(**changes: Any) -> JournalContent:
-    """Return a record with one mission, which is active."""
+    """Return journal content with one mission. It is the active mission."""
     return JournalContent({"k": replace(Mission("k", "id", home=(39.0, 22.0, 10.0)), **changes)}, "k")
 
 

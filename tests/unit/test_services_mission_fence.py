@@ -1,4 +1,4 @@
-"""Mission fence of the vehicle: its shape, the fence of the owner, and failures."""
+"""Mission fence on the vehicle: shape, handling of the owner's fence, and failures."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def outline(items: tuple[MissionItem, ...]) -> Any:
 
 
 class Vehicle(ParameterVehicle):
-    """Fake autopilot with parameters and one list of items."""
+    """Fake autopilot with parameters and a list of fence items."""
 
     def __init__(self) -> None:
         values = {"FENCE_ENABLE": 0.0, "FENCE_TYPE": 7.0, "FENCE_ALT_MAX": 100.0, "FENCE_ACTION": 2.0}
@@ -164,7 +164,7 @@ async def test_mission_fence_is_enabled_and_owner_fence_restored(vehicle: Vehicl
     assert vehicle.values["FENCE_TYPE"] == 5.0
     assert vehicle.values["FENCE_ACTION"] == 3.0
     assert vehicle.values["FENCE_ALT_MAX"] == 65.0
-    assert {i.command for i in vehicle.items} == {5001}, "a disabled fence of the owner is not enabled"
+    assert {i.command for i in vehicle.items} == {5001}, "items of the owner's disabled fence are not used"
     restarted = MissionFence(vehicle, tmp_path)
     assert restarted.raised, "a restarted service knows the mission fence"
     await restarted.raise_around(spec(area(-10, -10, 10, 10)), retraces=False)
@@ -180,7 +180,7 @@ async def test_owner_fence_stays_in_force(vehicle: Vehicle, tmp_path: Path) -> N
     fence = MissionFence(vehicle, tmp_path)
     await fence.raise_around(spec(area(-50, -50, 50, 50), **LIMITS), retraces=True)
     assert [n for n in vehicle.written if n == "FENCE_ENABLE"] == ["FENCE_ENABLE"] * 2, (
-        "the fence is disabled, and enabled with the new settings"
+        "the fence is disabled first, and enabled again after all changes"
     )
     assert (vehicle.written[0], vehicle.written[-1]) == ("FENCE_ENABLE", "FENCE_ENABLE")
     assert vehicle.values["FENCE_ENABLE"] == 1.0
@@ -189,7 +189,9 @@ async def test_owner_fence_stays_in_force(vehicle: Vehicle, tmp_path: Path) -> N
     assert vehicle.values["FENCE_ALT_MAX"] == 40.0
     assert vehicle.values["FENCE_TYPE"] == 7.0
     assert vehicle.values["FENCE_ACTION"] == 2.0
-    assert vehicle.values["FENCE_OPTIONS"] == 1.0, "a union of the inclusion areas would weaken both fences"
+    assert vehicle.values["FENCE_OPTIONS"] == 1.0, (
+        "the option for a union of inclusion areas is cleared, because it would weaken both fences"
+    )
 
 
 @pytest.mark.parametrize("action", [0.0, 4.0])
@@ -204,7 +206,9 @@ async def test_owner_fence_without_action_gets_action_for_the_mission(
     assert vehicle.values["FENCE_ACTION"] == action
 
 
-def test_vehicle_without_fence_support_is_not_changed_unlike_a_silent_vehicle(vehicle: Vehicle, tmp_path: Path) -> None:
+def test_vehicle_without_fence_support_is_not_changed_but_silent_vehicle_raises(
+    vehicle: Vehicle, tmp_path: Path
+) -> None:
     async def raised() -> None:
         fence = MissionFence(vehicle, tmp_path)
         with pytest.raises(AutopilotError, match="FENCE_ENABLE cannot be read"):
@@ -285,7 +289,7 @@ async def test_fence_is_not_changed_while_armed(vehicle: Vehicle, tmp_path: Path
     assert fence.raised
 
 
-async def test_fence_stays_enabled_if_vehicle_arms_during_its_request(vehicle: Vehicle, tmp_path: Path) -> None:
+async def test_owner_fence_stays_enabled_if_vehicle_arms_before_it_is_disabled(vehicle: Vehicle, tmp_path: Path) -> None:
     vehicle.values |= OWNED
     send = vehicle.send
     reads = 0
@@ -338,7 +342,7 @@ async def test_owner_fence_that_cannot_be_restored_is_kept_for_later(
     fence = MissionFence(vehicle, tmp_path)
     with pytest.raises(AutopilotError, match="stopped responding"):
         await fence.raise_around(spec(area(-50, -50, 50, 50)), retraces=False)
-    assert fence.raised, "the supervisor restores the fence of the owner later"
+    assert fence.raised, "the fence stays marked as raised, so that the supervisor restores the owner's fence later"
 
 
 async def test_fence_parameter_changed_by_another_station_in_flight_is_reset(vehicle: Vehicle, tmp_path: Path) -> None:
@@ -373,7 +377,7 @@ async def test_replaced_fence_items_of_same_count_are_reported(
     fence = MissionFence(vehicle, tmp_path)
     await fence.raise_around(spec(area(-50, -50, 50, 50)), retraces=False)
     vehicle.items = tuple(replace(item, lat_e7=item.lat_e7 + 5000) for item in vehicle.items)
-    assert await fence.hold() == (), "the items were read a moment ago"
+    assert await fence.hold() == (), "the change is not detected yet, because the items were read recently"
     with pytest.raises(AutopilotError, match="replaced the items of its fence"):
         await MissionFence(vehicle, tmp_path).hold()
     monkeypatch.setattr(module, "ITEMS_AGAIN_S", 0.0)

@@ -1,4 +1,4 @@
-"""Validity of the vehicle's position, and its telemetry."""
+"""Validity of the position of the vehicle, and telemetry of the service."""
 
 from __future__ import annotations
 
@@ -129,7 +129,7 @@ def test_attitude_age_follows_its_timestamp() -> None:
         runner.run(receive_late_attitude())
 
 
-def test_mission_items_are_addressed_to_the_node_only() -> None:
+def test_mission_outcomes_are_reported_to_the_node_only() -> None:
     for_node, for_others = (telemetry(Vehicle(stack=ARDUCOPTER), 0.0, missions=node) for node in (True, False))
     assert dict(for_node.missions) == {"uid": MissionOutcome(kind=MissionOutcome.KIND_REVOKED, reason="why")}
     assert for_node.controller_reason == "a pilot took it"

@@ -1,4 +1,4 @@
-"""Delay of the autopilot's link: the estimate is an upper bound, independent of losses and of both clocks."""
+"""Estimated delay of the autopilot link: it is an upper bound, despite lost messages and differences of the clocks."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Bench:
     Attributes:
         up, down: Delay of a message in seconds, infinite if the message is lost.
         clock: Vehicle time since its start as a function of the time of the test.
-        worst: Largest underestimate of the delay. A positive value is an error.
+        worst: Largest true delay minus its estimate. A positive value is an error.
     """
 
     up: Delay
@@ -53,7 +53,7 @@ class Bench:
             heapq.heappush(self._queue, (self.now + delay_s, self._number, action))
 
     def fly(self, seconds: float) -> None:
-        """Advance the time: receive positions, measure delays, and compare the estimate with the true delay."""
+        """Advance the time. Positions arrive, delays are measured, and the estimate is compared with the true delay."""
         end = self.now + seconds
         for event in (self._state, self._probe, self._judge):
             self.schedule(0.0, event)
@@ -107,7 +107,7 @@ def random_delay(rng: random.Random, least: float, most: float, loss: float = 0.
 
 @pytest.mark.parametrize(("up", "down"), [(0.0, 0.0), (0.15, 0.15), (0.25, 0.25), (0.5, 0.0), (0.0, 0.5)])
 def test_latency_of_each_direction_is_counted_once(up: float, down: float) -> None:
-    """The estimate is only little more than the delay, whichever direction is slower."""
+    """The estimate exceeds the delay only slightly, for any distribution of the delay over the two directions."""
     bench = Bench(steady(up), steady(down))
     bench.fly(30)
     assert bench.worst <= -REACTION_S + 0.01
@@ -124,7 +124,9 @@ def test_latency_is_an_upper_bound_despite_lost_late_and_duplicate_messages(seed
     bench.fly(15)
     bench.worst = -math.inf
     bench.fly(60)
-    assert bench.worst <= 0.0, "REACTION_S covers delays that no request has measured"
+    assert bench.worst <= 0.0, (
+        "the estimate is sufficient, because REACTION_S covers delays that no request has measured"
+    )
 
 
 @pytest.mark.parametrize("rate", [0.999, 1.001, 1.5, 2.0, 3.0, 5.0])
@@ -150,7 +152,9 @@ def test_slow_link_prevents_arming_with_reason() -> None:
     bench.fly(15)
     assert "takes 1.2 s" in bench.timing.problem(bench.now) or "1.3 s" in bench.timing.problem(bench.now)
     assert bench.timing.delay_s > MAX_ARMING_DELAY_S
-    assert math.isfinite(bench.timing.latency_s(bench.now)), "a drone in flight may land over this link"
+    assert math.isfinite(bench.timing.latency_s(bench.now)), (
+        "the latency is known, so that a drone in flight can land over this link"
+    )
     worse = Bench(steady(1.0), steady(0.9))
     worse.fly(15)
     assert math.isinf(worse.timing.latency_s(worse.now))
@@ -171,7 +175,7 @@ def test_slow_link_is_detected_and_cleared_when_fast_again() -> None:
 
 
 def test_slow_link_is_detected_before_first_slow_response() -> None:
-    """Positions still arrive on time. Only overdue responses show that the uplink became slower."""
+    """Positions still arrive on time. Only missing responses show that the uplink has become slower."""
     up_s = 0.05
     bench = Bench(lambda: up_s, steady(0.05))
     bench.fly(15)
@@ -186,7 +190,10 @@ def test_slow_link_is_detected_before_first_slow_response() -> None:
 
 
 def test_many_overdue_responses_do_not_count_as_fast_link() -> None:
-    """Ten requests without a response mean a vehicle that does not respond, or a slow link. Until then they count as overdue."""
+    """Requests without a response count as overdue.
+
+    After ten of them, the vehicle does not respond, or the link is too slow.
+    """
     up_s = 0.05
     bench = Bench(lambda: up_s, steady(0.05))
     bench.fly(15)
@@ -196,7 +203,7 @@ def test_many_overdue_responses_do_not_count_as_fast_link() -> None:
     assert bench.timing.unanswering
     assert bench.timing.latency_s(bench.now) >= MAX_DELAY_S
     bench.fly(2.0)
-    assert math.isinf(bench.timing.latency_s(bench.now)), "the slow responses have arrived"
+    assert math.isinf(bench.timing.latency_s(bench.now)), "the arrived responses show that the link is too slow"
 
 
 def test_one_lost_response_does_not_make_link_too_slow_to_fly() -> None:
@@ -257,7 +264,7 @@ def test_repeated_command_after_gap_is_not_a_latency_sample() -> None:
     bench.fly(2.5)
     assert bench.timing.unanswering
     bench.timing.take_acknowledgement(sent, bench.now)
-    assert bench.timing.delay_s < 0.1, "the response arrives before the first position"
+    assert bench.timing.delay_s < 0.1, "an acknowledgement before the first position after the gap is not a sample"
     bench.up = bench.down = steady(0.02)
     bench.timing.take_position(round(bench.clock(bench.now) * 1e3), bench.now + 0.02)
     bench.timing.take_acknowledgement(sent, bench.now + 0.03)
@@ -345,7 +352,7 @@ def test_timing_of_frozen_vehicle_is_unknown_until_it_recovers() -> None:
 @pytest.mark.parametrize("rate", [1.0, 3.0])
 @pytest.mark.parametrize("stall_s", [0.3, 0.8, 2.0, 3.0])
 def test_burst_after_stalled_connection_does_not_speed_up_clock(stall_s: float, rate: float) -> None:
-    """After a stall, TCP delivers late data in order at one moment, so the vehicle's clock seems to catch up."""
+    """After a stall, TCP delivers all late data at one moment. The clock of the vehicle then seems to run faster."""
     until = -math.inf
     in_order = 1 - 1e-6
     bench = Bench(steady(0.01), lambda: max(0.01, (until - bench.now) * in_order), clock=lambda t: rate * t + 7)
@@ -357,7 +364,7 @@ def test_burst_after_stalled_connection_does_not_speed_up_clock(stall_s: float, 
         paces.append(bench.timing.pace)
     assert min(paces) >= max(rate - 0.001, 1.0)
     assert max(paces) <= (1.0 if rate == 1.0 else rate * 1.1)
-    assert bench.worst <= 0.0, "late data increases the estimate meanwhile"
+    assert bench.worst <= 0.0, "the late data increases the estimate, so it stays an upper bound"
 
 
 def test_delay_of_the_own_event_loop_is_included() -> None:

@@ -104,7 +104,7 @@ class Line:
 async def test_serial_line_transfers_bytes_in_both_directions() -> None:
     line = Line()
     link = await line.open()
-    sent = bytes(range(256))  # includes control characters, which terminals may change
+    sent = bytes(range(256))  # includes control characters, because a terminal in the wrong mode would change them
     os.write(line.far, sent)
     await line.until(lambda: b"".join(line.received) == sent)
     link.write(sent)

@@ -89,7 +89,7 @@ def test_position_becomes_unknown_when_its_quality_is_no_longer_reported(silent:
 HEALTHY = {"onboard_control_sensors_present": 1 << 28, "onboard_control_sensors_health": 1 << 28}
 BOOTED = 167
 POSITIONED = 831
-"""Flags of EKF_STATUS_REPORT of a real ArduCopter, after 22 s and after 41 s."""
+"""EKF_STATUS_REPORT flags of a real ArduCopter, 22 s (BOOTED) and 41 s (POSITIONED) after its start."""
 
 
 def test_readiness_depends_on_requirements_of_the_arming_mode() -> None:
@@ -104,7 +104,7 @@ def test_readiness_depends_on_requirements_of_the_arming_mode() -> None:
     vehicle.take(message("EKF_STATUS_REPORT", flags=BOOTED), 31.0)
     vehicle.take(message("HOME_POSITION", latitude=393600000, longitude=229500000), 31.0)
     assert "position estimate is not accurate" in vehicle.arming_refusal(31.0), (
-        "the checks pass in STABILIZE without a position"
+        "SYS_STATUS reports passed checks, because STABILIZE needs no position"
     )
     for flags in (POSITIONED & ~16, POSITIONED & ~512):
         vehicle.take(message("EKF_STATUS_REPORT", flags=flags), 32.0)

@@ -1,4 +1,7 @@
-"""Heartbeats while the service starts: for a drone in flight, for a limited time, and once for each service that served."""
+"""Heartbeats to a drone in flight while the service starts.
+
+They are sent for a limited time. After a failed start, the next start sends none.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +22,7 @@ URL = "udpout:192.168.1.2:14550"
 
 
 class Air:
-    """Fake link to a vehicle that sends a heartbeat each second after it received a first message."""
+    """Fake link to a vehicle. After a first message, the vehicle sends a heartbeat every second."""
 
     def __init__(self, *, state: int = mavlink.MAV_STATE_ACTIVE, armed: bool = True, sysid: int = 1) -> None:
         self._vehicle = Endpoint(sysid, 1)
@@ -64,7 +67,7 @@ def served(directory: Path) -> Path:
 def start(
     air: Air, directory: Path, monkeypatch: pytest.MonkeyPatch, *, url: str | None = None, takes_s: float = 7.5
 ) -> list[float]:
-    """When heartbeats were sent during a start."""
+    """Start the service. Return the times of its heartbeats, in seconds since the start."""
     monkeypatch.setattr(startup_heartbeat, "open_link", air.open_link)
     with asyncio.Runner(loop_factory=Loop) as runner:
         begun_s = runner.get_loop().time()

@@ -70,7 +70,7 @@ WHOLE_SERVICE = re.compile(
 
 
 def test_unit_tests_start_no_service_or_vehicle() -> None:
-    """Tests with a whole mobility service or a vehicle are component tests. conftest.py detects processes and connections."""
+    """Tests with a complete mobility service or a simulated vehicle belong to tests/component."""
     files = [*(ROOT / "tests").glob("*.py"), *(ROOT / "tests" / "unit").glob("*.py")]
     assert Path(__file__) in files
     assert [path.name for path in files if WHOLE_SERVICE.search(path.read_text())] == []

@@ -1,4 +1,4 @@
-"""Message rates: requested again less and less often while requests have no effect."""
+"""Requests of message rates: if they have no effect, the service repeats them at increasing intervals."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ STEP_S = 0.5
 
 
 class SlowAutopilot:
-    """Fake autopilot that accepts every rate, but sends each message only once a second."""
+    """Fake autopilot. It accepts every requested rate, but sends each message only once a second."""
 
     def __init__(self, *missing: str) -> None:
         self.messages = RATES_HZ.keys() - set(missing)
@@ -30,7 +30,7 @@ class SlowAutopilot:
 async def request_times(
     rates: TelemetryRates, autopilot: SlowAutopilot, until_s: float, *, flying: bool
 ) -> list[float]:
-    """Return the times of all requests until a given time. The service checks twice a second."""
+    """Return the times of all requests until `until_s`. The service checks the rates twice a second."""
     while autopilot.now < until_s:
         await rates.request(autopilot, flying)
         autopilot.now += STEP_S
@@ -56,7 +56,7 @@ async def test_landing_resets_the_check_period() -> None:
     autopilot = SlowAutopilot()
     await request_times(rates, autopilot, 100.0, flying=True)
     times = await request_times(rates, autopilot, 130.0, flying=False)
-    assert times[-1] == 100.0, "one message a second is a sufficient share of four"
+    assert times[-1] == 100.0, "on the ground, 1 Hz is a sufficient share of the requested rate"
     times = await request_times(rates, autopilot, 150.0, flying=True)
     assert [at for at in times if at > 100.0] == [130.0, 130.0 + CHECK_PERIOD_S, 130.0 + 3 * CHECK_PERIOD_S]
 

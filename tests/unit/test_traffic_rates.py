@@ -1,4 +1,4 @@
-"""Traffic rates from byte counters that grow and restart."""
+"""Traffic rates computed from byte counters, which may restart."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def test_rates_cover_the_last_windows() -> None:
     rates.update(1.0, {A: (5 * MBIT, 0)})
     rates.update(1.5, {A: (6 * MBIT, MBIT)})
     rates.update(2.0, {A: (6 * MBIT, MBIT), B: (2 * MBIT, 0)})
-    assert rates.peak_mbps == pytest.approx(4.0), "2 Mbit in half a second, in both directions or of both services"
+    assert rates.peak_mbps == pytest.approx(4.0), "the peak is 2 Mbit in half a second"
     assert rates.by_service == {
         A: ServiceRate(pytest.approx(1.0), pytest.approx(1.0)),
         B: ServiceRate(pytest.approx(2.0), 0.0),

@@ -1,4 +1,4 @@
-"""Steps of the clock: uncertain time, and authentication of callers during it."""
+"""Steps of the clock: the time is then uncertain, and callers are authenticated with the uncertain time."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _KEY = ec.generate_private_key(ec.SECP256R1())
 
 
 class Machine:
-    """A machine with a clock that can be stepped, and a steady time that cannot."""
+    """Fake machine. A test can step its wall clock, but not its steady clock."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.steady_s = 50.0
@@ -46,7 +46,7 @@ class Machine:
             return False
 
     def wait(self, seconds: float) -> None:
-        """Pass time and read the clock often, like the motion monitor."""
+        """Advance the time, and read the clock often, like the motion monitor."""
         for _ in range(10):
             self.steady_s += seconds / 10
             self.clock()
@@ -72,11 +72,13 @@ def certificate(begin_s: float = -300.0, end_s: float = DAY_S, uris: tuple[str, 
 
 
 @pytest.mark.parametrize("step_s", [400 * DAY_S, -400 * DAY_S, 3600.0, -3600.0])
-def test_clock_is_uncertain_after_step_until_it_lasts(machine: Machine, step_s: float) -> None:
+def test_clock_is_uncertain_after_step_until_the_step_has_lasted(machine: Machine, step_s: float) -> None:
     machine.offset_s += step_s
     now = machine.clock()
     assert isinstance(now, UncertainTime)
-    assert (earliest_time(now), now) == tuple(sorted((BEGIN_S, BEGIN_S + step_s))), "both readings count"
+    assert (earliest_time(now), now) == tuple(sorted((BEGIN_S, BEGIN_S + step_s))), (
+        "the uncertain time ranges from the old to the new reading"
+    )
     machine.wait(TRUST_AFTER_S - 1)
     assert isinstance(machine.clock(), UncertainTime)
     machine.wait(2)
@@ -137,7 +139,7 @@ def test_unknown_caller_is_judged_by_later_reading_of_uncertain_clock(machine: M
     assert not machine.accepts(certificate())
     assert not machine.accepts(fresh), "callers are not remembered while the clock is uncertain"
     machine.offset_s -= 400 * DAY_S
-    assert machine.accepts(fresh), "valid again when the clock is right"
+    assert machine.accepts(fresh), "the certificate is valid again after the clock is corrected"
 
 
 @pytest.mark.parametrize("make", [lambda: certificate(-2 * DAY_S, -1.0), lambda: certificate(3600.0)])
@@ -162,7 +164,7 @@ def test_caller_without_valid_identity_is_refused(machine: Machine) -> None:
         machine.caller(certificate(-DAY_S, -1.0))
     with pytest.raises(NotAuthenticated, match="not valid yet"):
         machine.caller(certificate(90.0))
-    assert machine.accepts(certificate(30.0)), "clocks may differ by up to this time"
+    assert machine.accepts(certificate(30.0)), "a certificate is accepted early, because clocks may differ slightly"
 
 
 def test_number_of_remembered_callers_is_limited(machine: Machine) -> None:

@@ -1,4 +1,4 @@
-"""Identification of the drone's own vehicle on a selector."""
+"""VehicleSelector: selection of the drone's own vehicle among the vehicles on its link."""
 
 from __future__ import annotations
 
@@ -63,11 +63,11 @@ async def test_unknown_vehicle_is_selected_and_stored_after_it_was_alone(tmp_pat
     known = known_file(tmp_path)
     selector = VehicleSelector(known)
     assert not selector.select(heartbeat(7), 0.0, flying=False)
-    assert not selector.problem(heartbeat(7), 0.0), "no other vehicle is on the link"
+    assert not selector.problem(heartbeat(7), 0.0), "a vehicle that is alone on the link is no problem"
     assert not selector.select(heartbeat(7), SELECT_AFTER_S - 0.1, flying=False)
     assert selector.select(heartbeat(7), SELECT_AFTER_S, flying=False)
     assert not selector.problem(heartbeat(7), SELECT_AFTER_S + CONFIRM_AFTER_S)
-    assert known.own is None, "another vehicle may still appear"
+    assert known.own is None, "the vehicle is not stored yet, because another vehicle may appear"
     assert not selector.problem(heartbeat(7), SELECT_AFTER_S + CONFIRM_AFTER_S + 0.1)
     await stored(known)
     restarted = VehicleSelector(known_file(tmp_path))

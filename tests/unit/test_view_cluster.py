@@ -1,4 +1,4 @@
-"""Events that the live view derives from the objects of a cluster, and loss of contact to its API server."""
+"""Live view of a cluster: events derived from its objects, and loss of the connection to its API server."""
 
 from __future__ import annotations
 
@@ -146,7 +146,7 @@ async def watched(server: ApiServer, clock: Clock, monkeypatch: pytest.MonkeyPat
 
 
 async def until(cluster: ClusterSource, condition: Any) -> list[dict[str, Any]]:
-    """Return the events up to the first batch with an event that fulfils the condition."""
+    """Return all events up to the first batch that contains an event for which the condition is true."""
     events: list[dict[str, Any]] = []
     async with aclosing(cluster.stream("")) as stream:
         async for message in stream:

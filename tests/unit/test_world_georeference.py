@@ -75,7 +75,7 @@ def check_rendered_places(world: World, places: list[tuple[float, float]], heigh
 
 @pytest.mark.parametrize(("lat", "lon"), [(50.86, 4.68), (80.0, 25.0), (-12.0, 180.0)])
 def test_png_with_world_file_in_degrees_is_rendered_in_place(tmp_path: Path, lat: float, lon: float) -> None:
-    """The places include a high latitude, where a degree of longitude is short, and the antimeridian."""
+    """One place is at a high latitude, where a degree of longitude is short. Another is on the antimeridian."""
     picture, marks = marked()
     cv2.imwrite(str(tmp_path / "map.png"), picture)
     sheet = Sheet(lat, lon, 200.0, 400)
@@ -112,7 +112,7 @@ def test_picture_in_local_metres_requires_an_origin(tmp_path: Path) -> None:
     check_rendered_places(World.on(read_raster(tmp_path / "map.png", "local", (47.0, 11.0))), places, 200.0)
 
 
-def test_ground_outside_the_picture_is_rendered_as_nothing(tmp_path: Path) -> None:
+def test_ground_outside_the_picture_has_the_colour_of_outside(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "map.png"), np.full((100, 100, 3), 200, np.uint8))
     (tmp_path / "map.pgw").write_text(Sheet(50.0, 4.0, 50.0, 100).world_file())
     world = World.on(read_raster(tmp_path / "map.png"))

@@ -31,7 +31,7 @@ def ecef(lat: float, lon: float, height_m: float) -> np.ndarray:
 
 
 def oracle(pose: Pose, mount: Mount, lat: float, lon: float) -> np.ndarray:
-    """Return the pixel of a position on the ellipsoid by vector algebra that shares no code with the code under test."""
+    """Return the pixel of a position on the ellipsoid. The vector algebra shares no code with the code under test."""
     phi = math.radians(pose.lat)
     lam = math.radians(pose.lon)
     east = np.array([-math.sin(lam), math.cos(lam), 0.0])
@@ -70,7 +70,7 @@ PLACES = [(50.8637, 4.6785), (80.0, 25.0), (-79.9, -60.0), (10.0, 179.9999), (65
 @pytest.mark.parametrize(("pose", "mount"), ATTITUDES)
 @pytest.mark.parametrize(("lat", "lon"), PLACES)
 def test_projection_matches_oracle(pose: Pose, mount: Mount, lat: float, lon: float) -> None:
-    """Some cameras are five kilometres from the world's origin, where the two north directions differ."""
+    """Some cameras are 5 km from the world origin. Their north direction differs from that at the origin."""
     for east_m, north_m in ((0.0, 0.0), (5000.0, -3000.0)):
         frame = LocalFrame(lat, lon)
         camera = Pose(*frame.latlon(east_m, north_m), pose.height_m, pose.roll_deg, pose.pitch_deg, pose.yaw_deg)

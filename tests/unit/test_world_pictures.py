@@ -38,7 +38,7 @@ def digest(picture: np.ndarray) -> str:
 
 
 def test_picture_is_identical_for_same_seed_pose_and_time(world: World) -> None:
-    """The order of the pictures and the World instance make no difference."""
+    """The picture depends neither on the order of rendering nor on the World instance."""
     poses = [above(world, 60.0, 50.0, 60.0), above(world, 200.0, 50.0, 90.0)]
     first = [digest(world.render(pose, SMALL, time_s=TIME_S)) for pose in poses]
     same_world = World.procedural(LAT, LON, 7)
@@ -62,7 +62,7 @@ def test_traffic_moves_at_its_speed_and_heading(world: World) -> None:
 
 
 def test_vehicles_of_a_lane_keep_their_distance(world: World) -> None:
-    """No two vehicles of one road and direction overlap at any of the sampled times."""
+    """Vehicles on the same road and in the same direction never overlap."""
     for time_s in (0.0, 1e3, TIME_S):
         pose = above(world, 0.0, 0.0, 900.0)
         lanes: dict[str, list[tuple[float, float]]] = {}
@@ -76,7 +76,10 @@ def test_vehicles_of_a_lane_keep_their_distance(world: World) -> None:
 
 
 def changed_box(world: World, pose: Pose, mount: Mount, name: str) -> tuple[int, int, int, int]:
-    """Return the box of the pixels that an object changes. Thermal pictures show no shadows."""
+    """Return the box of the pixels that an object changes.
+
+    Thermal pictures are compared, because they show no shadows.
+    """
     arguments = {"mount": mount, "time_s": TIME_S}
     with_it = world.render(pose, LENS, band="ir", **arguments)
     without = world.render(pose, LENS, band="ir", hidden=frozenset({name}), **arguments)
@@ -111,7 +114,10 @@ def test_position_of_an_object_is_inside_its_box(world: World) -> None:
 
 
 def test_boxes_and_shares_of_cut_objects_stay_in_range(world: World) -> None:
-    """Boxes stay in the frame, and shares between 0 and 1. A cut object has less than its whole share in the frame."""
+    """Boxes stay inside the picture, and shares between 0 and 1.
+
+    Only an object at the edge of the picture may have a share `in_frame` below 1.
+    """
     for east in range(0, 200, 25):
         truth = world.truth(above(world, float(east), 40.0, 50.0), LENS, mount=Mount(-60.0), time_s=TIME_S)
         for sighting in (*truth.objects, *truth.faces):
@@ -132,7 +138,7 @@ def lying_faces(world: World, pose: Pose) -> list[SeenFace]:
 
 
 def test_lying_face_has_the_colours_of_the_photograph(world: World) -> None:
-    """Seen from straight above, the pixels in the box of the face have skin colour."""
+    """In a picture from straight above, the pixels in the box of the face have skin colour."""
     distant = lying_faces(world, above(world, 0.0, 0.0, 120.0))[0]
     east, north = world.frame.xy(distant.lat, distant.lon)
     pose = above(world, east, north, 14.0, yaw_deg=0.0)
@@ -141,7 +147,7 @@ def test_lying_face_has_the_colours_of_the_photograph(world: World) -> None:
     assert sighting.height_px > 40
     left, top, right, bottom = (round(edge) for edge in sighting.box)
     pixels = world.render(pose, LENS, time_s=TIME_S)[top:bottom, left:right]
-    # Skin is more red than blue.
+    # Skin colour contains more red than blue.
     assert (pixels[..., 2] > pixels[..., 0].astype(int) + 8).mean() > 0.6
 
 

@@ -83,7 +83,7 @@ def test_ed269_reads_permanent_zones(applicability):
 
 
 @pytest.mark.parametrize("offset_h", range(-12, 15))
-def test_ed269_time_zone_offsets_mean_the_same_times(offset_h):
+def test_ed269_times_are_local_times_of_their_time_zone_offset(offset_h):
     zone_text = f"{'-' if offset_h < 0 else '+'}{abs(offset_h):02d}:30"
     offset_s = (abs(offset_h) * 3600 + 1800) * (-1 if offset_h < 0 else 1)
     spec, _ = ed269([{"schedule": [daily(["MON"], f"06:00{zone_text}", f"03:00{zone_text}")]}])

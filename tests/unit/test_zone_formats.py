@@ -1,4 +1,4 @@
-"""Import and export of zones as GeoJSON, KML, QGroundControl plans and ED-269. Nothing is dropped without a note."""
+"""Import and export of zones as GeoJSON, KML, QGroundControl plans and ED-269. A note reports each omitted part."""
 
 import json
 import re
@@ -176,9 +176,9 @@ def test_geojson_imports_every_polygon_of_a_collection():
 
 
 def test_geojson_adds_points_along_parallels():
-    """A side of 140 km leaves its parallel by 470 m in the middle.
+    """A straight side of 140 km deviates from its parallel by 470 m in the middle.
 
-    The imported zone follows the parallel to half a metre.
+    The imported zone follows the parallel with a deviation below half a metre.
     """
     wide = [[4, 50], [6, 50], [6, 50.5], [4, 50.5], [4, 50]]
     (imported,) = formats.read_geojson(json.dumps(feature({"type": "Polygon", "coordinates": [wide]}))).zones

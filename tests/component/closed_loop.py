@@ -478,7 +478,7 @@ class Flight:
         self.changed = False
 
     def _box(self) -> tuple[float, float, float, float]:
-        """Return a random box away from home, with room for routes around it."""
+        """Return a random box away from home. Routes around the box are possible."""
         chance = self.chance
         while True:
             x = chance.uniform(-100, 100)

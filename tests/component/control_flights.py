@@ -40,11 +40,11 @@ class Recording(list[Any]):
 
 
 class Flight:
-    """Flight in a world, which records its trace.
+    """Flight that records its trace.
 
     Attributes:
         trace: Events by source in order of time.
-        texts: Reasons and error texts, which are not compared because their wording may change.
+        texts: Reasons and error texts. They are not compared, because their wording may change.
     """
 
     def __init__(self, directory: Path, **options: Any) -> None:

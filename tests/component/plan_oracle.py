@@ -618,15 +618,17 @@ class Oracle:
             if p.role == "static":
                 placed[p.component, p.location or 0].append(p.node or "")
         if sum(map(len, greedy.values())) == sum(count for _, _, count in numbered):
-            assert {k: placed[k] for k in greedy} == greedy, "not the nearest nodes"
-        assert sum(len(placed[name, i]) for name, i, _ in numbered) == most, "fewer instances than possible"
+            assert {k: placed[k] for k in greedy} == greedy, "instances are not on the nearest nodes"
+        assert sum(len(placed[name, i]) for name, i, _ in numbered) == most, (
+            "the plan has fewer instances than possible"
+        )
         for (name, i), nodes in placed.items():
-            assert set(nodes) <= set(inside[name, i]), "outside its location"
+            assert set(nodes) <= set(inside[name, i]), "an instance is outside its location"
         for name, i, count in numbered:
-            assert 1 <= len(placed[name, i]) <= count, "wrong number of instances"
+            assert 1 <= len(placed[name, i]) <= count, "a location has a wrong number of instances"
         for name in {name for name, _, _ in slots}:
             nodes = [n for (c, _), chosen in placed.items() if c == name for n in chosen]
-            assert len(nodes) == len(set(nodes)), "two instances on one node"
+            assert len(nodes) == len(set(nodes)), "two instances of a component are on one node"
         for chosen in placed.values():
             for node in chosen:
                 rooms[node] -= 1

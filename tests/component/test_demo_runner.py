@@ -73,7 +73,7 @@ def test_mission_progress_is_reported_from_apply_to_landing() -> None:
     assert "all pods Running after 4.0 s" in lines
     assert lines.count("drone-1 is flying") == 1
     assert lines[-1] == "drone-1 is on the ground"
-    assert set(mission.pods) == {"a"}, "deleted pods are kept"
+    assert set(mission.pods) == {"a"}, "the runner keeps deleted pods"
 
 
 def test_mission_progress_ignores_other_applications_and_drones() -> None:

@@ -24,7 +24,7 @@ from fractus_runtime.audit import AuditLog
 NAMES = [str(page.relative_to(ROOT)) for page in PAGES]
 _FRACTUS = re.compile(r"(?:^|[|;&(]\s*|kubectl |[A-Z_]+=\S* )fractus (?!-)([^|;&()<>#]*)")
 OFFLINE = ("fractus plan -f examples", "fractus policy check", "fractus zones import town", "fractus audit ")
-"""Prefixes of the commands that these tests run. These commands need no cluster, and they end."""
+"""Prefixes of the documented commands that the tests run. These commands need no cluster, and end by themselves."""
 
 ZONES = {
     "type": "FeatureCollection",

@@ -25,7 +25,7 @@ def sample(time_s: float, north: float, east: float, alt: float, **changes: Any)
 
 
 def flight(name: str = "d", east: float = 0.0, **changes: Any) -> Flight:
-    """Return a flight up to 20 m, 100 m north, back and down, with one sample per second."""
+    """Return a flight that climbs to 20 m, flies 100 m north and back, and lands. It has one sample per second."""
     legs = [
         *[sample(t, 0, east, 0) for t in range(3)],
         *[sample(3 + t, 0, east, 2.0 * t + 1) for t in range(10)],

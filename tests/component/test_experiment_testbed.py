@@ -108,7 +108,7 @@ def test_testbed_is_closed_if_the_disk_is_full_at_the_end(
 
 @pytest.fixture
 def interruptible() -> Iterator[None]:
-    """Install the default handler of SIGINT, which the background jobs of a shell ignore."""
+    """Install the default handler of SIGINT. A background job of a shell would ignore SIGINT otherwise."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)

@@ -33,7 +33,7 @@ def weather(
 DELAY_COST_M = 0.3
 """Maximum reduction of the distance by a slow link.
 
-The service knows the measured delay. It therefore stops the drone earlier, at almost the same distance.
+The service measures the delay and stops the drone earlier, so the distance is almost the same.
 """
 
 
@@ -67,7 +67,7 @@ def test_velocity_setpoints_keep_the_guaranteed_distance(delay_s: float, conditi
 
 
 def test_unmeasured_delay_reduces_the_distance(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The service limits the measured delay to 0.3 s here. The tests above would detect this."""
+    """In this test, the service never measures a delay above 0.3 s. The tests above would detect this error."""
     first = flight_without_delay(0.0, 0.5)
     measured = Timing.latency_s
     monkeypatch.setattr(Timing, "latency_s", lambda self, now: min(measured(self, now), 0.3))

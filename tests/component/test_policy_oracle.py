@@ -1,4 +1,4 @@
-"""Random fences, states and requests, against an oracle that flies the drone in small steps.
+"""Verdicts on random requests near random fences, compared with an oracle that simulates flights in small steps.
 
 The oracle shares no code with the engine. It projects positions on a sphere, and uses ray casting to distinguish inside
 from outside. It integrates the motion of a drone with bounded acceleration, wind drift, latency and position error.

@@ -37,7 +37,7 @@ def test_vehicle_fence_is_switched_on_again_in_flight_and_before_next_arming(tmp
             async for _ in landing:
                 if sky.truth.mode == mavlink.COPTER_MODE_LAND and sky.truth.fence.enabled:
                     switch_off(mavlink.MAV_CMD_DO_FENCE_ENABLE, OFF)
-            assert not sky.truth.fence.enabled, "the autopilot may switch it off for landing"
+            assert not sky.truth.fence.enabled, "the autopilot may switch off the fence before a landing"
             switch_off(mavlink.MAV_CMD_DO_AUX_FUNCTION, FENCE_SWITCH, OFF)
             await asyncio.sleep(2.0)
             await drone.service.arm(grant, 120.0)

@@ -382,7 +382,7 @@ def test_pending_command_is_dropped_after_control_is_lost(tmp_path: Path, event:
         async with World(tmp_path) as world:
             grant = world.grants.put(spec())
             stream = await world.up(grant)
-            assert world.control.effects.takeover_reason == "", "a driver has control"
+            assert world.control.effects.takeover_reason == "", "there is no takeover while a driver has control"
             world.plane.disconnected = True  # the autopilot gets no command, so the service repeats its commands
             asking = asyncio.ensure_future(refusal(world.service.set_speed(grant, SetSpeedArgs(3.0))))
             await asyncio.sleep(0.3)

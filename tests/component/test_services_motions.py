@@ -436,7 +436,7 @@ def test_altitude_correction_is_not_stopped_by_replaced_motion(tmp_path: Path) -
 
 
 async def start_return(world: World) -> bool:
-    """Start a return flight around a wall, and return True if it flies east."""
+    """Start a return flight around a wall. Return True if the drone passes the wall on the east side."""
     grant = world.grants.put(spec(zone("wall", "ignore", *WALL)))
     await world.up(grant)
     for x, y in ((60, 30), (60, 70), (0, 70)):
@@ -572,7 +572,7 @@ def test_takeoff_continues_after_lost_acknowledgement(tmp_path: Path) -> None:
 
 
 async def cut(world: World, seconds: float, *, frozen: bool = False) -> None:
-    """Cut the link for some seconds. If `frozen`, the vehicle and its clock stand still meanwhile."""
+    """Cut the link for some seconds. If `frozen` is set, the vehicle and its clock stand still during the outage."""
     plane = world.plane
     step = plane._step
     plane.disconnected = True

@@ -131,7 +131,7 @@ def test_command_is_resent_if_acknowledgement_belongs_to_another_station(tmp_pat
 
 
 def messages_to(sky: Sky, system: int) -> list[str]:
-    """Return a list to which the name of each message is added that is sent to a MAVLink system from now on."""
+    """Record the messages that are sent to a MAVLink system from now on. Return the growing list of their names."""
     names: list[str] = []
     connect = sky.create_connection
 

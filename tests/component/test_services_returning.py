@@ -141,7 +141,7 @@ def test_mission_parameters_are_held_during_mission_and_restored_after(tmp_path:
             await world.until(
                 lambda: world.control.failsafe_status is not None and not world.control.failsafe_status.problem
             )
-            assert current_values(world) == FLOWN, "unchanged before the mission"
+            assert current_values(world) == FLOWN, "parameters are unchanged before the mission"
             grant = world.grants.put(spec())
             await world.up(grant, 8.0)
             assert current_values(world) == HELD

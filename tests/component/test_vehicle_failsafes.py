@@ -138,7 +138,9 @@ def test_fence_enable_switches_whole_fence_or_minimum_altitude():
     assert pilot.command(mavlink.MAV_CMD_DO_FENCE_ENABLE, 0) == mavlink.MAV_RESULT_ACCEPTED
     assert not vehicle.fence.enabled
     pilot.parameter("FENCE_TYPE", 4)
-    assert pilot.command(mavlink.MAV_CMD_DO_FENCE_ENABLE, 1) == mavlink.MAV_RESULT_FAILED, "there is no polygon"
+    assert pilot.command(mavlink.MAV_CMD_DO_FENCE_ENABLE, 1) == mavlink.MAV_RESULT_FAILED, (
+        "the vehicle has no fence polygon"
+    )
     upload(pilot, 1, _square(mavlink.MAV_CMD_NAV_FENCE_POLYGON_VERTEX_INCLUSION, 20.0))
     assert pilot.command(mavlink.MAV_CMD_DO_FENCE_ENABLE, 1) == mavlink.MAV_RESULT_ACCEPTED
     assert vehicle.fence.enabled

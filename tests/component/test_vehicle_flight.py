@@ -197,7 +197,7 @@ def test_velocity_target_expires_after_timeout():
     assert vehicle.body.ve == pytest.approx(-1.0, abs=0.3)
     assert vehicle.body.vd == pytest.approx(0.5, abs=0.2)
     pilot.fly_on(2.5)
-    assert vehicle.body.vn == pytest.approx(3.0, abs=0.3), "GUID_TIMEOUT is 3 s"
+    assert vehicle.body.vn == pytest.approx(3.0, abs=0.3), "the target is still valid, because GUID_TIMEOUT is 3 s"
     pilot.fly_on(5.0)
     assert math.hypot(vehicle.body.vn, vehicle.body.ve) < 0.2
 
@@ -337,7 +337,7 @@ def test_mode_requirements_are_checked_only_while_armed():
     assert pilot.mode(mavlink.COPTER_MODE_GUIDED) == mavlink.MAV_RESULT_ACCEPTED
     pilot.wait(lambda: not arming_refusals(vehicle), 5.0)
     pilot.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1.0)
-    assert pilot.mode(mavlink.COPTER_MODE_AUTO) == mavlink.MAV_RESULT_FAILED, "there is no mission"
+    assert pilot.mode(mavlink.COPTER_MODE_AUTO) == mavlink.MAV_RESULT_FAILED, "the vehicle has no mission"
     assert pilot.texts[-1] == "Mode change to AUTO failed: init failed"
     assert pilot.command(mavlink.MAV_CMD_MISSION_START) == mavlink.MAV_RESULT_FAILED
     assert vehicle.mode == mavlink.COPTER_MODE_GUIDED

@@ -221,7 +221,7 @@ def test_current_mission_item_is_a_nav_command():
         assert pilot.command(mavlink.MAV_CMD_DO_SET_MISSION_CURRENT, chosen) == mavlink.MAV_RESULT_ACCEPTED
         assert vehicle.mission.current == current
     assert pilot.command(mavlink.MAV_CMD_DO_SET_MISSION_CURRENT, 4) == mavlink.MAV_RESULT_FAILED, (
-        "no navigation item follows"
+        "no navigation item follows item 4"
     )
     assert pilot.command(mavlink.MAV_CMD_DO_SET_MISSION_CURRENT, 5) == mavlink.MAV_RESULT_DENIED
     pilot.send("MISSION_SET_CURRENT", TARGET | {"seq": 2})

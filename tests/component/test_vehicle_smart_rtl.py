@@ -108,7 +108,9 @@ def test_segment_gap_matches_sampling():
         )
         assert gap_m == pytest.approx(sampled, abs=0.02)
         assert distance_to_segment(joint, a, b) == pytest.approx(gap_m / 2.0, abs=1e-6)  # type: ignore[arg-type]
-    assert segment_gap((0, 0, 0), (4, 0, 0), (1, 1, 0), (3, 1, 0))[0] == pytest.approx(1.0), "parallel"
+    assert segment_gap((0, 0, 0), (4, 0, 0), (1, 1, 0), (3, 1, 0))[0] == pytest.approx(1.0), (
+        "the distance of parallel segments is constant"
+    )
 
 
 def _detour(**parameters: float) -> tuple[VehicleState, Pilot, list[Point]]:

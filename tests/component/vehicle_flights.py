@@ -222,7 +222,10 @@ _RANDOM_ORDERS: tuple[Callable[[Pilot, random.Random], object], ...] = (
 
 
 def at_random(pilot: Pilot, orders: int = 60) -> None:
-    """Random commands and targets from a seed, with occasional takeoffs so that not all are refused."""
+    """Random commands and targets, determined by a seed.
+
+    Occasional takeoffs are added, because the vehicle refuses most commands on the ground.
+    """
     chance = random.Random(pilot.craft.config.seed)
     upload(
         pilot,

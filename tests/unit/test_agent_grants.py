@@ -250,7 +250,7 @@ async def test_failed_disk_write_is_retried_within_seconds(
         synchronizer.apply(grant_list(manifest()))
         await synchronizer.report()
     assert max(waits_s) <= 5
-    assert caplog.text.count("cannot write to disk") == 1, "logged once"
+    assert caplog.text.count("cannot write to disk") == 1, "the failure is logged once"
     waits_s.clear()
     await synchronizer.report()
     assert on_disk(tmp_path) == {"g1.json"}
@@ -324,7 +324,7 @@ def test_outdated_grant_is_removed_to_free_disk_space(
 
 
 class FakeVerifier:
-    """Fake signature check whose result a test sets."""
+    """Fake signature check. A test sets its result."""
 
     def __init__(self) -> None:
         self.error: Exception | None = None
@@ -497,7 +497,7 @@ def test_unchanged_grants_are_not_verified_again(
     (tmp_path / "g1.json").unlink()
     (tmp_path / "g2.json").write_bytes(stored["g2.json"][:20])
     verifying.apply(grant_list(manifest("g1"), manifest("g2")))
-    assert {name: (tmp_path / name).read_bytes() for name in on_disk(tmp_path)} == stored, "restored"
+    assert {name: (tmp_path / name).read_bytes() for name in on_disk(tmp_path)} == stored, "changed files are restored"
 
 
 async def test_new_agent_keeps_reported_final_phase(synchronizer: GrantSynchronizer, store: FakeStore) -> None:

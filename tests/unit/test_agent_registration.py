@@ -249,7 +249,7 @@ async def test_node_object_file_follows_the_owners_edits(path: Path) -> None:
     assert "depot" in file.read_text()
     written = file.stat()
     await registration.step()
-    assert file.stat().st_ino == written.st_ino, "nothing changed"
+    assert file.stat().st_ino == written.st_ino, "the file is not rewritten without a change"
 
 
 @pytest.mark.parametrize(

@@ -214,7 +214,10 @@ def test_show_prints_decisions(log: Path) -> None:
 
 @pytest.fixture
 async def fleet(tmp_path: Path, log: Path, entries: list[dict[str, Any]]) -> list[Path]:
-    """Log directories of two drones that flew at the same time, the second 0.01 degrees farther north."""
+    """Audit logs of two drones in separate directories.
+
+    The drones flew at the same time. The second drone was 0.01 degrees farther north.
+    """
     second_log = tmp_path / "other" / "mobility.jsonl"
     now = 0.0
     writer = AuditLog(second_log, lambda: now)

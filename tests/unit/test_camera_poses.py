@@ -96,7 +96,7 @@ def test_pose_errors_grow_with_measurement_age(drone: Drone) -> None:
     drone.now_s = 100.75
     now = drone.poses.situation(1.0)
     assert now.lat is not None
-    assert now.attitude is None, "measured more than a second ago"
+    assert now.attitude is None, "the pose is unknown, because it was measured more than a second ago"
     drone.now_s = 100.85
     assert drone.poses.situation(1.0).lat is None
 
@@ -121,17 +121,17 @@ def test_pose_is_unknown_when_telemetry_is_missing(drone: Drone) -> None:
     assert drone.poses.situation(1.0).lat is None
     assert [now.lat for now in drone.poses_since(100.0)] == [None]
     drone.send(100.0)
-    assert drone.poses_since(99.9)[0].lat is None, "no telemetry at the beginning"
+    assert drone.poses_since(99.9)[0].lat is None, "the pose at the beginning is unknown without telemetry"
     assert drone.poses_since(100.0)[0].lat is not None
     drone.send(101.1)
-    assert drone.poses_since(100.0)[0].lat is None, "no telemetry for more than a second"
+    assert drone.poses_since(100.0)[0].lat is None, "the pose is unknown after more than a second without telemetry"
     drone.send(101.2, connected=False)
     drone.send(101.3)
     assert [now.lat is None for now in drone.poses_since(101.1)] == [False, True, False]
     for i in range(400):
         drone.send(102.0 + i / 10)
     assert len(drone.poses) <= 302
-    assert drone.poses_since(101.3)[0].lat is None, "older than the history"
+    assert drone.poses_since(101.3)[0].lat is None, "the beginning is older than the history, so the pose is unknown"
 
 
 @settings(max_examples=examples(150), deadline=None, derandomize=True)

@@ -413,7 +413,7 @@ async def test_hanging_camera_is_reported_and_recovers(tmp_path: Path) -> None:
     begun = time.monotonic()
     with pytest.raises(CameraFailed, match="has not responded for"):
         await shutter.expose(request)
-    assert time.monotonic() - begun < 5, "refused at once"
+    assert time.monotonic() - begun < 5, "the call is refused at once"
     stuck.set()
     for _ in range(500):
         try:

@@ -307,7 +307,7 @@ async def test_busy_event_loop_keeps_lease() -> None:
     await asyncio.gather(task, return_exceptions=True)
     assert lease_thread.left_s == 0
     assert shelf.body is not None
-    assert shelf.body["spec"]["holderIdentity"] == "", "given back"
+    assert shelf.body["spec"]["holderIdentity"] == "", "the Lease is released"
     assert shelf.closed
 
 

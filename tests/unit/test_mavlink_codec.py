@@ -238,10 +238,10 @@ def test_only_frames_signed_with_the_key_are_accepted_while_signing_is_enabled()
     frame = signing_endpoint(KEY, 1000).encode("HEARTBEAT", {})
     (received,) = receiver.decode(frame)
     assert received.signed
-    assert receiver.decode(frame) == [], "a replayed frame"
-    assert receiver.decode(Endpoint(255, 190).encode("HEARTBEAT", {})) == [], "a frame without signature"
+    assert receiver.decode(frame) == [], "a replayed frame is refused"
+    assert receiver.decode(Endpoint(255, 190).encode("HEARTBEAT", {})) == [], "a frame without signature is refused"
     assert receiver.decode(signing_endpoint(FOREIGN_KEY, 2000).encode("HEARTBEAT", {})) == [], (
-        "a frame with another key"
+        "a frame that is signed with another key is refused"
     )
     (answer,) = signing_endpoint(KEY, 1000).decode(receiver.encode("HEARTBEAT", {}))
     assert answer.signed

@@ -91,7 +91,9 @@ def test_broken_release_stops_at_second_node() -> None:
     chosen, conditions = step_of(*failed, node("d3"))
     assert not chosen
     assert "other nodes wait" in conditions["d1"].message
-    assert step_of(*failed, node("d3"), ready=2)[0] == ["d3"], "others run it"
+    assert step_of(*failed, node("d3"), ready=2)[0] == ["d3"], (
+        "the failed nodes do not stop the rollout, because other nodes run the release"
+    )
 
 
 def test_unready_services_are_replaced_last() -> None:
@@ -115,7 +117,9 @@ def test_latest_revision_has_highest_number() -> None:
     services.revision_changed(("", "c"), None, Revision("fractus-camera", 9, "else"))
     assert (services.is_current(old), services.is_current(new)) == (False, True)
     services.revision_changed(("", "a"), None, Revision("fractus-mobility", 3, "old"))
-    assert (services.is_current(old), services.is_current(new)) == (True, False), "rolled back"
+    assert (services.is_current(old), services.is_current(new)) == (True, False), (
+        "the old revision is current again after a rollback"
+    )
     services.pod_changed((old.namespace, old.name), old, None)
     assert (len(services), list(services.on("d1"))) == (1, [new])
     assert services.ready("fractus-mobility") == 0
@@ -164,7 +168,7 @@ def test_drone_in_flight_is_stale_after_fifteen_seconds() -> None:
     assert not silence.stale_nodes([drone(at(0))], 100.0)
     assert not silence.stale_nodes([drone(at(0))], 115.0)
     assert silence.stale_nodes([drone(at(0))], 115.1)
-    assert not silence.stale_nodes([drone(at(5))], 116.0), "it reports again"
+    assert not silence.stale_nodes([drone(at(5))], 116.0), "a node that reports again is not stale"
 
 
 @pytest.mark.parametrize("jump", ["2020-01-01T00:00:00Z", "2031-01-01T00:00:00Z"])

@@ -257,15 +257,15 @@ async def test_guest_wakes_when_plan_of_host_changes(shared: ClusterCache) -> No
     stored = shared.children[kinds.DEPLOYMENT_PLAN]
     with shared.subscriptions.subscribe(SHARING) as sharing:
         decide(shared, HOST, node="other")
-        assert await sharing.changed(0), "decided"
+        assert await sharing.changed(0), "the guest wakes after the decision for a plan"
         shared.forget(HOST)
-        assert await sharing.changed(0), "forgotten"
+        assert await sharing.changed(0), "the guest wakes after the decision is dropped"
         stored.record_write(HOST, plan_body("d", 1))
-        assert await sharing.changed(0), "stored"
+        assert await sharing.changed(0), "the guest wakes after the plan is stored"
         stored.record_write(HOST, plan_body("other", 2))
         assert await sharing.changed(0), "the guest is woken because the stored plan has another drone"
         stored._drop(HOST)
-        assert await sharing.changed(0), "removed"
+        assert await sharing.changed(0), "the guest wakes after the plan is deleted"
         decide(shared, ("ns", "stranger"), node="e")
         shared.forget(("ns", "stranger"))
         assert not await sharing.changed(0)

@@ -116,7 +116,9 @@ def test_goto_through_zone_is_denied_when_the_drone_may_stop_before_it(
     refused = ask(grant, goto(*end, speed_mps=cruise), hot)
     assert (refused.action, refused.policies) == ("deny", ("no-fly",))
     away = goto(start[0] - 3 * east, start[1] - 3 * north)
-    assert ask(grant, away, at(*start, airframe=RETRACES)).action == "allow", "at rest"
+    assert ask(grant, away, at(*start, airframe=RETRACES)).action == "allow", (
+        "the drone at rest may fly away from the zone"
+    )
 
 
 def test_goto_outside_area_is_denied_when_the_drone_may_stop_inside() -> None:

@@ -153,9 +153,9 @@ def test_footprint_shows_zones_with_altitude_bands() -> None:
     assert verdict(5, 10) == "PrivacyZone", "the picture may show a building in the zone"
     assert verdict(5, 10, upper=3) == "", "the view passes above a low zone"
     assert verdict(5, 10, lower=8, upper=14) == "PrivacyZone"
-    assert verdict(-30, -5) == "", "behind"
-    assert verdict(40, 60) == "", "beyond"
-    assert verdict(15, 25, lower=25) == "", "above the camera"
+    assert verdict(-30, -5) == "", "the zone is behind the camera"
+    assert verdict(40, 60) == "", "the zone is beyond the view"
+    assert verdict(15, 25, lower=25) == "", "the zone is above the camera"
     assert verdict(-5, 5) == "PrivacyZone", "the drone is in the zone"
 
 
@@ -167,7 +167,7 @@ def test_footprint_of_exposure_covers_the_motion_between_its_ends() -> None:
     assert judge_privacy(now, grant).action == judge_privacy(later, grant).action == "allow"
     assert judge_privacy(replace(later, exposure=(now, later)), grant).code == "PrivacyZone"
     assert judge_privacy(replace(later, exposure=(now, Situation(time_s=NOW))), grant).code == "PrivacyZone", (
-        "the motion is unknown"
+        "the motion between the two poses is unknown"
     )
 
 

@@ -54,7 +54,7 @@ def test_goto_along_corridor_and_home_is_allowed() -> None:
     assert ask(grant, goto(20, 0), at(0, 0)).code == "OutsideOperationArea", (
         "the corridor is not part of the operation area"
     )
-    assert ask(grant, goto(0, 0), at(100, 0)).action == "allow", "home"
+    assert ask(grant, goto(0, 0), at(100, 0)).action == "allow", "the leg leads home"
     assert ask(grant, Call("Takeoff", TakeoffArgs(10)), at(0, 0, 0)).action == "allow"
     partial = compiled(operationArea=[box(50, -20, 150, 20)], corridor=[box(-30, -30, 150, 30)], control="partial")
     assert ask(partial, goto(100, 0), at(0, 0)).action == "allow", "the leg leads into the operation area"

@@ -233,7 +233,7 @@ def test_monitor_stops_leg_crossing_new_zone_at_once() -> None:
         assert (verdict.action, verdict.takeover) == expected
     assert monitor(flying, ahead, current_leg=short, fences_changed=True) is None, "the leg ends before the zone"
     above = compiled(exclusion(box(100, -20, 140, 20), lower=20))
-    assert monitor(flying, above, current_leg=leg, fences_changed=True) is None, "it passes below"
+    assert monitor(flying, above, current_leg=leg, fences_changed=True) is None, "the leg passes below the zone"
     assert monitor(flying, above, current_leg=climbing, fences_changed=True) is not None
     around = compiled(exclusion(box(-20, -20, 20, 20)))
     assert monitor(flying, around, current_leg=leg, fences_changed=True, system_flies=True) is None, "the leg leads out"

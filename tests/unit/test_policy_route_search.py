@@ -70,7 +70,7 @@ def test_route_is_none_when_target_is_enclosed() -> None:
     grant = free(exclusion(area))
     assert find(grant, (0, 0), (0, 40)) is None, "the target is enclosed by the walls"
     assert find(grant, (0, 40), (3, 42)) is not None
-    assert find(grant, (0, 0), (0, 25)) is None, "the wall itself"
+    assert find(grant, (0, 0), (0, 25)) is None, "the target is in the wall"
     assert find(grant, (0, 0), (0, 18.5)) is None, "the target is too close to the zone"
     assert find(grant, (0, 0), (math.nan, 0)) is None
     assert find(grant, (0, 0), (0, -40), home=None) is None
@@ -116,7 +116,7 @@ def test_route_of_the_system_may_use_the_corridor() -> None:
     assert route is not None
     assert len(route) > 1
     legal(grant, (0, 0), route, now)
-    assert find_route((0, 0), (100, 40), now, grant, 10.0) is None, "outside"
+    assert find_route((0, 0), (100, 40), now, grant, 10.0) is None, "the target is outside the corridor"
 
 
 def test_route_requires_legal_straight_return_from_every_waypoint() -> None:

@@ -83,4 +83,4 @@ def test_leg_across_gap_is_allowed_only_when_the_drone_cannot_stop_before_it(
     for grant in grants:
         verdict = judge(goto(0, away + gap + 40.0), now, grant)
         if verdict.permits and not verdict.brake_first:
-            assert speed * speed / (2 * now.airframe.accel_mps2) >= away, "it could stop before it"
+            assert speed * speed / (2 * now.airframe.accel_mps2) >= away, "the drone could stop before the zone"

@@ -186,7 +186,7 @@ def test_fence_ceiling_limits_return_altitude() -> None:
 
     assert returns_at() == 37.0
     assert returns_at(RTL_ALT=2000.0) == 20.0
-    assert returns_at(FENCE_TYPE=6.0) == 50.0, "no ceiling"
+    assert returns_at(FENCE_TYPE=6.0) == 50.0, "a fence without altitude limit does not lower the return altitude"
     assert returns_at(FENCE_ENABLE=0.0) == 50.0
     assert returns_at(FENCE_ENABLE=0.0, FENCE_AUTOENABLE=1.0) == 37.0
 

@@ -289,7 +289,9 @@ async def test_fence_is_not_changed_while_armed(vehicle: Vehicle, tmp_path: Path
     assert fence.raised
 
 
-async def test_owner_fence_stays_enabled_if_vehicle_arms_before_it_is_disabled(vehicle: Vehicle, tmp_path: Path) -> None:
+async def test_owner_fence_stays_enabled_if_vehicle_arms_before_it_is_disabled(
+    vehicle: Vehicle, tmp_path: Path
+) -> None:
     vehicle.values |= OWNED
     send = vehicle.send
     reads = 0

@@ -137,7 +137,7 @@ def test_vehicle_reports_satellites_wind_and_statustexts() -> None:
     vehicle.take(message("GPS_RAW_INT", fix_type=3, satellites_visible=14), 1.0)
     assert vehicle.satellites == 14
     vehicle.take(message("GPS_RAW_INT", fix_type=3, satellites_visible=255), 2.0)
-    assert vehicle.satellites == 0, "255 means unknown"
+    assert vehicle.satellites == 0, "the value 255 means unknown"
     vehicle.take(message("WIND", direction=-90.0, speed=6.0), 3.0)
     assert (vehicle.wind_from_deg, vehicle.wind_mps, vehicle.wind_at) == (270.0, 6.0, 3.0)
     vehicle.take(message("WIND", direction=float("nan"), speed=6.0), 4.0)

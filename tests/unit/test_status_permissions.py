@@ -19,7 +19,7 @@ PLAN = {"spec": {"application": "patrol", "placements": [{"component": "Viewer",
 
 
 class Client:
-    """Fake API server that permits reading namespace team, and fails all other lists with a status."""
+    """Fake API server. It permits lists of namespace team. All other lists fail with the given status."""
 
     def __init__(self, status: int = 403) -> None:
         self.status = status

@@ -744,7 +744,7 @@ def parameters_of(seed: int) -> dict[str, float]:
 
 
 def flight(seed: int, directory: Path, weather: Weather | None = None) -> Account:
-    """Fly the flight of a seed."""
+    """Fly the random flight of a seed, and return its result."""
     weather = weather or weather_of(seed)
     sky = Sky(seed, weather, parameters_of(seed))
 

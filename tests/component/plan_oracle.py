@@ -1,7 +1,7 @@
 """Exhaustive oracle for plans of random fleets, applications and policies.
 
-The oracle applies the rules (thesis chapter 8.5 and its errata, docs/policies.md) without the indexes, searches and geometry of the
-planner:
+The oracle applies the rules (thesis chapter 8.5 and its errata, docs/policies.md) without the indexes, searches and
+geometry of the planner:
 
 - Distances are geodesics, and flights are sampled at short intervals.
 - Zones are circles, and a flood fill of a grid finds the routes around them.
@@ -512,7 +512,10 @@ class Oracle:
         )
 
     def flown_by_system(self, legs: int) -> list[bool]:
-        """Return for each leg whether the system flies it: all legs of a POI mission, legs to control points under partial control, and the last leg."""
+        """Return True for each leg that the system flies.
+
+        These are all legs of a POI mission, legs to control points under partial control, and the last leg.
+        """
         driver = self.spec.driver
         if driver is None:
             return [True] * legs

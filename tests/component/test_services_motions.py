@@ -503,7 +503,7 @@ def changed(monkeypatch: pytest.MonkeyPatch) -> list[bool]:
     return recorded
 
 
-def test_monitor_flags_fences_changed_until_drone_rests(tmp_path: Path, changed: list[bool]) -> None:
+def test_monitor_flags_fences_changed_until_drone_is_at_rest(tmp_path: Path, changed: list[bool]) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             grant = world.grants.put(spec())

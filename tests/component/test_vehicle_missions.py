@@ -373,7 +373,7 @@ def test_home_is_a_rally_point_if_rally_incl_home_is_set(near_home: bool, includ
         highest = max(highest, vehicle.altitude_m)
     assert distance_m(vehicle, north, 0.0) < 1.0
     if north:
-        assert highest == pytest.approx(25.0, abs=0.6), "at the rally point's altitude"
+        assert highest == pytest.approx(25.0, abs=0.6), "the vehicle holds the altitude of the rally point"
 
 
 def test_rally_point_beyond_limit_is_ignored():

@@ -44,7 +44,8 @@ BODY_FRAMES = (8, 9)
 TEXTS_S = 0.6
 # STATUSTEXTs that an autopilot sends without a request.
 SPONTANEOUS = ("EKF3", "GPS 1", "AHRS", "Field", "Barometer", "Calibrating", "RC7", "ArduPilot", "SIM ", "PreArm")
-# Item of a list to upload: command, frame, metres north (or None) and east, or degrees, altitude, first parameters.
+# Item of a list to upload: command, frame, metres north of home (None: no position, inf: invalid latitude), metres east
+# of home, altitude, first parameters.
 Row = tuple[int, int, float | None, float, float, tuple[float, ...]]
 _HOME_ROW: Row = (16, 0, 0.0, 0.0, 0.0, ())
 _TAKEOFF: Row = (22, 3, None, 0.0, 12.0, ())
@@ -463,7 +464,7 @@ class Player:
     def do_stored(self, kind_name: str, bad: str = "") -> str:
         """Return the number of stored items.
 
-        If `bad` is set, upload a valid list and then the invalid list `bad` before.
+        If `bad` is set, first upload a valid list, then the invalid list `bad`.
         """
         if bad:
             self.do_upload(kind_name, "good")

@@ -100,7 +100,7 @@ def test_goto_is_judged_with_pending_setpoints() -> None:
     assert not verdict.permits or verdict.brake_first
 
 
-def test_denied_setpoint_stays_denied_after_the_next_one() -> None:
+def test_denied_setpoint_stays_denied_after_the_next_setpoint() -> None:
     grant = compiled(exclusion(box(-30, 30, 30, 60)))
     call = Call("SetVelocity", VelocityArgs(9.0, 0.0, hold_s=1.0))
     hot = at(0, 4, north_mps=8.9, forward_mps2=-2.0, latency_s=0.5, speed_setpoint_mps=9.0, pending=((9.0, 0.0, 0.0),))

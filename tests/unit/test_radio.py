@@ -155,7 +155,7 @@ def test_uplink_has_rate_delay_and_queue() -> None:
     arrived = 0
     while now < 3.0:
         uplink.offer(b"x" * 1500, now)
-        now += rng.uniform(0.0005, 0.0015)  # 12 Mbit/s offered
+        now += rng.uniform(0.0005, 0.0015)  # the offered traffic is 12 Mbit/s
         arrived += sum(len(packet) for packet in uplink.advance(now))
     assert arrived * 8 / 2.0 == pytest.approx(8e6, rel=0.06)
     assert uplink.dropped > 0

@@ -465,7 +465,7 @@ _LOGGED_FIELDS = frozenset({"method", "action", "code", "reason", "takeover", "c
 
 
 class Flight:
-    """One seeded flight."""
+    """Random flight that is determined by a seed."""
 
     def __init__(self, seed: int, directory: Path, weather: Weather, sky: Sky) -> None:
         self.chance = random.Random(seed)

@@ -141,7 +141,7 @@ class Flight:
         except asyncio.CancelledError:
             self._stream_event(name, "left")
             raise
-        except Exception as error:  # any end is part of the trace
+        except Exception as error:  # the trace contains every end of a stream
             self._stream_event(name, f"refused {_code(error)}", str(error))
         else:
             self._stream_event(name, "ended")
@@ -158,7 +158,7 @@ class Flight:
         except asyncio.CancelledError:
             self._write("calls", f"{name} cancelled")
             raise
-        except Exception as error:  # any end is part of the trace
+        except Exception as error:  # the trace contains every result of a call
             self._write("calls", f"{name} {_code(error)}")
             self.texts.append(f"{name} {error}")
         else:

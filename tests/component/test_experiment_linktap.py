@@ -24,7 +24,7 @@ def server() -> Iterator[socket.socket]:
     "problem",
     [ConnectionRefusedError("refused"), ExperimentError("network namespace drone-1: no such file or directory")],
 )
-def test_link_tap_disconnects_a_client_without_server_and_serves_the_next(
+def test_link_tap_disconnects_client_of_unavailable_server_and_serves_the_next_client(
     tmp_path: Path, server: socket.socket, problem: Exception
 ) -> None:
     problems = [problem]

@@ -46,7 +46,7 @@ def test_startup_heartbeat_imports_no_large_library() -> None:
     assert not imported & {"grpc", "google", "numpy", "shapely", "pydantic", "yaml", "cryptography", "fractus_core"}
 
 
-def test_environment_cannot_turn_off_the_checksums_of_mavlink(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_environment_variable_cannot_disable_mavlink_checksums(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MAV_IGNORE_CRC", "1")
     printed, _ = run_program(
         "from fractus_runtime.mavlink_codec import Endpoint, Parser; "

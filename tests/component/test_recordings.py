@@ -157,7 +157,7 @@ def test_flight_is_recorded_with_seconds_before_and_after(tmp_path: Path) -> Non
     kinds = Counter(message.get_type() for message in tlog(frames))
     assert kinds["HEARTBEAT"] == kinds["GLOBAL_POSITION_INT"] == kinds["ATTITUDE"]
     assert abs(kinds["HEARTBEAT"] - (10 + 30 + 10)) <= 2
-    assert kinds["TIMESYNC"] >= 48, "messages of the companion are recorded too"
+    assert kinds["TIMESYNC"] >= 48, "messages of the companion are also recorded"
     assert tlog(frames)[0]._timestamp == pytest.approx(T0 / 1e9 + 90, abs=1.1)
     by_topic = mcap(messages)
     fixes = by_topic["/drone-1/location foxglove.LocationFix"]

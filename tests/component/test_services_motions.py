@@ -593,7 +593,7 @@ def test_driver_keeps_control_after_short_link_outage(tmp_path: Path, seconds: f
             await world.until(lambda: world.plane.velocity[1] > 3)
             await cut(world, seconds, frozen=frozen)
             stopped = await flying
-            assert isinstance(stopped, Unavailable), "the SDK retries this error"
+            assert isinstance(stopped, Unavailable), "the error is Unavailable, so the SDK retries the call"
             assert world.control.authority is Authority.DRIVER
             if seconds > 1.5:
                 with pytest.raises(Unavailable):

@@ -128,7 +128,7 @@ def test_velocity_setpoint_ends_when_driver_opens_second_stream(tmp_path: Path) 
             await world.service.set_velocity(grant, VelocityArgs(4.0, 0.0, hold_s=2.0))
             await world.drive(grant)
             await asyncio.sleep(0.3)
-            assert world.plane.velocity_setpoint == (0.0, 0.0, 0.0), "the old setpoint is stopped"
+            assert world.plane.velocity_setpoint == (0.0, 0.0, 0.0), "the setpoint of the first stream ends"
             assert world.control.motion is None
             await world.service.set_velocity(grant, VelocityArgs(0.0, 2.0, hold_s=0.5))
             assert world.plane.velocity_setpoint == (2.0, 0.0, 0.0)

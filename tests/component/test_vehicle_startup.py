@@ -96,7 +96,7 @@ def test_all_failed_arming_checks_are_reported_per_mode():
     assert pilot.texts[before:] == ["PreArm: Accels inconsistent", "PreArm: AHRS: waiting for home"]
 
 
-def test_position_is_required_without_checks_and_when_forced():
+def test_position_is_required_for_forced_arming_and_with_disabled_checks():
     _, pilot = _cold()
     pilot.parameter("ARMING_CHECK", 0.0)
     pilot.mode(mavlink.COPTER_MODE_GUIDED)

@@ -162,7 +162,7 @@ class TcpConnection:
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """One step of the script, a row of the file."""
+    """Step of the script, from one row of the file."""
 
     name: str
     action: str

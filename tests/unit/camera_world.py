@@ -78,7 +78,7 @@ class Scene:
         return noise.astype(np.uint8)
 
     def close(self) -> None:
-        """Nothing to close."""
+        """Do nothing."""
 
 
 class Finder:

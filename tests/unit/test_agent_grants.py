@@ -367,7 +367,7 @@ async def test_grant_with_bad_signature_is_not_stored_and_removes_the_previous_o
     assert on_disk(tmp_path) == set()
     await verifying.report_once()
     reported = store.reports[-1]["g1"]
-    assert reported.phase == "Pending", "the operator will sign it again"
+    assert reported.phase == "Pending", "the Grant is pending until the operator signs it again"
     assert "changed after" in reported.message
     verifier.error = None
     verifying.apply(grant_list(manifest()))

@@ -74,7 +74,7 @@ def attitude(now: Situation) -> Any:
     return now.attitude
 
 
-def test_pose_history_returns_poses_since_begin_and_previous_one(drone: Drone) -> None:
+def test_pose_history_returns_poses_since_a_time_and_the_pose_before(drone: Drone) -> None:
     for i in range(10):
         drone.send(100.0 + i / 10, turned=(0.0, 0.0, 10.0 * i))
     poses = drone.poses_since(100.45)

@@ -18,7 +18,7 @@ def corridor(path, width=7):
 
 @given(paths, spots, st.floats(20, 400))
 @settings(max_examples=examples(60), deadline=None)
-def test_coverage_samples_lie_inside_and_measure_area(path, centre, radius):
+def test_coverage_samples_lie_inside_the_shape_and_represent_its_area(path, centre, radius):
     shape = corridor(path)
     samples = Samples(shape)
     xy = samples.xy()
@@ -40,7 +40,7 @@ def test_coverage_samples_exclude_holes_and_include_every_part():
     assert (xy > 300).all(axis=1).any()
 
 
-def test_coverage_samples_of_long_narrow_path_measure_area():
+def test_coverage_samples_of_long_narrow_path_represent_its_area():
     shape = shapely.LineString([(0, 0), (40_000, 40_000)]).buffer(7)
     samples = Samples(shape)
     assert samples.spacing_m <= 3.6

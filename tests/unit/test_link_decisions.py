@@ -144,7 +144,7 @@ def test_traffic_leaves_an_unreachable_cloud_path(heuristic_of: tuple[str, str |
     assert restored.planned == ({} if heuristic_of[0] == "preferDirect" else {VIP: None})
 
 
-def test_slow_link_is_made_and_kept_without_a_cloud_path() -> None:
+def test_slow_link_is_established_and_kept_without_a_cloud_path() -> None:
     slow = replace(TRAFFIC, peers=(replace(NEAR, offers=replace(WIFI, ingress_mbps=0.5)),))
     alone = LinkSituation(NOW_S, STANDING, (slow,), NO_LINK, IN_CONTACT, CLOUD)
     assert actions(alone).peer == ""

@@ -46,7 +46,7 @@ def test_link_event_has_reason_and_number_of_changes() -> None:
 
 
 class Recorder:
-    """What is posted."""
+    """Fake API server that records the posted Events."""
 
     def __init__(self) -> None:
         self.events: list[tuple[str, str]] = []

@@ -50,7 +50,7 @@ def test_report_becomes_grant_status_but_final_phase_stays(
 
 
 @pytest.mark.parametrize("kind", ACCOUNT_KINDS, ids=lambda kind: kind.name)
-def test_account_with_other_rights_is_modified(kind: Kind) -> None:
+def test_account_with_changed_fields_counts_as_modified(kind: Kind) -> None:
     created = account_object(kind, "drone-1")
     assert is_unmodified(kind, created | {"secrets": []})
     for field in created.keys() - {"apiVersion", "kind", "metadata"}:

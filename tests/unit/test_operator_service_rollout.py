@@ -367,7 +367,9 @@ async def test_refused_deletion_does_not_stop_rollout(cache: ClusterCache) -> No
     await ServiceRollout(api, cache, reported(cache, api), lambda: 0.0).step()
     assert [name for method, name in api.requests if method == "DELETE"] == ["m-d1-old", "m-d2-old"]
     assert condition_reason(api, "d1", "ServicesCurrent") == "Refused"
-    assert condition_reason(api, "d3", "ServicesCurrent") == "Queued", "after d2, whose status is refused"
+    assert condition_reason(api, "d3", "ServicesCurrent") == "Queued", (
+        "the status of d3 is written although that of d2 was refused"
+    )
 
 
 @pytest.mark.parametrize("last_seen", [None, "2026-01-01T00:00:00z", "yesterday"])
@@ -381,7 +383,9 @@ async def test_report_times_are_parsed(cache: ClusterCache, last_seen: str | Non
     now_s[0] = 1000.0
     await watch.step()
     assert condition_reason(api, "d1", "Ready") == ("AgentSilent" if last_seen and last_seen.endswith("z") else "")
-    assert condition_reason(api, "d3", "Ready") == "AgentSilent", "after d2, whose status is refused"
+    assert condition_reason(api, "d3", "Ready") == "AgentSilent", (
+        "the status of d3 is written although that of d2 was refused"
+    )
 
 
 # -- missions --

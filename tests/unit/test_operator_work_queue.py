@@ -76,7 +76,7 @@ async def test_change_during_reconcile_is_not_lost() -> None:
     assert reconciled == [1, 2]
 
 
-async def test_failed_key_is_retried_and_delays_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_failed_key_is_retried_and_delays_no_other_key(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(work_queue_module, "_FIRST_RETRY_S", 0.001)
     attempts: dict[Key, int] = {}
     done = asyncio.Event()

@@ -61,7 +61,7 @@ def test_goto_with_wide_turn_causes_no_takeover() -> None:
     assert ask(grant, goto(20, 20), at(0, 0)).brake_first is False
 
 
-def test_goto_is_denied_when_the_stop_breaks_a_fence() -> None:
+def test_goto_is_denied_when_the_stop_violates_a_fence() -> None:
     ahead = compiled(exclusion(box(12, -20, 30, 20)))
     verdict = ask(ahead, goto(60, 60), at(0, 0, east_mps=9))
     assert not verdict.permits

@@ -358,7 +358,7 @@ def verifying(store: FakeStore, verifier: FakeVerifier, tmp_path: Path) -> Grant
     )
 
 
-async def test_grant_with_bad_signature_is_not_stored_and_removes_the_previous_one(
+async def test_grant_with_bad_signature_is_not_stored_and_removes_the_previous_grant(
     verifying: GrantSynchronizer, verifier: FakeVerifier, store: FakeStore, tmp_path: Path
 ) -> None:
     verifying.apply(grant_list(manifest()))

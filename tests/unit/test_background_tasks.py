@@ -29,7 +29,7 @@ def test_background_task_cancelled_before_start_never_runs() -> None:
     assert begun == ["once"]
 
 
-def test_background_attempt_logs_autopilot_error_and_raises_others(
+def test_background_attempt_logs_autopilot_error_and_raises_other_errors(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     async def fail(error: Exception) -> None:

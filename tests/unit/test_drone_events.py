@@ -175,7 +175,7 @@ async def test_recreated_drone_starts_new_events(cluster: Cluster) -> None:
     assert await cluster.observe(None, drone("inactive", at_s=9, uid="u2")) == []
 
 
-async def test_failed_event_is_retried_and_others_are_not_repeated(cluster: Cluster) -> None:
+async def test_failed_event_is_retried_and_posted_events_are_not_repeated(cluster: Cluster) -> None:
     await cluster.observe(drone("inactive", at_s=0))
     cluster.failing = 2
     with pytest.raises(KubeError):

@@ -72,7 +72,7 @@ def test_first_missed_accepts_point_on_second_pass():
     assert first_missed([place(200, 0), place(100, 0)], flight([(0, 0), (300, 0)]), 7, ordered=True) == 1
 
 
-def test_first_missed_compares_altitude_when_both_have_it():
+def test_first_missed_compares_altitude_when_point_and_path_have_an_altitude():
     climbing = flight([(0, 0, 10), (300, 0, 40)])
     assert first_missed([place(150, 0, 25)], climbing, 7, ordered=True) is None
     assert first_missed([place(150, 0, 60)], climbing, 7, ordered=True) == 0

@@ -172,7 +172,7 @@ NESTED = b"[" * 100_000
 
 
 @pytest.mark.parametrize("odd", [NESTED, b'{"a":' * 5000 + b"1" + b"}" * 5000, b"1" * 5000, b"\0" * 50, b"\xff\xfe{"])
-def test_grant_files_read_others_when_one_file_is_malformed(tmp_path: Path, odd: bytes) -> None:
+def test_grant_files_read_other_files_when_one_file_is_malformed(tmp_path: Path, odd: bytes) -> None:
     (tmp_path / "a.json").write_bytes(odd)
     (tmp_path / "b.json").write_text(body(uid="sound"))
     (tmp_path / "loop.json").symlink_to("loop.json")

@@ -243,7 +243,7 @@ def test_verifier_refuses_older_grant(node: Node, restarts: bool) -> None:
 
 
 @pytest.mark.parametrize("restarts", [False, True])
-def test_verifier_refuses_revoked_grant_but_accepts_later_one(node: Node, restarts: bool) -> None:
+def test_verifier_refuses_revoked_grant_but_accepts_later_grant(node: Node, restarts: bool) -> None:
     node.verifier.revoke(IDENTITY, node.take(signed()))
     if restarts:
         node.restart()

@@ -278,7 +278,7 @@ async def test_retrieval_is_judged_again_after_filters_are_applied(world: World)
     assert (caught.value.verdict.code, caught.value.verdict.policies) == ("PrivacyZone", ("p",))
 
 
-async def test_retrieval_is_judged_by_current_position_too(world: World) -> None:
+async def test_retrieval_is_also_judged_by_current_position(world: World) -> None:
     record = await world.capture(active_grant(private("black")))
     world.drone.y = 0.0
     assert (await world.pixels(active_grant(private("black")), record)).max() == 0

@@ -118,7 +118,7 @@ def test_each_application_takes_its_own_path() -> None:
     assert decided.planned == {OTHER_VIP: other}
 
 
-def test_traffic_follows_a_moved_pod_and_leaves_a_removed_one() -> None:
+def test_traffic_follows_a_moved_pod_and_leaves_a_removed_pod() -> None:
     moved = replace(ROUTE, port=30_002)
     assert actions(replace(DIRECT, routes={VIP: moved})).abrupt == {VIP: moved}
     assert actions(replace(DIRECT, routes={})).abrupt == {VIP: None}

@@ -48,7 +48,7 @@ def step_of(*nodes: ServicesOfNode, ready: int = 0) -> tuple[list[str], dict[str
     return [n.node for n in chosen], reasons
 
 
-def test_services_of_one_node_are_replaced_at_a_time() -> None:
+def test_services_are_replaced_on_one_node_at_a_time() -> None:
     chosen, conditions = step_of(node("d1"), node("d2"), node("d3"))
     assert chosen == ["d1"]
     assert [conditions[n].reason for n in ("d1", "d2", "d3")] == ["Replacing", "Queued", "Queued"]
@@ -101,7 +101,7 @@ def test_unready_services_are_replaced_last() -> None:
     assert step_of(node("d1"), ready)[0] == ["d2"]
 
 
-def test_one_of_twenty_nodes_is_replaced_at_a_time_in_large_fleet() -> None:
+def test_services_are_replaced_on_one_in_twenty_nodes_at_a_time_in_large_fleet() -> None:
     assert len(step_of(*(node(f"d{i:03}") for i in range(100)))[0]) == 5
 
 

@@ -152,7 +152,7 @@ async def test_released_capacity_wakes_applications_that_need_the_node() -> None
     assert not cache.subscriptions._full_nodes
 
 
-def test_application_is_validated_again_when_it_or_rules_change() -> None:
+def test_application_is_validated_again_when_application_or_rules_change() -> None:
     def applied(generation: int, uid: str) -> Application:
         points = [{"point": {"depot": "base"}, "path": [at(100, 0, 10)], "navigation": "pathBased"}]
         services = [{"service": "mobility", "methods": ["Goto"]}]
@@ -321,7 +321,7 @@ async def test_deleted_plan_without_pods_releases_capacity() -> None:
         assert await waits.changed(0)
 
 
-async def test_new_application_wakes_no_other() -> None:
+async def test_new_application_wakes_no_other_application() -> None:
     cache = ClusterCache(cast(Store, None))
     with cache.subscriptions.subscribe(("ns", "waits")) as waits:
         metadata = {"namespace": "ns", "name": "new", "uid": "new", "resourceVersion": "1"}

@@ -173,7 +173,7 @@ def test_node_objects_determine_resources_and_readiness(run):
     assert "d1 is cordoned" in result.output
 
 
-def test_bookings_of_one_application_reduce_room_for_the_next(run):
+def test_bookings_of_one_application_reduce_capacity_for_the_next_application(run):
     big = component("Big", "edge", locations=[{"center": at(150, 0), "radius": 10}])
     big["container"]["resources"] = {"requests": {"cpu": "3"}}
     result = run([SCENE[3], node("e1", "edge"), *(named(application(big), n) for n in ("one", "two"))])

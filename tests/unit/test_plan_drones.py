@@ -103,7 +103,7 @@ def test_partial_control_from_depot_uses_its_drones_and_nearby_drones():
     assert reasons(plan(application(navigator(PATH)), inventory(fleet)))["Navigator", "near"] == "OtherDepot"
 
 
-def test_full_control_at_position_uses_drones_of_depot_there():
+def test_full_control_at_position_uses_drones_of_depot_at_that_position():
     start = {"position": at(15, 0)}
     fleet = [drone("kept", home=(400, 0)), drone("stray", home=(60, 0), depot=None)]
     result = plan(application(navigator(PATH, point=start)), inventory(fleet))

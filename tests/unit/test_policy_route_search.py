@@ -137,7 +137,7 @@ def test_route_leads_away_from_zone_when_start_is_too_close() -> None:
     assert inside == ((0, -60),)
 
 
-def test_route_uses_narrow_gap_when_no_wider_one_exists() -> None:
+def test_route_uses_narrow_gap_when_no_wider_gap_exists() -> None:
     gap = 2 * (2.5 + CLEARANCES_M[1]) + 0.6
     grant = free(exclusion(box(-500, 40, 0, 50), name="west"), exclusion(box(gap, 40, 500, 50), name="east"))
     route = find(grant, (-30, 0), (-30, 100))

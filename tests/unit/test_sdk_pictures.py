@@ -34,6 +34,6 @@ async def test_take_returns_picture_if_deletion_fails(caplog: pytest.LogCaptureF
     assert "not deleted from the node" in caplog.text
 
 
-async def test_take_reports_retrieval_error_if_deletion_fails_too() -> None:
+async def test_take_reports_retrieval_error_if_deletion_also_fails() -> None:
     with pytest.raises(Unavailable, match="fetching broke off"):
         await Node(None).take()

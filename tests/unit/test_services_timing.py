@@ -237,7 +237,7 @@ def test_latency_is_measured_by_acknowledgements_without_timesync() -> None:
     assert max(bench.excess) <= REACTION_S + 0.02
 
 
-def test_timesync_replies_to_others_and_duplicates_are_ignored() -> None:
+def test_timesync_replies_to_other_systems_and_duplicates_are_ignored() -> None:
     timing = Timing()
     for i in range(40):
         timing.take_position(5000 + 50 * i, 1.0 + 0.05 * i)

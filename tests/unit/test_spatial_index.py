@@ -156,7 +156,7 @@ def test_upsert_takes_less_than_a_millisecond_among_40000_points():
     assert math.isclose(index.position(name).lat, lat)
 
 
-def test_nearest_orders_equal_distances_by_name_at_its_limit():
+def test_nearest_orders_equal_distances_at_the_limit_by_name():
     centre = Point(lat=50, lon=4)
     points = {"b": destination(centre, 10, 127.9998), "a": destination(centre, 200, 128.0002)}
     assert [n for n, _ in index_of(points).nearest(centre, 1)] == ["a"]

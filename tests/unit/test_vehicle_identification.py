@@ -39,7 +39,7 @@ async def stored(file: KnownVehicleFile) -> None:
         await file._storing
 
 
-def test_vehicle_on_the_ground_is_replaced_before_it_is_confirmed_and_not_afterwards() -> None:
+def test_selected_vehicle_on_the_ground_is_replaced_only_before_confirmation() -> None:
     selector = VehicleSelector()
     assert selector.select(heartbeat(1), 0.0, flying=False)
     assert not selector.problem(heartbeat(1), CONFIRM_AFTER_S - 0.1)
@@ -90,7 +90,7 @@ async def test_vehicle_that_is_armed_while_alone_is_stored_at_once(tmp_path: Pat
     assert known_file(tmp_path).own == (7, 1)
 
 
-def test_no_vehicle_is_selected_among_several_unknown_ones(tmp_path: Path) -> None:
+def test_no_vehicle_is_selected_among_several_unknown_vehicles(tmp_path: Path) -> None:
     selector = VehicleSelector(known_file(tmp_path))
     for at in range(20):
         assert not selector.select(heartbeat(1 + at % 2), float(at), flying=False) or at < SELECT_AFTER_S

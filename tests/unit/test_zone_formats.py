@@ -239,7 +239,7 @@ def test_geojson_rejects_features_a_zone_cannot_represent(whole, sentence):
     assert str(refused.value).startswith(sentence)
 
 
-def test_import_reports_every_rejected_feature_and_can_leave_it_out(tmp_path):
+def test_import_reports_every_rejected_feature_and_can_omit_rejected_features(tmp_path):
     features = [feature(HIGH, id="a"), feature(FLAT, id="b"), feature(FLAT | {"layer": 1}, id="c")]
     source = tmp_path / "town.geojson"
     source.write_text(json.dumps({"type": "FeatureCollection", "features": features}, indent=1))

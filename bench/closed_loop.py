@@ -1,9 +1,9 @@
 """The whole mobility service on the simulated vehicle in virtual time: random flights on bad links, checked by an oracle.
 
-Each seed is one flight (tests/component/closed_loop.py) with zones and limits, another owner's vehicle, wind, a delay of up
-to 0.25 s each way with jitter, up to 10 % lost frames, and an interrupted link. Some zones and limits appear during the
-driver's flight or the flight home. The oracle knows the true position of the vehicle. It reports every breach that the
-documented guarantee excludes.
+Each seed is one flight (tests/component/closed_loop.py) with zones and limits, a vehicle of another owner, and wind.
+The link delays frames by up to 0.25 s each way with jitter, loses up to 10 % of them, and is interrupted. Some zones
+and limits are added while the driver flies or during the return flight. The oracle knows the true position of the
+vehicle. It reports every breach of a zone or limit that the documented guarantee rules out.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def fly(seed: int) -> Account:
 def main() -> int:
     arguments = parser(__doc__, quick="20 flights")
     arguments.add_argument("--flights", type=int, default=500, help="number of flights")
-    arguments.add_argument("--seed", type=int, default=1, help="seed of the first flight; others follow")
+    arguments.add_argument("--seed", type=int, default=1, help="seed of the first flight; each flight adds one")
     arguments.add_argument("--events", action="store_true", help="print the events of each flight with a breach")
     options = arguments.parse_args()
     seeds = range(options.seed, options.seed + (20 if options.quick else options.flights))

@@ -1,9 +1,10 @@
 """Deployment on 100 to 5,000 simulated nodes: the operator against a real API server, scheduler and kwok.
 
-The traffic-monitoring example is applied beside thousands of nodes at other places. Measured are the time until every pod is
-bound, the time until the application is Waiting with all its children, the operator's processor time and memory, and the
-time from its start to the first plan. Then 50 applications are applied at the same time, which must all end bound or queued.
-The comparator creates the same Deployments without Fractus.
+The traffic-monitoring example is applied in a cluster with thousands of nodes at other places. The benchmark measures
+the time until every pod is bound, the time until the application is Waiting with all its children, the operator's
+processor time and memory, and the time from the operator's start to the first plan. Then it applies 50 applications at
+the same time. The pods of each application must be bound, or the application must be Queued. The comparator creates the
+same Deployments without Fractus.
 
 Takes about a quarter of an hour, or four minutes with --quick. Needs no root. simulated_cluster.py describes the nodes.
 """
@@ -74,7 +75,7 @@ class Measurement:
 
 
 class Bench:
-    """Measures growing numbers of nodes on one control plane."""
+    """Measures deployments on one control plane while the number of nodes grows."""
 
     def __init__(self, cluster: SimulatedCluster, operator: Operator) -> None:
         self._api = cluster.admin
@@ -102,10 +103,10 @@ class Bench:
             self._bound_at[metadata["namespace"]].setdefault(metadata["name"], time.monotonic())
 
     def measure(self, nodes: int, times: int) -> Measurement:
-        """Measure with a number of nodes."""
+        """Add nodes up to the given number, and measure deployments."""
         self._grow(nodes)
         result = Measurement(nodes)
-        # Let the operator prepare the nodes, so that it then starts in a cluster that it knows.
+        # The first operator process prepares the nodes, so that the measured process starts in a prepared cluster.
         with self._operator:
             self._operator.start_operator()
             wait_for_prepared_nodes(self._api)
@@ -113,7 +114,7 @@ class Bench:
             result.first_plan_s = self._first_plan()
             self._templates = self._deployments()
             self._idle_percent()
-            # Both methods take turns, so that they run on the same machine load.
+            # Deployments with and without Fractus alternate, so that both run under the same machine load.
             for _ in range(times):
                 before_s = cpu_s(self._operator.pid)
                 self._deploy(result)
@@ -126,7 +127,7 @@ class Bench:
         return result
 
     def _grow(self, nodes: int) -> None:
-        """Add nodes up to a number. One in six is a drone, the first 40 of them at the example's depot."""
+        """Add nodes up to the given number. One in six is a drone. The first 40 drones are at the example's depot."""
         nodes_to_add = []
         depot = self._depot["spec"]["location"]
         for i in range(self._nodes, nodes):
@@ -145,7 +146,7 @@ class Bench:
         wait_for_ready_nodes(self._api)
 
     def _first_plan(self) -> float:
-        """Return the time from the start of the operator to the plan of an application that exists already."""
+        """Apply an application, start the operator, and return the seconds until the plan of the application exists."""
         namespace = self._namespace()
         self._apply(namespace, "first")
         plan = f"{API}/namespaces/{namespace}/deploymentplans/first"
@@ -157,7 +158,7 @@ class Bench:
         return taken_s
 
     def _idle_percent(self) -> float:
-        """Wait until the cluster is at rest, and return the operator's processor time."""
+        """Wait two seconds, and return the operator's share of one core in percent."""
         time.sleep(2.0)
         return cpu_percent(self._operator.pid, 5.0)
 
@@ -183,7 +184,7 @@ class Bench:
         return deployments
 
     def _deploy_without_fractus(self) -> float:
-        """Create the same Deployments at once, and return the time until the last pod is bound."""
+        """Create the Deployments of the example directly, and return the time until the last pod is bound."""
         namespace = self._namespace()
         path = f"/apis/apps/v1/namespaces/{namespace}/deployments"
         bodies = [
@@ -198,7 +199,7 @@ class Bench:
         return taken_s
 
     def _deploy_at_once(self, result: Measurement) -> None:
-        """Apply 50 applications, and check that each is bound or queued and that nothing is lost or created twice."""
+        """Apply 50 applications at the same time, and record how the cluster differs from the expected result."""
         namespace = self._namespace()
         names = {f"app-{i:02d}" for i in range(AT_ONCE)}
         begun_s = time.monotonic()
@@ -238,7 +239,10 @@ class Bench:
         return sum(int(body["spec"]["replicas"]) for body in self._templates)
 
     def _wait_for_bound_pods(self, namespace: str, begun_s: float) -> float:
-        """Return the seconds until every pod of the example is bound, without a request to the busy API server."""
+        """Wait for the pods of the example without requests to the busy API server.
+
+        Return the seconds until all are bound.
+        """
         bound_at = self._bound_at[namespace]
         wait_until(lambda: len(bound_at) >= self._pods_planned(), "bound pods", timeout_s=60, pause_s=0.01)
         return max(bound_at.values()) - begun_s
@@ -283,7 +287,7 @@ class Bench:
 
 
 def print_results(results: list[Measurement]) -> None:
-    """Print the table of all sizes."""
+    """Print the table with a row for each number of nodes."""
     headers = (
         "nodes", "first plan s", "bound p50 s", "p95 s", "Waiting s", "plain p50 s", "CPU s each", "idle %", "RSS MB",
         "peak MB", f"{AT_ONCE} at once s",
@@ -300,7 +304,7 @@ def print_results(results: list[Measurement]) -> None:
 
 
 def run(options: argparse.Namespace, directory: Path) -> list[Measurement]:
-    """Measure each number of nodes."""
+    """Measure deployments for each number of nodes."""
     sizes = options.nodes or ((100, 1_000) if options.quick else (100, 1_000, 5_000))
     results = []
     with simulated_cluster(directory) as cluster:

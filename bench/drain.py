@@ -1,9 +1,9 @@
-"""Calls that a gRPC client without retries loses in a planned switch, by its call rate.
+"""Number of calls that a gRPC client without retries loses in a planned switch of its service, by call rate.
 
-A gRPC client calls while its service is switched between two servers, in network namespaces of this program. The comparator
-closes connections immediately, as after the loss of a link. A call is lost if its request is sent after the connection was
-found idle and before the client notices that it was closed. So the loss grows with the share of time in which the client
-has a call in progress.
+A gRPC client sends calls while its service is switched between two servers, in network namespaces of this program. A
+planned switch closes the connection when it is idle. A call is lost if the client sends its request in the short time
+between this check and the moment when the client notices the close. The loss therefore grows with the call rate. The
+comparator closes connections immediately, as after the loss of a link.
 
 Needs root.
 """
@@ -30,7 +30,10 @@ SAFE_RATE = 20
 async def lost_per_switch(
     world: Rig, redirector: Redirector, rate: int, switches: int, *, planned: bool
 ) -> tuple[float, float]:
-    """Return the number of failed calls per switch, and the achieved calls per second."""
+    """Switch the service repeatedly.
+
+    Return the number of failed calls per switch, and the achieved calls per second.
+    """
     client = world.client(10_000_000, 1 / rate)
     loop = asyncio.get_running_loop()
     begun_s = loop.time()
@@ -47,7 +50,7 @@ async def lost_per_switch(
 
 
 async def measure(report: Report, switches: int) -> None:
-    """Measure each call rate."""
+    """Measure the loss of planned and immediate switches at each call rate."""
     with tempfile.TemporaryDirectory() as folder, rig() as world:
         (Path(folder) / "pod").symlink_to(world.path("dpod"))
         namespaces = PodNamespaces(Path(folder), node_namespace=world.path("drone"))

@@ -1,12 +1,12 @@
 """Share of faces that the camera service finds and hides, by their size, direction and light, and the cost of its filters.
 
-The faces are one in a photograph of an astronaut and, if scikit-image is installed (`uv pip install scikit-image`), the
-hundred of its subset of Labeled Faces in the Wild (25 x 25 pixels, enlarged). They are rotated, lit, made noisy and placed
-on pictures of the ground. The comparator is the usual way of tutorials: one upright pass of OpenCV's default cascade with
-its usual parameters.
+One face is from a photograph of an astronaut. If scikit-image is installed (`uv pip install scikit-image`), a hundred
+more are from its subset of Labeled Faces in the Wild (25 x 25 pixels, enlarged) and are placed on pictures of the
+ground. All faces are rotated, and get different light and noise. The comparator is the method of most tutorials: one
+upright pass of OpenCV's default cascade with its usual parameters.
 
-A face is found if a box of about its size covers its middle. It is hidden if the filter changes at least 95 % of the disc
-that it fills, into pieces of at least a sixth of its width.
+A face is found if a detected box of about the size of the face covers the middle of the face. A face is hidden if the
+filter changes at least 95 % of the disc of the face, in squares of at least a sixth of the width of the face.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ ASTRONAUT = (177, 66, 97)
 """Left, top and width of the face in the photograph."""
 LFW_FACES = 100
 CANVAS = 3.0
-"""Width of a scene, in widths of its face."""
+"""Width of a scene, as a multiple of the width of its face."""
 LIGHTS: dict[str, Callable[[Pixels], Pixels]] = {
     "plain": lambda p: p,
     "dark": lambda p: cv2.convertScaleAbs(p, alpha=0.3),
@@ -59,13 +59,21 @@ class Scene:
         return self.picture.shape[0] / 2
 
 
-def scene_of(photo: Pixels, face: tuple[float, float, float], width_px: float, turn_deg: float, light: str) -> Scene:
-    """Return the surroundings of a face in a photograph (x and y of its middle, width), scaled, rotated and lit."""
+def scene_of(photo: Pixels, face: tuple[float, float, float], width_px: float, angle_deg: float, light: str) -> Scene:
+    """Return the part of a photograph around a face, scaled and rotated, in one of the `LIGHTS`.
+
+    Args:
+        photo: Photograph.
+        face: x, y and width of the face in the photograph. x and y are the middle of the face.
+        width_px: Width of the face in the scene.
+        angle_deg: Rotation, counter-clockwise.
+        light: Key of `LIGHTS`.
+    """
     x, y, width = face
     side = round(width_px * CANVAS)
-    matrix = cv2.getRotationMatrix2D((x, y), turn_deg, width_px / width)
+    matrix = cv2.getRotationMatrix2D((x, y), angle_deg, width_px / width)
     matrix[:, 2] += (side / 2 - x, side / 2 - y)
-    # Without smoothing, small faces would consist of stray pixels.
+    # Without smoothing, a face that is scaled down would consist of single pixels of the photograph.
     blur = max(width / width_px / 2, 0.01)
     smooth = cv2.GaussianBlur(photo, (0, 0), blur) if blur > 0.5 else photo
     picture = cv2.warpAffine(smooth, matrix, (side, side), borderMode=cv2.BORDER_REFLECT)
@@ -75,9 +83,9 @@ def scene_of(photo: Pixels, face: tuple[float, float, float], width_px: float, t
 def astronauts(width_px: float, quick: bool) -> Iterator[Scene]:
     """Return the astronaut's face in many directions and every light."""
     left, top, width = ASTRONAUT
-    for turn in range(0, 360, 45 if quick else 15):
+    for angle in range(0, 360, 45 if quick else 15):
         for light in LIGHTS:
-            yield scene_of(photograph(), (left + width / 2, top + width / 2, width), width_px, turn + 5, light)
+            yield scene_of(photograph(), (left + width / 2, top + width / 2, width), width_px, angle + 5, light)
 
 
 def hundred(width_px: float, quick: bool) -> Iterator[Scene]:
@@ -92,8 +100,8 @@ def hundred(width_px: float, quick: bool) -> Iterator[Scene]:
         face = cv2.resize((faces[index] * 255).astype(np.uint8), (100, 100), interpolation=cv2.INTER_CUBIC)
         photo = grounds[index % 3][:300, :300].copy()
         photo[100:200, 100:200] = face[..., None]
-        turn = float(random.uniform(0, 360))
-        yield scene_of(photo, (150.0, 150.0, 90.0), width_px, turn, lights[index % len(lights)])
+        angle = float(random.uniform(0, 360))
+        yield scene_of(photo, (150.0, 150.0, 90.0), width_px, angle, lights[index % len(lights)])
 
 
 def detect_like_tutorials(picture: Pixels) -> list[Box]:
@@ -112,7 +120,7 @@ def is_found(scene: Scene, boxes: list[Box]) -> bool:
 
 
 def is_hidden(scene: Scene, boxes: list[Box]) -> bool:
-    """Return True if the filter covers the disc of the face with coarse pieces."""
+    """Return True if the filter covers the disc of the face with sufficiently large squares."""
     marks = np.random.default_rng(SEED).integers(0, 256, scene.picture.shape).astype(np.uint8)
     coarse = [box for box in boxes if box[2] / FACE_CELLS >= scene.width / 6]
     changed = (hide_faces(marks, coarse, "pixelate") != marks).any(axis=2)
@@ -122,7 +130,7 @@ def is_hidden(scene: Scene, boxes: list[Box]) -> bool:
 
 
 def measure_shares(report: Report, name: str, series: Callable[[float, bool], Iterator[Scene]], quick: bool) -> None:
-    """Measure the shares of found and hidden faces for each width of a series."""
+    """Measure the shares of found and hidden faces of a series, for each face width."""
     detector = CascadeDetector()
     rows = []
     reliable = []

@@ -42,12 +42,12 @@ def parser(description: str | None, *, quick: str) -> argparse.ArgumentParser:
     """
     made = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
     made.add_argument("--quick", action="store_true", help=quick)
-    made.add_argument("--json", type=Path, help="write the claims to this file")
+    made.add_argument("--json", type=Path, help="write the results to this JSON file")
     return made
 
 
 class Report:
-    """Claims of one benchmark run, printed as they are measured.
+    """Results of one benchmark run, compared with the claims. Each result is printed when it is added.
 
     Args:
         section: Section of `claims.yaml`.
@@ -68,8 +68,8 @@ class Report:
             claim: Key of the claim in the section.
             ours: Measured value.
             theirs: Value of the comparator, if there is one.
-            valid: False if the claim fails whatever the value is.
-            **details: Values for the placeholders of the claim's name, and further values for the JSON file.
+            valid: False if the measurement is invalid. The claim then fails for every value.
+            **details: Values for the placeholders in the name of the claim. The JSON file contains all of them.
         """
         entry = self._claims[claim]
         limit = entry.get("limit")
@@ -95,14 +95,14 @@ class Report:
         return 0 if all(result["holds"] for result in self._results) else 1
 
     def save(self) -> None:
-        """Write the claims so far to the JSON file, if the user named one."""
+        """Write the results so far to the JSON file if the option `--json` is set."""
         if self._file is not None:
             self._file.parent.mkdir(parents=True, exist_ok=True)
             self._file.write_text(json.dumps({"claims": self._results}, indent=1) + "\n")
 
 
 def _check(limit: str, ours: float, theirs: float | None) -> tuple[str, bool]:
-    """Return the quantity that a limit applies to, and whether it is within the limit."""
+    """Return the quantity that a limit applies to, and True if the quantity is within the limit."""
     compared = _COMPARED.fullmatch(limit)
     if compared is not None:
         quantity = compared[1] or "ours"
@@ -111,7 +111,7 @@ def _check(limit: str, ours: float, theirs: float | None) -> tuple[str, bool]:
         return quantity, value is not None and bound is not None and _OPERATORS[compared[2]](value, bound)
     near = _NEAR.fullmatch(limit)
     if near is None:
-        raise ValueError(f"{_CLAIMS}: limit {limit!r} is not understood")
+        raise ValueError(f"{_CLAIMS}: limit {limit!r} has an unknown format")
     if theirs is None:
         return "ours/theirs", False
     return "ours/theirs", abs(ours - theirs) <= max(abs(theirs) * float(near[1]) / 100, float(near[2] or 0))
@@ -158,7 +158,7 @@ def durations_us(
     Args:
         work: Function to time.
         runs: Number of timed calls.
-        warm_up: Number of calls before these.
+        warm_up: Number of untimed calls before the timed calls.
         clock: Clock in nanoseconds, for example of processor time.
     """
     for _ in range(warm_up):
@@ -172,24 +172,27 @@ def durations_us(
 
 
 def median_ms(work: Callable[[], object], runs: int) -> float:
-    """Return the median processor time of a call of this process, in milliseconds."""
+    """Call a function several times, and return the median processor time of a call in milliseconds."""
     return statistics.median(durations_us(work, runs, clock=time.process_time_ns)) / 1e3
 
 
 def quantile(values: Iterable[float], share: float) -> float:
-    """Return the smallest value that at least this share of the values does not exceed."""
+    """Return the quantile of values, for example the 99th percentile for a share of 0.99.
+
+    It is always one of the values.
+    """
     ordered = sorted(values)
     return ordered[max(math.ceil(share * len(ordered)) - 1, 0)]
 
 
 def cpu_s(pid: int | None = None) -> float:
-    """Return the processor time of a process (of this one by default), in seconds."""
+    """Return the processor time of a process, by default of the current process, in seconds."""
     fields = Path(f"/proc/{pid or 'self'}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / _TICKS_PER_S
 
 
 def cpu_percent(pid: int, seconds: float) -> float:
-    """Watch a process for some time, and return its share of one core in percent."""
+    """Wait for some seconds, and return the share of one core that a process used, in percent."""
     before_s = cpu_s(pid)
     begun_s = time.monotonic()
     time.sleep(seconds)
@@ -197,10 +200,10 @@ def cpu_percent(pid: int, seconds: float) -> float:
 
 
 def memory_mb(pid: int | None = None) -> dict[str, float]:
-    """Return the memory of a process (of this one by default), in megabytes.
+    """Return the memory of a process, by default of the current process, in megabytes.
 
-    `resident` includes shared pages, `proportional` divides them among the processes that share them, `private` excludes
-    them, and `peak` is the largest resident size so far.
+    `resident` includes all shared pages. `proportional` includes a share of each shared page, divided by the number of
+    processes that use the page. `private` excludes shared pages. `peak` is the largest resident size so far.
     """
     texts = [Path(f"/proc/{pid or 'self'}/{name}").read_text() for name in ("smaps_rollup", "status")]
     sizes = {
@@ -213,10 +216,10 @@ def memory_mb(pid: int | None = None) -> dict[str, float]:
 
 
 class Processes:
-    """Processes with a log file each, which end with the block.
+    """Processes that are stopped at the end of a `with` block. Each process has a log file.
 
     Args:
-        directory: Working directory, and directory of the logs.
+        directory: Working directory of the processes, and directory of their logs.
     """
 
     def __init__(self, directory: Path) -> None:
@@ -237,7 +240,7 @@ class Processes:
         self._running.clear()
 
     def start(self, name: str, *command: object, **environment: str) -> int:
-        """Start a process with more environment variables, and return its process id."""
+        """Start a process with additional environment variables, and return its process id."""
         with (self._directory / f"{name}.log").open("ab") as log:
             process = subprocess.Popen(
                 [str(word) for word in command], stdin=subprocess.DEVNULL, stdout=log, stderr=log,
@@ -289,5 +292,5 @@ def wait_until(condition: Callable[[], bool], name: str, *, timeout_s: float, pa
     deadline_s = time.monotonic() + timeout_s
     while not condition():
         if time.monotonic() > deadline_s:
-            raise TimeoutError(f"waited {timeout_s:.0f} s in vain for {name}")
+            raise TimeoutError(f"timed out after {timeout_s:.0f} s of waiting for {name}")
         time.sleep(pause_s)

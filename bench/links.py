@@ -1,7 +1,8 @@
-"""Cost of direct links for the agents: private memory, and processor time with a link in use and with no planned link.
+"""Cost of direct links for an agent: private memory, and processor time with a used link and without a planned link.
 
-A drone and an edge node are network namespaces on the simulated radio. The code of the agent that runs direct links runs in
-one process per node, including the Kubernetes client but not gRPC for telemetry. A component sends calls all the time.
+A drone and an edge node are network namespaces on the simulated radio. One process per node runs the part of the agent
+that controls direct links. The process includes the Kubernetes client, but not gRPC for telemetry. During the
+measurement, a component sends calls without a pause.
 
 Needs root.
 """

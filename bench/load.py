@@ -1,14 +1,15 @@
 """Applications created, changed and deleted without a pause: the operator against a real API server, scheduler and kwok.
 
-200 applications run on 1,000 simulated nodes at 100 sites. Each site has a depot, drones, edge nodes, a zone and a policy.
-Three of five applications are the traffic-monitoring example, moved to their site; the others have no driver or no drone.
-After all are created, there is one change per second for ten minutes: an application is created, deleted, or gets another
-path, memory limit or label, or a policy of its site changes. Some sites have fewer drones than applications, so that some
-applications are Queued.
+200 applications run on 1,000 simulated nodes at 100 sites. Each site has a depot, drones, edge nodes, a zone and a
+policy. Three of five applications are the traffic-monitoring example, moved to their site. The remaining applications
+have no driver or no drone. After all applications are created, one change per second is made for ten minutes. A change
+creates or deletes an application, changes its path, memory limit or label, or changes a policy of its site. Some sites
+have fewer drones than applications, so that some applications are Queued.
 
-The audit log of the API server counts the requests of the operator, and the kernel its memory (proportional set size).
-After the last change, every application must be planned or Queued, every Grant must contain the current policy, nothing of
-deleted applications may exist, and there must be half a minute without a warning, a refused request or a write.
+The requests of the operator are counted in the audit log of the API server. The operator's memory is its proportional
+set size. After the last change, every application must be planned or Queued, every Grant must contain the current
+policy, and no object of a deleted application may exist. Then the operator must be idle for half a minute: without a
+warning and without a request that writes or is refused.
 
 Takes about 14 minutes, or three with --quick. Needs no root. simulated_cluster.py describes the nodes.
 """
@@ -61,14 +62,14 @@ ANSWER_TIMEOUT_S = 60.0
 CONVERGE_TIMEOUT_S = 300.0
 QUIET_S = 30.0
 SETTLE_S = 5.0
-"""Time for writes that follow a change later, such as Events."""
+"""Time to wait after a change for delayed writes, such as Events."""
 
 SAMPLE_S = 2.0
 SINGLE_CHANGES = 5
-"""Number of changes of each kind that are made while nothing else happens, to count their requests."""
+"""Number of changes of each kind that are made before the load, to count the requests for one change."""
 
 EXAMPLES = ("application.yaml", "passenger-only.yaml", None)
-"""Examples that applications are made of. None is application.yaml without its components on drones."""
+"""Manifests of the example from which applications are created. None: application.yaml without its drone components."""
 
 _MIX = (0, 0, 1, 0, 2)
 _PLANS = Kind("fractus.dev/v1alpha1", DeploymentPlan.KIND, DeploymentPlan.PLURAL, namespaced=True)
@@ -97,7 +98,7 @@ def moved(body: Any, lat: float, lon: float) -> Any:
 
 @dataclass(frozen=True)
 class Site:
-    """A place with a depot, drones and edge nodes, far from all others."""
+    """A place with a depot, drones and edge nodes, far from all other sites."""
 
     number: int
 
@@ -106,7 +107,7 @@ class Site:
         return f"depot-{self.number}"
 
     def move(self, body: Any) -> Any:
-        """Move a manifest of the example to the site."""
+        """Return a manifest of the example with its positions moved to the site."""
         row, column = divmod(self.number, SITES_PER_ROW)
         return moved(body, row * SITE_DISTANCE_DEG, column * SITE_DISTANCE_DEG)
 
@@ -125,7 +126,7 @@ class Site:
         return manifest("Policy", f"altitude-{self.number}", {**limit, "selector": selector})
 
     def nodes(self) -> Iterator[tuple[str, str, Body]]:
-        """Return class, name and spec of the nodes: one or two drones, the example's edge nodes, and others near them."""
+        """Yield class, name and spec of each node: drones, the edge nodes of the example, and more nodes near these."""
         rng = random.Random(SEED + self.number)
         drone = documents("drone.yaml")[0]["spec"]
         edges = documents("edge-nodes.yaml")
@@ -142,7 +143,7 @@ class Site:
 
 
 class Slot:
-    """A name under which an application is created, changed and deleted.
+    """A fixed application name. The application with this name is created, changed, deleted and created again.
 
     Attributes:
         body: Applied manifest. None if the application does not exist.
@@ -172,7 +173,7 @@ class Slot:
         return []
 
     def manifest(self) -> Body:
-        """Return the application as it is first applied."""
+        """Return the initial manifest of the application."""
         namespace, name = self.key
         (body,) = documents(self._example or "application.yaml")
         body = self.site.move(body) | {"metadata": {"name": name, "namespace": namespace}}
@@ -188,7 +189,7 @@ class Slot:
 
 
 class Scene:
-    """Sites with their nodes, and the namespaces of applications."""
+    """Creates the sites, their nodes, and the namespaces of applications."""
 
     def __init__(self, api: BlockingClient, nodes: int, applications: int) -> None:
         self.sites = [Site(i) for i in range(nodes // NODES_PER_SITE)]
@@ -247,7 +248,7 @@ class Observed:
 
 
 def read_requests(log: Path, since: datetime) -> list[Body]:
-    """Return the operator's requests after a time from the audit log, each once."""
+    """Return the operator's requests since a time from the audit log, without duplicates."""
     events: dict[str, Body] = {}
     with log.open() as lines:
         for line in lines:
@@ -268,17 +269,17 @@ def request_name(event: Body) -> str:
 
 
 def without_upkeep(events: list[Body]) -> collections.Counter[str]:
-    """Count requests by name, without watches and the Lease, which an idle operator also sends."""
+    """Count requests by name. Watches and Lease requests are omitted, because an idle operator also sends them."""
     names = (request_name(event) for event in events if event["verb"] != "watch")
     return collections.Counter(name for name in names if not name.endswith(" leases"))
 
 
 class Load:
-    """Changes applications, and measures the time until the operator answers.
+    """Changes applications, and measures the time until the operator has processed each change.
 
     Attributes:
         answers_s: Seconds from each change to its plan, by kind of change. NaN if the kind needs no new plan.
-        faults: Changes that failed or were not answered in time.
+        faults: Changes that failed or were not processed in time.
     """
 
     def __init__(self, api: BlockingClient, observed: Observed, scene: Scene) -> None:
@@ -297,7 +298,7 @@ class Load:
             list(pool.map(lambda slot: self._attempt(slot, self.create), self._scene.slots))
 
     def run(self, duration_s: float, period_s: float) -> None:
-        """Start one change per period, also while others are not answered yet."""
+        """Start one change per period, even if earlier changes are still in progress."""
         begun_s = time.monotonic()
         with ThreadPoolExecutor(2 * WORKERS) as pool:
             for i in range(math.ceil(duration_s / period_s)):
@@ -437,7 +438,7 @@ class Results:
 
     @property
     def memory_growth(self) -> float:
-        """Mean memory in the last third of the run over that in the first."""
+        """Mean memory in the last third of the run, divided by the mean memory in the first third."""
         third = max(len(self.memory_mb) // 3, 1)
         return statistics.fmean(self.memory_mb[-third:]) / statistics.fmean(self.memory_mb[:third])
 
@@ -464,7 +465,7 @@ class Bench:
             self._converge()
             taken_s = time.monotonic() - begun_s
             print(f"{results.applications} applications created and running after {taken_s:.0f} s", flush=True)
-            # The preparation of a node is no part of the cost of a change.
+            # The operator may still be preparing nodes. Its requests for this must not count as cost of changes.
             wait_for_prepared_nodes(self._api)
             self._count_single_changes()
             self.load.answers_s.clear()
@@ -488,7 +489,7 @@ class Bench:
             results.lasting += self.load.differences()
 
     def _run(self, duration_s: float, period_s: float) -> None:
-        """Make changes, and sample the memory of the operator meanwhile."""
+        """Make changes, and sample the memory of the operator in another thread."""
         ended = threading.Event()
 
         def sample() -> None:
@@ -504,18 +505,21 @@ class Bench:
             sampling.join()
 
     def _converge(self) -> float:
-        """Wait until there are no differences, or until the timeout, and return the seconds."""
+        """Wait until the cluster matches the applied objects, or until the timeout.
+
+        Return the waiting time in seconds.
+        """
         begun_s = time.monotonic()
         try:
             wait_until(lambda: not self.load.differences(), "rest", timeout_s=CONVERGE_TIMEOUT_S, pause_s=1.0)
         except TimeoutError as error:
-            # A difference that persists until the end becomes a finding there.
+            # `measure` reports the differences that still exist at its end.
             print(f"{error}: {', '.join(self.load.differences()[:5])}", flush=True)
         return time.monotonic() - begun_s
 
     def _count_single_changes(self) -> None:
-        """Count the requests of each kind of change while nothing else happens."""
-        # These slots have the whole example and a drone each, so no other application takes a drone that becomes free.
+        """Count the requests for each kind of change. No other changes are made at the same time."""
+        # Each of these applications is the whole example. No other application of its site waits for its drone.
         load = self.load
         slots = self._scene.slots[:: 2 * len(_MIX)][:SINGLE_CHANGES]
         for change in (load.path, load.limit, load.label, load.policy, load.delete, load.create):
@@ -565,7 +569,7 @@ def listed(counts: collections.Counter[str], divisor: int) -> str:
 
 
 def print_results(results: Results, load: Load) -> None:
-    """Print details that are no claims."""
+    """Print results for which there is no claim."""
     for change, values in sorted(load.answers_s.items()):
         answered = [value for value in values if not math.isnan(value)]
         times = f", p50 {statistics.median(answered):.2f} s, p99 {quantile(answered, 0.99):.2f} s" if answered else ""

@@ -1,11 +1,11 @@
 """The policy engine against an independent oracle that flies every permitted random request.
 
-Policies, vehicles, states and requests are random. The oracle (tests/component/policy_flights.py) integrates jerk-limited
-motion in steps of 50 ms, with wind, latency and position errors inside the bounds given to the engine. It reports drones
-in forbidden places, and corrected targets that the engine would not allow unchanged or that lie inside a margin. Vehicles
-differ in acceleration and return altitude, and other ground stations change these in flight. Afterwards the system flies
-some drones home like the mobility service, and the autopilots of others return without the system
-(tests/component/return_flights.py). The motion monitor watches one flight in twelve and must not stop it.
+Policies, vehicles, states and requests are random. The oracle (tests/component/policy_flights.py) integrates
+jerk-limited motion in steps of 50 ms, with wind, latency and position errors inside the bounds given to the engine. It
+reports drones in forbidden places. It also reports a corrected target if the engine would not allow it unchanged, or if
+it lies inside a margin. Vehicles differ in acceleration and return altitude, and ground stations change both parameters
+in flight. After the requests, some drones return under the system like in the mobility service, and some under their
+autopilot (tests/component/return_flights.py). The motion monitor checks some of the flights and must not stop them.
 
 A case is one request of one drone under one set of policies. Each drone makes three requests, two of them in flight. In
 addition, vehicles with missing, absent and unusual parameters are armed (tests/component/parameter_faults.py).
@@ -34,8 +34,8 @@ VEHICLES = 100
 
 def main() -> int:
     arguments = parser(__doc__, quick="3,000 cases")
-    arguments.add_argument("--cases", type=int, default=1_000_000, help="number of requests to judge and fly")
-    arguments.add_argument("--seed", type=int, default=1, help="seed of the first batch of drones; others follow")
+    arguments.add_argument("--cases", type=int, default=1_000_000, help="number of requests to evaluate and fly")
+    arguments.add_argument("--seed", type=int, default=1, help="seed of the first batch of drones; each batch adds one")
     options = arguments.parse_args()
     cases = 3000 if options.quick else options.cases
     progress = Progress(cases)

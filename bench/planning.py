@@ -1,11 +1,12 @@
 """Planning at 100 to 100,000 edge nodes, against the linear method of the thesis (Fig. 8.14).
 
-The application is the traffic monitoring of thesis 8.2, with a path of 20 waypoints. There is one drone for five edge nodes.
-In one series a fixed number of nodes are candidates, in the other 15 %. Both planners get the same inventory and must make
-the same plan. Algorithm 8 of the thesis searches around every candidate of a static component. The linear method here
-searches around the selected nodes only, which makes it faster, so that it finishes.
+The application is the traffic monitoring of thesis 8.2, with a path of 20 waypoints. There is one drone for five edge
+nodes. In the first series, the number of candidate nodes is fixed. In the second series, 15 % of the nodes are
+candidates. Both planners get the same inventory and must make the same plan. Algorithm 8 of the thesis searches around
+every candidate of a static component. The linear method of this benchmark searches around the selected nodes only.
+Otherwise it would be too slow for the large sizes.
 
-Durations are processor time of the whole process, so that other programs do not count.
+Durations are processor time of the whole process, so that other programs do not affect them.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ BLOCK_M = (600.0, 540.0)
 """Width and height of the block of streets."""
 
 CLEAR_M = 3_000.0
-"""Distance from the depot within which only candidates are."""
+"""Distance from the depot. All nodes within this distance are candidates."""
 
 FIXED = 40
 SHARE = 0.15
@@ -50,7 +51,7 @@ PHASES = {
     "hybrid search": ("hybrid-edge", "hybrid-drone.candidates"),
     "selection": ("drone.host", "static.host", "hybrid-drone.host", "cloud.host", "report"),
 }
-"""Phases of the thesis, with the steps of a planner that they contain."""
+"""Phases of the thesis, each with the planner steps that it contains."""
 
 WIFI = {"technology": "WiFi", "device": "wlan0", "range": 80, "pairing": {"networkId": "fractus"}}
 CAMERA = {"methods": ["CaptureImage", "RetrieveImage"]}
@@ -101,7 +102,10 @@ def traffic_monitoring() -> Application:
 
 
 def inventory(nodes: int, candidates: int) -> Inventory:
-    """Return edge nodes of which some are among the streets and the others elsewhere, and one drone for five of them."""
+    """Return an inventory with edge nodes and one drone for five edge nodes.
+
+    Only the candidates are among the streets.
+    """
     rng = random.Random(SEED)
     services = {"camera": CAMERA}
     edge_spec = {"location": position(0, 0), "interfaces": [WIFI], "services": services}
@@ -138,7 +142,7 @@ def inventory(nodes: int, candidates: int) -> Inventory:
 
 
 def _outside(rng: random.Random, nodes: int) -> tuple[float, float]:
-    """Return a point in a land that grows with the number of nodes, but not near the streets."""
+    """Return a random point outside of the streets. The area of the points grows with the number of nodes."""
     bearing = rng.uniform(0, 2 * math.pi)
     reach = 50.0 * math.sqrt(nodes)
     distance = math.sqrt(rng.uniform(CLEAR_M**2, (CLEAR_M + reach) ** 2))
@@ -289,7 +293,7 @@ class Measurement:
 
     Attributes:
         nodes: Number of edge nodes.
-        candidates: Number of them among the streets.
+        candidates: Number of edge nodes among the streets.
         ours_s: Median duration of the planner, in seconds.
         theirs_s: Duration of the linear method, in seconds.
         phases_ms: Duration of each phase, of the planner and of the linear method, in milliseconds.
@@ -305,13 +309,13 @@ class Measurement:
 
 
 def decision_of(plan: DeploymentPlanSpec) -> Decision:
-    """Return the parts of a plan that both planners must agree on."""
+    """Return the drone and placements of a plan, which must be equal for both planners."""
     placed = tuple((p.component, p.node, p.role, p.coverage) for p in plan.placements)
     return plan.drone.node if plan.drone is not None else None, placed
 
 
 def timed(steps: Generator[str, None, object]) -> tuple[object, dict[str, float]]:
-    """Run a planner to its end, and return its result and the seconds of each step."""
+    """Run a planner to its end. Return its result and the duration of each step in seconds."""
     durations_s: dict[str, float] = {}
     while True:
         started = time.process_time()
@@ -323,7 +327,7 @@ def timed(steps: Generator[str, None, object]) -> tuple[object, dict[str, float]
 
 
 def repeated(make: Callable[[], Generator[str, None, object]], times: int) -> tuple[object, float, list[float]]:
-    """Return the result, the median duration in seconds, and the median of each phase in milliseconds."""
+    """Run a planner several times. Return its result, the median duration (s), and the median of each phase (ms)."""
     runs = [timed(make()) for _ in range(times)]
     phases_ms = [
         1e3 * statistics.median(sum(durations.get(step, 0.0) for step in steps) for _, durations in runs)
@@ -345,7 +349,7 @@ def measure(nodes: int, candidates: int, times: int, application: Application) -
 
 
 def index_update_ms(nodes: int, moves: int = 1000) -> tuple[float, float]:
-    """Return the duration of the update for one moved node (99th percentile), and of building the index."""
+    """Return the duration of an index update for one moved node (99th percentile), and of building the index."""
     stock = inventory(nodes, FIXED)
     started = time.process_time()
     index = NodeLocations.of(edge_nodes=stock.edge_nodes, drones=stock.drones, depots=stock.depots, cloud=())

@@ -4,9 +4,9 @@ The comparator does what the thesis describes: for each call it requests the pos
 tests the position against the area of each policy in turn. The autopilot is a simulated ArduCopter in another process,
 connected over loopback TCP with pymavlink.
 
-A check never waits, so its duration is processor time or wall-clock time, whichever is smaller: neither clock measures too
-little, and the smaller duration is less disturbed by other programs. The comparator waits for the autopilot, so its
-durations are wall-clock time. The table also shows its area tests alone, with a known position.
+A check never waits. It is therefore timed with both a processor clock and a wall clock, and the smaller duration
+counts. Other programs can only lengthen a duration. The comparator waits for the autopilot, so its durations are
+wall-clock time. The table also shows the area tests of the comparator alone, with a known position.
 """
 
 from __future__ import annotations
@@ -148,7 +148,7 @@ class Thesis:
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """A call under some policies, by the key of its claim."""
+    """A call to check under some policies. `claim` is the key of its claim."""
 
     claim: str
     policies: list[dict[str, Any]]
@@ -170,7 +170,7 @@ def cases() -> list[Case]:
 
 
 def check_durations_us(work: Callable[[], object], runs: int) -> tuple[float, float]:
-    """Return median and 99th percentile of a check, on the clock that measures less."""
+    """Return median and 99th percentile of the duration of a check, each from the clock with the smaller value."""
     warm_up = max(runs // 10, 5)
     clocks = (time.thread_time_ns, time.perf_counter_ns)
     taken = [durations_us(work, runs, warm_up=warm_up, clock=clock) for clock in clocks]
@@ -178,7 +178,7 @@ def check_durations_us(work: Callable[[], object], runs: int) -> tuple[float, fl
 
 
 def measure(report: Report, runs: int, autopilot: Autopilot) -> None:
-    """Time each case with both methods."""
+    """Measure each case with Fractus and with the method of the thesis."""
     request_us = statistics.median(durations_us(autopilot.position, max(runs // 20, 50)))
     rows = [("one position over MAVLink", request_us, 0.0)]
     for case in cases():
@@ -204,7 +204,7 @@ def measure(report: Report, runs: int, autopilot: Autopilot) -> None:
 
 
 def measure_route(report: Report, runs: int) -> None:
-    """Time the search of a route through a thousand zones."""
+    """Measure the search for a route between a thousand zones."""
     compiled = compile_grant(grant(fences(1000, random.Random(8))))
     situation = Situation(
         time_s=0, lat=HOME.lat, lon=HOME.lon, altitude_m=10, home=HOME, airframe=Airframe(retraces=True)

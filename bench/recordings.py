@@ -1,6 +1,7 @@
-"""Cost of recording for the mobility service: the work of its thread for a flight, by the rates of a real flight.
+"""Cost of recording in the mobility service: processor time and memory of the recorder thread during a flight.
 
-Only the thread's work is measured. `service.py` measures the service without a recording.
+The messages have the rates of a real flight. Only the work of the recorder thread is measured. `service.py` measures
+the service without a recording.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from fractus_services.recording.segment_directory import SegmentDirectory
 from harness import Report, memory_mb, parser
 
 BEFORE_MB = memory_mb()["resident"]
-"""Memory of this process before it imports the recorder, which only a recording service needs."""
+"""Memory of this process before it imports the recorder. A service without recordings does not import it."""
 
 from fractus_services.recording.mavlink_messages import MavlinkDecoder  # noqa: E402
 from fractus_services.recording.recorder import FlightWriter  # noqa: E402
@@ -27,7 +28,7 @@ RECEIVED_HZ = {
 }  # fmt: skip
 SENT_HZ = {"HEARTBEAT": 1, "TIMESYNC": 10, "SET_POSITION_TARGET_LOCAL_NED": 10}
 STATES_HZ = 2
-"""Rate of the flight recorder's entries."""
+"""Rate of the entries with the state of the drone."""
 
 FIELDS = {
     "HEARTBEAT": {"autopilot": 3, "base_mode": 128},
@@ -39,7 +40,7 @@ STATE = {
 
 
 def record(writer: FlightWriter, seconds: int) -> None:
-    """Record a flight of some seconds."""
+    """Record the messages and entries of a flight of some seconds."""
     vehicle = Endpoint(1, 1)
     companion = Endpoint(244, 191)
     for second in range(seconds):

@@ -1,8 +1,9 @@
-"""Duration of a switch of N services to other targets, on both sides, against the method of the thesis (ch. 8.9.1).
+"""Duration of switching N services to other targets on two nodes, against the method of the thesis (ch. 8.9.1).
 
-The thesis sets one rule per service and side, which takes 55 ms on a Raspberry Pi. The comparator does this with the
-iptables command. Fractus replaces the elements of a map in one netlink transaction per side. Both are measured in network
-namespaces of this program, and again beside the rules that kube-proxy creates for 2,000 services.
+The thesis sets one rule per service and node, which takes 55 ms on a Raspberry Pi. The comparator does the same with
+the iptables command. Fractus replaces the elements of a map in one netlink transaction per node. Both methods are
+measured in network namespaces of this program, first alone and then with the rules that kube-proxy creates for 2,000
+other services.
 
 Needs root, nftables and iptables.
 """
@@ -72,7 +73,7 @@ def redirects(count: int, target: str) -> list[Redirect]:
 
 
 def fractus_ms(sides: list[Side], count: int) -> list[float]:
-    """Return durations of switches by a map transaction, in milliseconds."""
+    """Return the durations of switches with Fractus, one map transaction per node, in milliseconds."""
     targets = [redirects(count, "10.77.0.2"), redirects(count, "10.77.0.6")]
     taken = []
     for number in range(SWITCHES):
@@ -93,7 +94,7 @@ def set_rule(side: Side, verb: list[str], redirect: Redirect) -> None:
 
 
 def thesis_ms(sides: list[Side], count: int, switches: int) -> list[float]:
-    """Return durations of switches by one iptables command per service and side, in milliseconds."""
+    """Return the durations of switches with one iptables command per service and node, in milliseconds."""
     for side in sides:
         for redirect in redirects(count, "10.77.0.2"):
             set_rule(side, ["-A", "PREROUTING"], redirect)
@@ -110,7 +111,10 @@ def thesis_ms(sides: list[Side], count: int, switches: int) -> list[float]:
 
 
 def tail_ms(values: list[float], batches: int = 5) -> float:
-    """Return the median of the 99th percentiles of batches, so that one pause of a shared machine does not decide."""
+    """Return the median of the 99th percentiles of several batches.
+
+    A single pause of the machine affects only one batch.
+    """
     size = len(values) // batches
     return statistics.median(quantile(values[i * size : (i + 1) * size], 0.99) for i in range(batches))
 

@@ -1,6 +1,6 @@
 """Processor time and memory of the mobility service, against MAVProxy on a link to the same vehicle.
 
-Both run beside each other for the same time while the vehicle stands ready on the ground. Needs MAVProxy
+Both programs run at the same time while the vehicle stands on the ground, ready to arm. Needs MAVProxy
 (`uv pip install MAVProxy`).
 """
 

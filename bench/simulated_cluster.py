@@ -1,9 +1,12 @@
 """Control plane on loopback with any number of nodes simulated by kwok, and the operator as a process, for measurements.
 
-The scheduler binds pods, but nothing runs. Unlike the embedded cluster (`fractus_cluster`) it needs no root, and a node costs
-only a few objects. The nodes send no heartbeats: at kubelet's rate those of 5,000 nodes would use more than two cores. The
-cost of nodes is in lists, watches, planning and scheduling. Pods run one second after they are bound, as with a fast
-kubelet. The API server collects garbage a quarter as often as by default, because this would take a third of its time.
+The scheduler binds pods, but no containers run. Unlike the embedded cluster (`fractus_cluster`), this cluster needs no
+root, and a node consists only of a few objects. Pods become Running one second after they are bound, as with a fast
+kubelet.
+
+The nodes send no heartbeats, because the heartbeats of 5,000 nodes would use more than two cores. Lists, watches,
+planning and scheduling still cost as much as with real nodes. The Go garbage collector of the API server runs a quarter
+as often as by default. Otherwise it would use a third of the server's processor time.
 """
 
 from __future__ import annotations
@@ -38,7 +41,10 @@ _NAMESPACES = ("fractus-system", NODES_NAMESPACE)
 _ALLOCATABLE = {"cpu": "64", "memory": "64Gi", "pods": "500"}
 _READY = {"type": "Ready", "status": "True", "reason": "Simulated", "lastTransitionTime": "2026-01-01T00:00:00Z"}
 _LEASE_S = 40_000
-"""Duration of a node's Lease. kwok renews it after a quarter, after the end of the measurement."""
+"""Duration of a node's Lease in seconds.
+
+kwok renews it after a quarter of this time, when the measurement has ended.
+"""
 
 Body = dict[str, Any]
 OnEvent = Callable[[str, Body], None]
@@ -94,7 +100,7 @@ class SimulatedCluster(ControlPlane):
                 raise SystemExit(f"bench: {program} has ended; see {self._logs / program}.log")
 
     def watch(self, callbacks: Mapping[Kind, OnEvent]) -> None:
-        """Pass all further events of some kinds to callbacks, in a thread of its own."""
+        """Call the callback of each kind for every new event, in a separate thread."""
         version = self.admin.call("GET", "/api/v1/pods?limit=1")["metadata"]["resourceVersion"]
         threading.Thread(target=lambda: asyncio.run(self._watch_all(callbacks, version)), daemon=True).start()
 
@@ -113,7 +119,7 @@ class SimulatedCluster(ControlPlane):
         policy = directory / "audit-policy.yaml"
         rules = [{"level": "Metadata", "users": [OPERATOR], "omitStages": ["RequestReceived"]}, {"level": "None"}]
         policy.write_text(yaml.safe_dump({"apiVersion": "audit.k8s.io/v1", "kind": "Policy", "rules": rules}))
-        # A large maximum size prevents rotation, which would remove requests from the count.
+        # The maximum size is large, because requests in a rotated log would not be counted.
         return (
             f"--audit-policy-file={policy}", f"--audit-log-path={directory / 'audit.log'}", "--audit-log-maxsize=10000",
         )  # fmt: skip
@@ -203,7 +209,7 @@ def wait_for_prepared_nodes(api: BlockingClient) -> None:
 
 @contextlib.contextmanager
 def simulated_cluster(directory: Path, *, audit: bool = False) -> Iterator[SimulatedCluster]:
-    """Run a control plane for the length of a block."""
+    """Run a simulated cluster until the end of the `with` block."""
     cluster = SimulatedCluster(directory, audit=audit)
     try:
         cluster.start()

@@ -1,7 +1,7 @@
 """The simulated vehicle against measurements of a real ArduCopter, and its cost.
 
-Motion is measured in lockstep, in simulated seconds. Processor time and memory are those of a vehicle process in real time
-with its default step, idle on the ground and hovering with every stream at 4 Hz.
+Motion is measured in lockstep, in simulated seconds. Processor time and memory are measured on a vehicle process that
+runs in real time with its default step, first idle on the ground, then hovering with every stream at 4 Hz.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def command(sysid: int, number: int, parameters: tuple[float, ...]) -> dict[str,
 
 
 def measure_motion(report: Report) -> None:
-    """Measure takeoff, a leg of 50 m and the return flight, like those of the real vehicle."""
+    """Measure takeoff, a leg of 50 m and the return flight. The real vehicle flew the same."""
     simulation = Simulation([VehicleConfig(start=START, ready_after_s=2.0)])
     pilot = Pilot(simulation, simulation.crafts[0])
     vehicle = simulation.crafts[0].vehicle.state
@@ -67,7 +67,7 @@ def measure_motion(report: Report) -> None:
 
 
 def measure_start(report: Report) -> None:
-    """Measure the parameter list, the time until the vehicle is ready, and whether equal seeds give equal logs."""
+    """Measure the parameter list and the time until the vehicle is ready. Check that equal seeds give equal logs."""
     simulation = Simulation([VehicleConfig(start=START)])
     pilot = Pilot(simulation, simulation.crafts[0])
     vehicle = simulation.crafts[0].vehicle.state
@@ -100,7 +100,7 @@ def log_of_flight(seed: int) -> bytes:
 
 
 def measure_speed(report: Report, flight_s: float) -> None:
-    """Measure the speed of one and of fifty flying vehicles in processor time, as a multiple of real time."""
+    """Measure simulated time per processor time for one and for fifty flying vehicles."""
     for count, claim, duration_s in ((1, "speed_one", flight_s), (50, "speed_fifty", flight_s / 20)):
         configs = formation(VehicleConfig(start=START, ready_after_s=2.0), count, 10.0)
         simulation = Simulation(configs)
@@ -133,7 +133,7 @@ class Link:
         self._socket.sendall(self._endpoint.encode(name, {"target_system": 1, "target_component": 1} | values))
 
     def read(self, duration_s: float, until: str = "") -> int:
-        """Read for some seconds, or until a message of a name arrives, and return the number of messages."""
+        """Read for some seconds, or until a message with the name `until` arrives. Return the number of messages."""
         count = 0
         end_s = time.monotonic() + duration_s
         while time.monotonic() < end_s:

@@ -1,7 +1,8 @@
 """The page of `fractus view` in Chromium: time until its map is shown, and its frames with 100 drones at 5 Hz.
 
-The comparator of frames is the same page with one drone. Without a graphics processor, Chromium draws in software. That takes
-nearly all of each frame and is no measure of users' machines. The cost of the page itself is the time of its scripts.
+The comparator of the frame durations is the same page with one drone. Without a graphics processor, Chromium draws in
+software. Drawing then takes most of each frame, unlike on the machines of users. The time of the scripts shows the cost
+of the page itself.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from harness import Report, parser, print_table, quantile
 from playwright.async_api import Browser, async_playwright
 
 LOADS = 7
-"""Number of page loads. The median duration counts."""
+"""Number of page loads. The result is the median duration."""
 
 PERIOD_S = 0.2
 ARGUMENTS = (

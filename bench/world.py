@@ -1,4 +1,4 @@
-"""Cost of a picture of the simulated world, and its likeness to an oversampled picture.
+"""Cost of a picture of the simulated world, and the difference from an oversampled picture.
 
 Durations are processor time of one core, with OpenCV on one thread. The comparator is a naive renderer that looks up every
 pixel separately in the finest level of the ground.
@@ -45,7 +45,7 @@ def render_naively(view: View, store: TileStore, level: int = 0) -> np.ndarray:
 
 
 def measure_known_ground(report: Report, world: World, repeats: int) -> None:
-    """Measure pictures of ground that has been drawn before, like nearly all pictures of a flight."""
+    """Measure pictures of ground whose tiles are in the cache, as in nearly all pictures of a flight."""
     scenes = {
         "1080p, 60 m, looking down": (pose(world, 70.0, 55.0, 60.0), Mount()),
         "1080p, 120 m, looking down": (pose(world, 70.0, 55.0, 120.0), Mount()),
@@ -70,7 +70,7 @@ def measure_known_ground(report: Report, world: World, repeats: int) -> None:
 
 
 def render_next(world: World, camera: Pose, mount: Mount, numbers: itertools.count[int]) -> None:
-    """Render the next of several pictures at five per second."""
+    """Render the next picture of a series with five pictures per second."""
     world.render(camera, LENS, mount=mount, time_s=100.0 + 0.2 * next(numbers))
 
 
@@ -100,7 +100,7 @@ def measure_tiles(report: Report) -> None:
 
 
 def measure_likeness(report: Report) -> None:
-    """Measure the difference of a slanted picture from a picture of sixteen times as many rays."""
+    """Measure the difference between a slanted picture and one that was rendered with 16 times as many pixels."""
     world = World.procedural(LAT, LON, 7)
     small = Intrinsics(480, 270, 62.2)
     large = Intrinsics(1920, 1080, 62.2)
@@ -118,7 +118,7 @@ def measure_likeness(report: Report) -> None:
 
 
 def visit(world: World) -> float:
-    """Return the resident memory in megabytes after pictures at 24 places of a world."""
+    """Render pictures at 24 places of a world, and return the resident memory in megabytes."""
     for step in range(24):
         camera = pose(world, 900.0 * step - 8000.0, 700.0 * (step % 5), 60.0 + 20 * (step % 4))
         world.render(camera, Intrinsics(1280, 720), mount=Mount(-90.0 if step % 2 else -35.0))
@@ -127,7 +127,7 @@ def visit(world: World) -> float:
 
 def main() -> int:
     arguments = parser(__doc__, quick="fewer repetitions")
-    arguments.add_argument("--visit", action="store_true", help="only print the memory after pictures at 24 places")
+    arguments.add_argument("--visit", action="store_true", help="only print the memory after 24 pictures")
     options = arguments.parse_args()
     world = World.procedural(LAT, LON, 7)
     if options.visit:

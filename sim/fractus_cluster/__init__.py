@@ -8,5 +8,5 @@ Start a cluster, use it and remove it:
     cluster.node("drone-1").power_off()
     cluster.down()
 
-This module imports nothing, because `node_init` is part of the package and must start fast.
+This file imports nothing. Imports here would delay the start of `node_init`, which is a module of the package.
 """

@@ -43,7 +43,7 @@ class Addressing:
 
     @property
     def control_plane(self) -> IPv4Address:
-        """Address of the API server and the cluster DNS. It is also the router of the nodes."""
+        """Address of the API server and the cluster DNS. It is also the default gateway of the nodes."""
         return self.block.network_address + 1
 
     @property
@@ -75,7 +75,8 @@ def choose_block(taken: Iterable[IPv4Network]) -> IPv4Network:
     for candidate in _CANDIDATES:
         if not any(candidate.overlaps(network) for network in used):
             return candidate
-    # A VPN or cloud network may have a route for the whole of 10.0.0.0/8. More specific routes inside it still work.
+    # Second attempt: ignore very large networks, such as a VPN route for 10.0.0.0/8. The route of the cluster is more
+    # specific and takes precedence.
     narrow = [network for network in used if network.prefixlen > _BROAD]
     for candidate in _CANDIDATES:
         if not any(candidate.overlaps(network) for network in narrow):

@@ -17,7 +17,7 @@ _NEEDED_V2 = ("cpu", "cpuset", "memory", "pids")
 _DELEGATED_V2 = (*_NEEDED_V2, "io", "hugetlb")
 _DAEMONS = "daemons"
 _WEIGHT = 20
-"""CPU weight of a cluster, as a multiple of one process. It is high because the vehicles fly in real time."""
+"""CPU weight of all clusters, as a multiple of the default weight. It is high because vehicles fly in real time."""
 _ONE_V1 = 1024
 _ONE_V2 = 100
 _POLL_S = 0.02
@@ -40,7 +40,7 @@ def find_hierarchies(mounts: str | None = None) -> Hierarchies:
     """Read the mounted control groups from /proc/self/mounts.
 
     Args:
-        mounts: Text in the format of /proc/self/mounts. None: the kernel's own.
+        mounts: Text in the format of /proc/self/mounts. None: read the file.
 
     Raises:
         PrerequisiteError: No control groups are mounted, or a required controller is missing.
@@ -58,7 +58,7 @@ def find_hierarchies(mounts: str | None = None) -> Hierarchies:
         missing = [name for name in _NEEDED_V1 if not any(name in options for options in old.values())]
         if missing:
             raise PrerequisiteError(f"the kernel's control groups lack {', '.join(missing)}; Kubernetes needs them")
-        # Container runtimes also use the unified hierarchy of a hybrid layout.
+        # In a hybrid layout, the version 2 hierarchy is included, because container runtimes also create groups in it.
         return Hierarchies(1, (*old, *new))
     if not new:
         raise PrerequisiteError("no control groups are mounted at /sys/fs/cgroup; Kubernetes needs them")
@@ -198,7 +198,7 @@ def _remove_tree(directory: Path) -> OSError | None:
 
 
 def _fill_cpuset(above: Path, directory: Path) -> None:
-    """Copy CPUs and memory nodes of the parent group to a new group, which version 1 leaves empty."""
+    """Copy the CPUs and memory nodes of the parent group to a new group. Version 1 creates it without any."""
     for name in ("cpuset.cpus", "cpuset.mems"):
         file = directory / name
         if file.exists() and not file.read_text().strip():

@@ -54,7 +54,7 @@ def up(file: Path, name: str | None, images: tuple[str, ...]) -> None:
 def down(name: str | None, every: bool) -> None:
     """Remove the cluster and all its resources on the machine."""
     check_root()
-    # If a state directory was deleted, only the claims of the machine contain the cluster.
+    # A cluster whose state directory was deleted is missing in `known_clusters`. It still has a claim.
     names = sorted({*known_clusters(), *(other for other, path in holders().items() if path.parent == state_root())})
     if name is None and len(names) > 1 and not every:
         raise ClusterError(f"several clusters: {', '.join(names)}; select one with --name, or remove all with --all")
@@ -107,7 +107,7 @@ def _describe(node: NodeStatus) -> str:
 
 @cluster.command()
 @_name_option
-@click.option("--path", "only_path", is_flag=True, help="Print the path of the file instead of its content.")
+@click.option("--path", "only_path", is_flag=True, help="Print the path of the kubeconfig file instead of its content.")
 def kubeconfig(name: str | None, only_path: bool) -> None:
     """Print the administrator's kubeconfig."""
     file = Cluster.existing(name).kubeconfig
@@ -134,7 +134,7 @@ def env(name: str | None) -> None:
 @click.option(
     "--source",
     type=click.Path(path_type=Path, file_okay=False, exists=True),
-    help="Checkout with Dockerfile and charts.",
+    help="Checkout of Fractus with the Dockerfile and the charts.",
 )
 def install_(name: str | None, source: Path | None) -> None:
     """Build the images, install or upgrade the charts of Fractus, and wait until the drones are ready."""
@@ -160,7 +160,7 @@ def load_image(images: tuple[str, ...], name: str | None, output: str) -> None:
 @click.argument("node")
 @_name_option
 def power(state: str, node: str, name: str | None) -> None:
-    """Power a node off, or on again. The power of its vehicle does not change."""
+    """Power a node on or off. Its vehicle keeps running."""
     Cluster.existing(name, report=print_report).set_power(node, on=state == "on")
 
 
@@ -230,11 +230,15 @@ _EXTRA_PROGRAMS = sorted(set(PROGRAMS[DEFAULT_KUBERNETES]) - set(CLUSTER_PROGRAM
 
 @cluster.command()
 @click.option(
-    "--with", "extra", multiple=True, type=click.Choice(_EXTRA_PROGRAMS), help="Program to provide in addition."
+    "--with",
+    "extra",
+    multiple=True,
+    type=click.Choice(_EXTRA_PROGRAMS),
+    help="Additional program to build and list. Can be given several times.",
 )
 @_output_option
 def binaries(extra: tuple[str, ...], output: str) -> None:
-    """Build missing Kubernetes programs, and print the paths of all programs."""
+    """Print the paths of the Kubernetes programs that a cluster needs. Missing programs are built first."""
     programs = ensure_binaries((*CLUSTER_PROGRAMS, *extra), report=print_report)
     if output == "json":
         click.echo(json.dumps({program: str(path) for program, path in programs.paths.items()}, sort_keys=True))

@@ -67,7 +67,7 @@ class NodeStatus:
 
 
 class Cluster:
-    """A cluster that a file describes. It may be running or not."""
+    """An embedded cluster, as specified by a cluster file. The cluster may be running or not."""
 
     def __init__(self, spec: ClusterSpec, *, report: Report = silent) -> None:
         """Create a cluster object. This does not start the cluster.
@@ -116,7 +116,10 @@ class Cluster:
 
     @classmethod
     def bare(cls, name: str, *, report: Report = silent) -> Cluster:
-        """Return a cluster for `down`, also if its start was interrupted before its file was stored."""
+        """Return a cluster that only `down` may be called on.
+
+        Its cluster file may be missing after an interrupted start.
+        """
         spec = state_of(name).read_spec()
         return cls(spec or ClusterSpec.placeholder(name), report=report)
 
@@ -165,9 +168,10 @@ class Cluster:
         )
 
     def up(self, *, images: Sequence[str] = ()) -> None:
-        """Start the cluster, or update it to its description. Nothing changes if it is already up to date.
+        """Start the cluster, or update a running cluster to its specification.
 
-        It restarts ended processes, vehicles and cameras, powers nodes on, and restores links.
+        This also restarts processes, vehicles and cameras that have ended, powers nodes on, and restores links. Nothing
+        changes if the cluster is up to date.
 
         Args:
             images: Images in buildah's storage to deliver to every node before it starts pods.
@@ -209,7 +213,7 @@ class Cluster:
         self._report(f"cluster {self.name} is up: {len(nodes)} nodes, {time.monotonic() - started:.1f} s")
 
     def down(self) -> None:
-        """Remove the cluster and all its resources on the machine. Nothing changes if it does not exist.
+        """Remove the cluster and all its resources on the machine. Do nothing if it does not exist.
 
         Raises:
             ClusterError: A resource could not be removed. Fix the cause and call this again.

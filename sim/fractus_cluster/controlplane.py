@@ -86,9 +86,10 @@ def write_control_plane(
 
 
 def let_dns_start(addressing: Addressing, files: ControlPlaneFiles) -> None:
-    """Write the DNS server's configuration after its permission to read Services exists.
+    """Write the DNS server's configuration, for which its supervisor waits.
 
-    Without the permission, the server retries only after 30 s.
+    Call this after the permission of the server to read Services has been created. If the permission is missing at its
+    start, the server retries only after 30 s.
     """
     if not files.corefile.exists():
         new = files.corefile.with_suffix(".new")
@@ -97,7 +98,7 @@ def let_dns_start(addressing: Addressing, files: ControlPlaneFiles) -> None:
 
 
 def corefile(addressing: Addressing, kubeconfig: Path) -> str:
-    """Return the DNS server's configuration: it resolves names of the cluster, and refuses all others immediately."""
+    """Return the DNS server's configuration. The server resolves names of the cluster, and refuses all other names."""
     return f"""\
 {_CLUSTER_DOMAIN}:53 in-addr.arpa:53 {{
     bind {addressing.control_plane}

@@ -8,7 +8,7 @@ from fractus_cluster.commands import run
 
 
 def mount_disk(image: Path, target: Path, size_bytes: int) -> None:
-    """Mount an image file as a disk unless it is mounted. Create the file if it is missing.
+    """Mount an image file as a disk unless the target is already a mount point. Create the file if it is missing.
 
     No blocks are reserved for root, so the disk can be filled completely.
 
@@ -42,5 +42,5 @@ def unmount_below(directory: Path) -> None:
     mounted = [Path(line.split(" ")[4].replace("\\040", " ")) for line in lines]
     for target in reversed(mounted):
         if target.is_relative_to(directory):
-            # Lazy unmount: a program with an open file must not prevent the removal of the other resources.
+            # With --lazy, a program that has a file open cannot prevent the removal of the cluster.
             run(["umount", "--lazy", target])

@@ -11,6 +11,6 @@ class ClusterError(Exception):
 
 
 class PrerequisiteError(ClusterError):
-    """The machine lacks something that the embedded cluster needs."""
+    """A prerequisite of the embedded cluster is missing on the machine."""
 
     exit_code = 3

@@ -13,10 +13,10 @@ from fractus_cluster.errors import ClusterError
 from fractus_cluster.spec import NodeSpec, Place, camera_address
 
 CAMERA_LINKS = ("tcp:127.0.0.1:5762", "tcp:127.0.0.1:5763")
-"""Candidates for the vehicle endpoint of the camera. The first is used unless it is the autopilot's."""
+"""Possible MAVLink endpoints for the camera. The second is used if the first is the endpoint for the services."""
 
 RADIO_LINK = "tcp:127.0.0.1:5765"
-"""Vehicle endpoint of the radio, if the node has a WiFi device."""
+"""MAVLink endpoint of the vehicle for the simulated radio, if the node has a WiFi device."""
 
 
 def hardware_commands(node: NodeSpec, origin: Place | None) -> dict[str, list[str]]:

@@ -34,7 +34,7 @@ def locked(
     Args:
         path: Lock file. It is created if it is missing.
         timeout_s: Maximum time to wait for the lock.
-        what: Activity of the other holder, for messages. Example: "another process is building binaries".
+        what: Text for messages about the current holder of the lock, such as "another process is building binaries".
         report: Called once if another process holds the lock.
         remove: Delete the file before the lock is released.
 

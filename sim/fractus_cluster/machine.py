@@ -17,7 +17,7 @@ from fractus_cluster.errors import ClusterError
 from fractus_cluster.locking import locked
 from fractus_cluster.network import NETNS_DIRECTORY, networks_in_use
 
-# On /run, because claims, settings and addresses do not survive a reboot.
+# In /run, because a reboot removes the networks of clusters and resets the kernel settings.
 DIRECTORY = Path("/run/fractus-sim")
 _LEDGER = DIRECTORY / "machine.json"
 _LOCK = DIRECTORY / "lock"
@@ -29,7 +29,7 @@ Report = Callable[[str], None]
 
 @dataclass(slots=True)
 class _Claim:
-    """Claim of one cluster."""
+    """Name and addresses that a cluster holds: its state directory and its address block."""
 
     state: str
     block: str
@@ -37,7 +37,7 @@ class _Claim:
 
 @dataclass(slots=True)
 class _Ledger:
-    """All claims, and the settings of the machine before the first claim."""
+    """Claims by cluster name, and the settings that the machine had before the first claim."""
 
     sysctls: dict[str, str] = field(default_factory=dict)
     controllers: list[str] = field(default_factory=list)
@@ -52,7 +52,7 @@ def cluster_lock(name: str) -> Path:
 
 
 def claim(name: str, state: Path, block: IPv4Network | None) -> IPv4Network:
-    """Claim a cluster's name and addresses. The first cluster also changes kernel settings.
+    """Claim a name and addresses for a cluster. The first claim also changes kernel settings of the machine.
 
     Args:
         name: Name of the cluster.
@@ -80,14 +80,14 @@ def claim(name: str, state: Path, block: IPv4Network | None) -> IPv4Network:
         if not ledger.claims:
             _record_settings(ledger)
         ledger.claims[name] = _Claim(str(state), str(block))
-        # Written before anything changes, so that an interrupted start can be undone.
+        # The claim is written before the machine is changed, so that an interrupted start can be undone.
         _write(ledger)
         _raise_sysctls(ledger)
         return block
 
 
 def holders() -> dict[str, Path]:
-    """Return the state directory of each cluster that holds a name."""
+    """Return the state directory of each cluster with a claim, by cluster name."""
     if not _LEDGER.exists():
         return {}
     with locked(_LOCK, timeout_s=_LOCK_TIMEOUT_S, what="another cluster is being started or removed"):
@@ -95,12 +95,12 @@ def holders() -> dict[str, Path]:
 
 
 def holder(name: str) -> Path | None:
-    """Return the state directory of the cluster that holds a name, or None."""
+    """Return the state directory of the cluster that has claimed a name, or None."""
     return holders().get(name)
 
 
 def release(name: str) -> None:
-    """Release a cluster's claims. After the last cluster, restore the settings of the machine."""
+    """Release the claim of a cluster. After the last release, restore the settings of the machine."""
     with locked(_LOCK, timeout_s=_LOCK_TIMEOUT_S, what="another cluster is being started or removed", remove=True):
         ledger = _read()
         ledger.claims.pop(name, None)
@@ -141,10 +141,10 @@ def _raise_sysctls(ledger: _Ledger) -> None:
 def _restore(ledger: _Ledger) -> None:
     for name, value in ledger.sysctls.items():
         path = _sysctl(name)
-        # A different value was set by another program in the meantime and must stay.
+        # Another program may have set a different value in the meantime. That value must stay.
         if path.read_text().strip() == str(_RAISED_SYSCTLS.get(name)):
             path.write_text(value)
-    # The first `ip netns add` mounts the directory on itself.
+    # The first `ip netns add` creates a bind mount of this directory on itself. Remove the mount.
     if NETNS_DIRECTORY.is_dir() and not any(NETNS_DIRECTORY.iterdir()):
         if not ledger.netns_mounted and _mounted(NETNS_DIRECTORY):
             run(["umount", str(NETNS_DIRECTORY)], check=False)

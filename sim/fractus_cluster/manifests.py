@@ -17,7 +17,7 @@ DNS_USER = "fractus-sim:dns"
 
 
 def node_object(node: NodeSpec, index: int, addressing: Addressing) -> tuple[str, Json]:
-    """Return path and content of the Node. It is created before its kubelet starts, so that its labels exist early."""
+    """Return path and content of a Node object. It is created before kubelet starts, so that its labels exist early."""
     pods = str(addressing.pods(index))
     labels = {
         "kubernetes.io/hostname": node.name,
@@ -34,16 +34,17 @@ def node_object(node: NodeSpec, index: int, addressing: Addressing) -> tuple[str
 
 
 def taints_patch(node: NodeSpec, present: Json) -> tuple[str, Json] | None:
-    """Return path and merge patch of the taint that keeps other pods off a drone or edge node. Return None if it is set.
+    """Return path and merge patch for the taint of a drone or edge node. Return None if the taint is already set.
 
-    The patch keeps all other taints, because Kubernetes sets some itself.
+    The taint keeps all pods off the node that do not tolerate it. The patch keeps all other taints, because Kubernetes
+    sets some itself.
 
     Args:
         node: Part of the cluster file that describes the node.
         present: Node object on the API server.
     """
     taints = present["spec"].get("taints", [])
-    # kubelet also enforces NoExecute, so a pod cannot bypass the taint by setting nodeName.
+    # Unlike NoSchedule, kubelet enforces NoExecute. A pod therefore cannot bypass the taint by setting nodeName.
     taint = [{"key": CLASS_LABEL, "value": node.node_class, "effect": "NoExecute"}]
     if node.node_class == "cloud":
         taint = []
@@ -55,7 +56,7 @@ def taints_patch(node: NodeSpec, present: Json) -> tuple[str, Json] | None:
 
 
 def dns_objects(listen: IPv4Address) -> list[tuple[str, Json]]:
-    """Return path and content of the objects that point the well-known DNS address at the DNS of the cluster."""
+    """Return path and content of the objects of the cluster DNS: Service, EndpointSlice, and permissions."""
     metadata = {"name": "kube-dns", "namespace": "kube-system"}
     ports = [{"name": "dns", "port": 53, "protocol": "UDP"}, {"name": "dns-tcp", "port": 53, "protocol": "TCP"}]
     service: Json = {
@@ -104,7 +105,7 @@ def extended_resources_patch(node: NodeSpec, present: Json) -> tuple[str, Json] 
     """Return path and merge patch for a node's extended resources, or None if the node already offers them."""
     resources = dict(node.extended_resources)
     status = present.get("status", {})
-    # kubelet would update `allocatable` only at its next heartbeat.
+    # The patch also contains `allocatable`, because kubelet would update it only at its next heartbeat.
     patch = {
         field: resources
         for field in ("capacity", "allocatable")

@@ -52,12 +52,12 @@ class Wiring:
 
 @dataclass(frozen=True, slots=True)
 class _Mark:
-    """Record of a completely configured namespace.
+    """Record of a completely configured network namespace.
 
     Attributes:
-        inode: Identity of the namespace.
-        hub: Identity of the control plane's namespace, or 0 in its own record.
-        mobile: True if the radio carries the uplink.
+        inode: Inode number of the namespace.
+        hub: Inode number of the control plane's namespace. 0 in the record of the control plane itself.
+        mobile: True if the uplink is a simulated mobile uplink.
     """
 
     inode: int
@@ -66,7 +66,7 @@ class _Mark:
 
 
 def host_link(cluster: str) -> str:
-    """Return the name of the machine's end of its link into a cluster (the kernel takes at most 15 characters)."""
+    """Return the device name of the machine's end of its link into a cluster. Linux allows at most 15 characters."""
     return "fx-" + hashlib.sha256(cluster.encode()).hexdigest()[:10]
 
 
@@ -143,7 +143,7 @@ def wire_node(wiring: Wiring, node: str, index: int, *, mobile: bool = False) ->
     _delete_link(UPLINK, wiring.namespace(node))
     _delete_link(device, wiring.namespace())
     if mobile:
-        # When the radio process ends, the devices remain but lose their carrier.
+        # These devices are persistent: after the radio process has ended, they remain without a carrier.
         _ip(wiring.namespace(node), f"tuntap add dev {UPLINK} mode tap")
         _ip(wiring.namespace(), f"tuntap add dev {device} mode tap")
     else:

@@ -36,7 +36,7 @@ _FOLDERS = ("etc", "etc-work", "var-lib", "var-log", "config")
 def init_command(config: Path, namespace: Path) -> list[str]:
     """Return the command that runs the first program of a node or control plane in new namespaces.
 
-    The command is the parent of that program. When it is killed, all processes in the namespaces end.
+    When the process of this command is killed, all processes in the namespaces end.
     """
     return [
         "nsenter",
@@ -159,7 +159,7 @@ class Node:
         kill_recorded(record_path)
         self._cgroup.kill_all()
         record_path.unlink(missing_ok=True)
-        # The control groups of old pods would slow down the next kubelet.
+        # Control groups of old pods would slow down the kubelet at its next start.
         self._cgroup.remove()
 
     def power_on(self) -> bool:

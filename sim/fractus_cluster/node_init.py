@@ -1,7 +1,7 @@
 """First program of a node: builds the node's mount tree, then supervises its daemons.
 
-It runs as root in new mount, uts, ipc and pid namespaces and in the network namespace of the node. It imports no large
-library, so that it starts fast, and changes nothing outside of these namespaces.
+The program runs as root in new mount, uts, ipc and pid namespaces and in the network namespace of the node. It changes
+nothing outside of these namespaces. It imports no large library, because it must start fast.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _MS_SHARED = 1 << 20
 _MNT_DETACH = 2
 
 RUN = Path("/run/fractus")
-"""Directory of a node's configuration, programs and logs: config/, bin/ and logs/ below it."""
+"""Directory on a node with the configuration (config/), the programs (bin/) and the logs (logs/)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +39,7 @@ class NodeView:
         files: Directory with the node's etc/, etc-work/, var-lib/, var-log/ and config/.
         logs: Directory of the daemons' logs.
         programs: Paths on the machine by program name.
-        sysctls: Values of machine-wide kernel settings that the node's daemons see. They cannot change the real values.
+        sysctls: Values that the node's daemons see for kernel settings of the machine. The real values do not change.
     """
 
     hostname: str | None
@@ -62,7 +62,7 @@ def main(argument: str) -> None:
 
 
 def release_namespaces() -> None:
-    """Unmount the files of all network namespaces in this mount tree, so that the namespaces can be deleted."""
+    """Unmount all network namespaces in this mount tree. Otherwise the machine could not delete them."""
     for line in Path("/proc/self/mountinfo").read_text().splitlines():
         before, _, after = line.partition(" - ")
         if after.split(" ", 1)[0] == "nsfs":
@@ -72,7 +72,7 @@ def release_namespaces() -> None:
 def prepare(view: NodeView) -> None:
     """Build the node's mount tree."""
     with ExitStack() as stack:
-        # File descriptors stay valid when a mount covers a directory above their path.
+        # The later mounts hide the original paths. Open file descriptors stay valid.
         source = {name: _handle(Path(view.files) / name, stack) for name in ("etc", "etc-work", "var-lib", "var-log")}
         source["config"] = _handle(Path(view.files) / "config", stack)
         source["logs"] = _handle(Path(view.logs), stack)
@@ -89,14 +89,14 @@ def prepare(view: NodeView) -> None:
         layers = f"lowerdir=/etc,upperdir={source['etc']},workdir={source['etc-work']}"
         _mount("overlay", "/etc", "overlay", 0, layers)
         _bind(source["var-log"], Path("/var/log"))
-        # A recursive mount includes the node's separate disk.
+        # The bind mount is recursive, so that it includes the separate disk of the node.
         _mount(source["var-lib"], "/var/lib", None, _MS_BIND | _MS_REC, None)
     _settings(view.sysctls)
     _mount("none", "/", None, _MS_SHARED | _MS_REC, None)
 
 
 def _fresh_sysfs() -> None:
-    """Mount a sysfs with the node's network devices, and mount the control groups into it again."""
+    """Mount a new sysfs, which contains the node's network devices, and mount the control groups below it again."""
     aside = Path("/run/.cgroup")
     aside.mkdir()
     _mount("/sys/fs/cgroup", str(aside), None, _MS_BIND | _MS_REC, None)

@@ -19,7 +19,7 @@ CONTAINERD_SOCKET = "/run/containerd/containerd.sock"
 CONFIG = RUN / "config"
 
 SHOWN_SYSCTLS = {
-    # Values that kubelet requires. If they are set, kubelet does not change the settings of the machine.
+    # kubelet would set these kernel settings of the machine. It does not if it already sees the required values.
     "vm.overcommit_memory": "1",
     "vm.panic_on_oom": "0",
     "kernel.panic": "10",
@@ -43,7 +43,7 @@ class Machine:
 
 
 def shortfalls(node: NodeSpec, machine: Machine) -> list[str]:
-    """Return a sentence for each resource of which the node should offer more than the machine has."""
+    """Return a sentence for each resource that the specification of the node sets above the amount of the machine."""
     sentences = []
     cpu = node.resources.get("cpu")
     memory = node.resources.get("memory")
@@ -97,13 +97,13 @@ def kubelet_config(node: NodeSpec, *, cgroup_root: str, cgroup_version: int, mac
         "systemReserved": _reserved(node, machine),
         "registryPullQPS": 0,
         "serializeImagePulls": False,
-        # Evictions and image collections are off, because all nodes share one disk.
+        # Evictions and image garbage collection are disabled, because all nodes share the disk of the machine.
         "evictionHard": dict.fromkeys(
             ("memory.available", "nodefs.available", "nodefs.inodesFree", "imagefs.available"), "0%"
         ),
         "imageGCHighThresholdPercent": 100,
         "imageGCLowThresholdPercent": 99,
-        # A lost node is noticed within seconds. More frequent heartbeats would load an idle machine.
+        # With these values, a lost node is detected within seconds. Shorter intervals would load an idle machine.
         "nodeLeaseDurationSeconds": 8,
         "nodeStatusUpdateFrequency": "10s",
         "nodeStatusReportFrequency": "5m",

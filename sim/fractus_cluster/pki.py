@@ -24,7 +24,7 @@ AlternativeName = str | IPv4Address
 
 @dataclass(frozen=True, slots=True)
 class Credential:
-    """A certificate and its key, as files."""
+    """Files of a certificate and its private key."""
 
     certificate: Path
     key: Path
@@ -105,7 +105,7 @@ class Authority:
         return credential
 
     def service_account_key(self) -> Credential:
-        """Return the key pair that signs service account tokens (the certificate file holds the public key)."""
+        """Return the key pair for service account tokens. Its certificate file contains only the public key."""
         pair = Credential(self._directory / "service-accounts.pub", self._directory / "service-accounts.key")
         if not pair.complete:
             key = ec.generate_private_key(ec.SECP256R1())

@@ -8,8 +8,8 @@ import random
 import socket
 from collections import deque
 
-# Below the usual range for connections and for listeners on port 0 (32768 and up) and Kubernetes NodePorts (30000 and
-# up), above the ports of Kubernetes components (10248 to 10259) and the usual MAVLink ports (14540 to 18570).
+# The range lies above the ports of Kubernetes components (10248 to 10259) and the usual MAVLink ports (14540 to 18570).
+# It lies below the Kubernetes NodePorts (30000 and up) and the ports that Linux assigns itself (32768 and up).
 _FIRST = 20_000
 _LAST = 29_999
 _KEPT = 512
@@ -21,8 +21,9 @@ _reservations: deque[socket.socket] = deque()
 def free_port() -> int:
     """Reserve a port (TCP and UDP) of 127.0.0.1 that is free and not reserved by another caller.
 
-    The port stays reserved, also for other processes, until this process ends or has reserved 512 more ports. A program
-    that listens on it may be restarted. On systems other than Linux, ports are not reserved.
+    Calls in all processes skip the port until this process ends or has reserved 512 more ports. The port therefore
+    stays available for a program that listens on it and is restarted. On systems other than Linux, ports are not
+    reserved.
 
     Raises:
         OSError: No port is free.
@@ -43,7 +44,10 @@ def free_port() -> int:
 
 
 def _reserve(port: int) -> socket.socket | None:
-    """Bind an abstract Unix socket named after the port. It is unique per network namespace and needs no file."""
+    """Reserve a port by an abstract Unix socket with its number. Return None if the port is already reserved.
+
+    The name of such a socket is unique in its network namespace. It needs no file.
+    """
     reservation = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
     try:
         reservation.bind(f"\0fractus/port/{port}")

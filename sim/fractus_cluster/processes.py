@@ -21,11 +21,11 @@ _POLL_S = 0.01
 
 @dataclass(frozen=True, slots=True)
 class ProcessRecord:
-    """Identity of a process that is distinct from a later process with the same pid.
+    """Identity of a process. A later process with the same pid has a different identity.
 
     Attributes:
         pid: Process id in the root pid namespace.
-        start_ticks: Field 22 of /proc/PID/stat: clock ticks from boot to its start.
+        start_ticks: Start time of the process, clock ticks since boot (field 22 of /proc/PID/stat).
         boot_id: Id of the boot.
     """
 
@@ -102,7 +102,7 @@ def spawn(
             raise ClusterError(f"cannot start {words[0]}: {error}") from error
     # The child is not reaped yet, so its pid cannot be reused.
     record = record_of(process.pid)
-    process.returncode = 0  # keeps subprocess from waiting for the process and from warning about it
+    process.returncode = 0  # prevents subprocess from waiting for the process, and from a ResourceWarning
     if record is None:
         raise ClusterError(f"{words[0]} ended immediately; see {log}")
     return record
@@ -133,7 +133,7 @@ def kill(record: ProcessRecord, *, timeout_s: float = 10.0) -> None:
 
 
 def reap(pid: int) -> None:
-    """Reap an ended child process. Other processes are not affected."""
+    """Reap a child process if it has ended. Do nothing for other processes."""
     try:
         os.waitpid(pid, os.WNOHANG)
     except ChildProcessError:

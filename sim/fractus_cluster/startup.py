@@ -130,7 +130,15 @@ class Startup:
             write_private(self.state.kubeconfig, text)
 
     def wait_nodes(self, api: BlockingClient, nodes: Sequence[tuple[Node, datetime | None]]) -> None:
-        """Wait until every node is Ready in a report since the given time, and offers its extended resources."""
+        """Wait until every node is Ready and offers its extended resources.
+
+        Args:
+            api: Client of the API server.
+            nodes: Nodes, each with a time. Reports of its kubelet before this time are ignored.
+
+        Raises:
+            ClusterError: A node did not start, or was not Ready before the timeout.
+        """
         deadline = time.monotonic() + _READY_TIMEOUT_S
         waiting = {node.name: (node, since) for node, since in nodes}
         while True:
@@ -152,7 +160,7 @@ class Startup:
             if time.monotonic() > deadline:
                 names = ", ".join(waiting)
                 raise ClusterError(
-                    f"not Ready within {_READY_TIMEOUT_S:.0f} s: {names}; see the logs in {self.state.logs}"
+                    f"nodes not Ready within {_READY_TIMEOUT_S:.0f} s: {names}; see the logs in {self.state.logs}"
                 )
             time.sleep(_POLL_S)
 
@@ -170,7 +178,7 @@ class Startup:
                     raise ClusterError(f"the {name} of node {node.name} has ended: {' '.join(last)} (see {log})")
 
     def let_dns_start(self) -> None:
-        """Start DNS. The objects that it serves must exist."""
+        """Start the cluster DNS. Call this after `apply_objects`."""
         let_dns_start(self.wiring.addressing, self._files())
 
     def wait_dns(self) -> None:
@@ -210,7 +218,7 @@ def wiring_of(cluster: str, state: StateDirectory, record: ClusterRecord) -> net
 
 
 def claim(spec: ClusterSpec, state: StateDirectory, kubernetes: str, report: Report) -> ClusterRecord:
-    """Claim addresses, and remove nodes that are no longer part of the description.
+    """Claim addresses for a cluster, and remove its nodes that are no longer part of the specification.
 
     Raises:
         ClusterError: The cluster was started with another minor version of Kubernetes, or no addresses are free.

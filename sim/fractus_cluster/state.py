@@ -17,7 +17,7 @@ from fractus_cluster.spec import ClusterSpec, parse_spec
 
 
 def state_root() -> Path:
-    """Return the state directory of all clusters: FRACTUS_STATE, or below /var/lib."""
+    """Return the state directory of all clusters: FRACTUS_STATE, or /var/lib/fractus-sim."""
     return Path(os.environ.get("FRACTUS_STATE") or "/var/lib/fractus-sim").resolve()
 
 
@@ -28,7 +28,7 @@ class ClusterRecord:
     Attributes:
         block: Addresses.
         indexes: Index of each node. It is kept so that addresses do not change.
-        kubernetes: Minor version of its programs. An older version cannot read the data of a newer one.
+        kubernetes: Minor version of Kubernetes. An older version cannot read the data of a newer version.
     """
 
     block: IPv4Network
@@ -36,7 +36,7 @@ class ClusterRecord:
     kubernetes: str = DEFAULT_KUBERNETES
 
     def with_nodes(self, names: list[str]) -> ClusterRecord:
-        """Return data for the given nodes. Known nodes keep their index, new nodes get the lowest free one."""
+        """Return the record with the given nodes. Known nodes keep their index. New nodes get the lowest free index."""
         kept = {name: index for name, index in self.indexes.items() if name in names}
         free = (index for index in range(len(names) + len(kept) + 1) if index not in kept.values())
         return replace(self, indexes={name: kept[name] if name in kept else next(free) for name in names})

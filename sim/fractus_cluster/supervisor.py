@@ -1,7 +1,8 @@
 """First process of a node or control plane: starts and restarts programs, and reaps orphans.
 
-It runs as a separate process, which must start fast, so it imports no large library. A JSON file lists its programs:
-`{"units": [{"name", "argv", "log", "env", "needs"}]}`. It runs until it is killed, and killing it ends all programs.
+The supervisor runs as a separate process. It imports no large library, because it must start fast. A JSON file lists
+its programs: `{"units": [{"name", "argv", "log", "env", "needs"}]}`. When the supervisor is killed, all its programs
+end.
 """
 
 from __future__ import annotations
@@ -61,7 +62,7 @@ class Unit:
     backoff: Backoff = field(default_factory=lambda: Backoff(_FIRST_RETRY_S, _MAX_RETRY_S))
 
     def start(self, now_s: float) -> None:
-        """Start the program. A failure counts as an exit."""
+        """Start the program. If it cannot be started, schedule another attempt."""
         self.started_s = now_s
         with Path(self.log).open("ab") as output:
             try:
@@ -85,7 +86,7 @@ class Unit:
         try:
             Path("/proc/self/oom_score_adj").write_text(str(self.oom_score_adj))
         except OSError:
-            return  # not permitted in a container; the kernel's default is used
+            return  # not permitted in some containers; the program then has the default score
 
     def ended(self, now_s: float) -> None:
         """Record the end of the program and schedule its restart."""
@@ -102,7 +103,7 @@ class Unit:
         try:
             if path.stat().st_size > _LOG_LIMIT_BYTES:
                 path.with_name(path.name + ".1").write_bytes(path.read_bytes())
-                os.truncate(path, 0)  # the program appends, so it continues at the new end
+                os.truncate(path, 0)  # the program writes in append mode, so it continues at the new end of the file
         except FileNotFoundError:
             return
 

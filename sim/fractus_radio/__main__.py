@@ -39,7 +39,7 @@ class Frame:
 
 
 def make_radio(layout: Layout) -> tuple[Radio, list[Follower]]:
-    """Create the radio of a layout with all its devices, and followers of its vehicles.
+    """Create the radio of a layout with all its devices, and a follower for each vehicle that carries a station.
 
     Raises:
         OSError: A device cannot be created.
@@ -82,7 +82,7 @@ def radio(layout: Path) -> None:
         signal.signal(number, lambda *_: sys.exit(0))
     for follower in followers:
         follower.start()
-    # On a busy machine, frames would otherwise wait for the CPU longer than their travel time.
+    # Without real-time priority, frames would wait for the CPU of a busy machine longer than for their transmission.
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(REAL_TIME_PRIORITY))
     except OSError:  # the control group may forbid real-time scheduling

@@ -49,7 +49,7 @@ class StationEntry(_Value):
 
 
 class EndEntry(_Value):
-    """An existing persistent TAP device, one end of an uplink."""
+    """One end of an uplink: a persistent TAP device that already exists."""
 
     namespace: Path
     device: str
@@ -79,7 +79,7 @@ class Layout(_Value):
     Attributes:
         control: Path of the command socket.
         origin: Origin of the metric positions in commands.
-        fading: Shape of Nakagami fading; None for a hard edge of the range.
+        fading: Shape of Nakagami fading. None: no fading, so that no frame arrives beyond the range.
         seed: Random seed of fading.
     """
 

@@ -19,7 +19,10 @@ RATE_BPS = 24e6
 HEADER_BYTES = 76
 """LLC and MAC headers and checksum, transmitted at the data rate."""
 FIXED_S = 269e-6
-"""DIFS, mean first back-off, preambles, SIFS and ACK. Matches ns-3 within 2 us from 40 to 1400 bytes."""
+"""Duration of DIFS, mean first back-off, preambles, SIFS and ACK.
+
+Airtimes of 40 to 1400 bytes match ns-3 within 2 us.
+"""
 SLOT_S = 20e-6
 FIRST_WINDOW = 16
 MAX_WINDOW = 1024
@@ -45,10 +48,10 @@ class Station:
         position: Position in metres, in the common frame of all stations.
         address: MAC address.
         network: Network name (SSID). A station receives only frames of its own network.
-        silent: True if the station receives but sends nothing, like a peer that pairs and never responds.
+        silent: True if the station receives but sends nothing.
         off: True if the station neither receives nor sends.
         loss_db: Additional loss by a fade or interference.
-        reach: Range relative to the range of the medium. A link has the shorter range of its ends.
+        reach: Range, as a share of the range of the medium. The shorter range of its two stations applies to a link.
     """
 
     position: Position
@@ -64,7 +67,7 @@ class Station:
 
 @dataclass(frozen=True, slots=True)
 class Attempt:
-    """A frame in the air.
+    """An attempt to transmit a frame.
 
     Attributes:
         station: Sender.
@@ -172,7 +175,7 @@ class Medium:
         return self._propagation.receives(_distance_m(a, b), self._chance, loss_db=a.loss_db + b.loss_db)
 
     def neighbours(self, name: str) -> Mapping[str, float]:
-        """Return the stations of the same network in range and their mean power in dBm, like a scan."""
+        """Return the stations of the same network in range, and their mean received power in dBm."""
         scanner = self.stations[name]
         powers = {}
         for other, station in self.stations.items():
@@ -186,5 +189,8 @@ class Medium:
 
 
 def _distance_m(a: Station, b: Station) -> float:
-    """Return the distance, scaled so that the range of the medium applies to the link of two stations."""
+    """Return the distance of two stations divided by the smaller `reach`.
+
+    The range of the medium applies to the result.
+    """
     return math.dist(a.position, b.position) / min(a.reach, b.reach)

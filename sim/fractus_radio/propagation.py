@@ -23,7 +23,7 @@ class Propagation:
     Attributes:
         power_dbm: Transmit power.
         exponent: Path-loss exponent.
-        fading: Shape of Nakagami fading; None for no fading and a hard edge of the range.
+        fading: Shape of Nakagami fading. None: no fading, so that no frame arrives beyond the range.
     """
 
     power_dbm: float
@@ -32,7 +32,10 @@ class Propagation:
 
     @classmethod
     def reaching(cls, range_m: float, *, fading: float | None = None) -> Propagation:
-        """Return a channel with a given range, if there is no fading."""
+        """Return a channel with a range.
+
+        With fading, some frames are lost within the range and some arrive beyond it.
+        """
         power = SENSITIVITY_DBM + REFERENCE_LOSS_DB + 10 * OPEN_EXPONENT * math.log10(range_m)
         return cls(power, OPEN_EXPONENT, fading)
 

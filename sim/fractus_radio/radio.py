@@ -1,9 +1,10 @@
 """Radio process: connects the TAP devices of all nodes by the simulated air and uplinks, and executes commands.
 
-Commands are JSON objects, one per datagram, on a Unix socket:
+A command is a JSON object in one datagram on a Unix socket. This command changes attributes of a station:
 `{"station": "drone-1", "position": [0, 0, 20], "off": false, "silent": false, "loss_db": 0, "network": "fleet"}`
-changes the given attributes of a station. `{"uplink": "drone-1", "off": true, "rate_bps": 8e6, "delay_s": 0.06}`
-changes both directions of an uplink.
+This command changes both directions of an uplink:
+`{"uplink": "drone-1", "off": true, "rate_bps": 8e6, "delay_s": 0.06}`
+Attributes that are not in the command stay unchanged.
 """
 
 from __future__ import annotations
@@ -96,10 +97,7 @@ class Radio:
                     end.write(frame)
 
     def _forward_from(self, tap: Tap, offer: Callable[[bytes, float], None]) -> None:
-        """Carry the frames of a device until the device is removed.
-
-        The loss of one device does not affect the others.
-        """
+        """Pass the frames of a device to `offer` until the device is removed. Other devices are not affected."""
 
         def forward(now_s: float) -> None:
             try:

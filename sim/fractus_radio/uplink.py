@@ -17,7 +17,7 @@ class Uplink:
     Attributes:
         rate_bps: Bits per second.
         delay_s: Delay from the end of transmission to arrival.
-        off: True if nothing is carried. Frames in transit are lost.
+        off: True if the direction is cut. It then drops all frames, including the frames in transit.
     """
 
     rate_bps: float = 8e6

@@ -23,7 +23,7 @@ EXIT_FAILED = 2
 
 @contextmanager
 def command_errors() -> Iterator[None]:
-    """Interrupt the command on signals, and print expected errors in one line.
+    """Run a block with interruption by signals. Print expected errors in one line.
 
     Raises:
         ClickException: The block raised an expected error. click prints it and exits with 1.
@@ -45,7 +45,7 @@ def _describe(error: OSError) -> str:
 
 
 def exit_with_expectations(expectations: Sequence[Expectation], out: Path) -> None:
-    """Print the expectations that do not hold and a summary. Exit with 2 if there are any."""
+    """Print the expectations that do not hold, and a summary. Exit with 2 if an expectation does not hold."""
     failed = [expectation for expectation in expectations if not expectation.holds]
     for expectation in failed:
         run = f", {expectation.run}" if expectation.run else ""

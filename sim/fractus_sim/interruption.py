@@ -13,7 +13,7 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 def interrupt_on_signals() -> None:
-    """Raise KeyboardInterrupt on SIGTERM, and on SIGHUP unless it is ignored (nohup)."""
+    """Raise KeyboardInterrupt on SIGTERM and SIGHUP. A SIGHUP that is ignored (nohup) stays ignored."""
     signal.signal(signal.SIGTERM, _interrupt)
     if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
         signal.signal(signal.SIGHUP, _interrupt)
@@ -21,7 +21,7 @@ def interrupt_on_signals() -> None:
 
 @contextmanager
 def uninterrupted() -> Iterator[None]:
-    """Defer SIGINT, SIGTERM and SIGHUP until the end of the block. Then handle the last one that was received.
+    """Defer SIGINT, SIGTERM and SIGHUP until the end of the block. Then handle the last received signal.
 
     Use this for actions that are short or have a timeout. It has no effect outside of the main thread, because only the
     main thread handles signals.
@@ -30,7 +30,7 @@ def uninterrupted() -> Iterator[None]:
         yield
         return
     deferred: list[signal.Signals] = []
-    # A signal mask would be inherited by the processes that the block starts, so handlers are used.
+    # A signal mask is not used, because processes that the block starts would inherit it.
     handlers = {number: signal.getsignal(number) for number in _SIGNALS}
     for number, handler in handlers.items():
         if handler not in (signal.SIG_IGN, None):

@@ -35,7 +35,7 @@ def module_digest(module: Module) -> str:
 
 
 def build(programs: Sequence[Program], into: Path, *, report: Report) -> None:
-    """Build programs of one module, and move them to a directory when all are complete.
+    """Build programs of one module. Move them to a directory after all of them have been built.
 
     Args:
         programs: Programs to build, all of the same module.
@@ -52,7 +52,8 @@ def build(programs: Sequence[Program], into: Path, *, report: Report) -> None:
     names = ", ".join(program.name for program in programs)
     report(f"building {names} {programs[0].version} from Go modules (once; kept in {into})")
     started = time.monotonic()
-    for left in into.glob(".building-*"):  # of a killed build, because this process holds the lock
+    # These directories are left by killed builds. No other build can run while this process holds the lock.
+    for left in into.glob(".building-*"):
         shutil.rmtree(left)
     with tempfile.TemporaryDirectory(prefix=".building-", dir=into) as scratch:
         source = Path(scratch) / "source"

@@ -45,7 +45,7 @@ class Module:
 
     Attributes:
         name: Folder below `gomod/`.
-        link_variables: Values set by the linker. Servers report their version from them.
+        link_variables: Values set by the linker, such as the version that a server reports.
     """
 
     name: str
@@ -85,7 +85,7 @@ def _programs(minor: str) -> Mapping[str, Program]:
         _kubernetes(minor, "kubelet"),
         _kubernetes(minor, "kube-proxy"),
         _kubernetes(minor, "kubectl", "version", "--client"),
-        # Separate module, so that the dependencies of kubeadm do not affect the other programs.
+        # kubeadm is a separate module, so that its dependencies do not affect the versions in the other programs.
         Program("kubeadm", f"kubeadm-{minor}", "k8s.io/kubernetes/cmd/kubeadm", version, ("version",)),
         Program("kind", "kind", "sigs.k8s.io/kind", KIND_VERSION),
         Program("etcd", "etcd", ".", ETCD_VERSION, accepts="3."),
@@ -142,4 +142,4 @@ CLUSTER_PROGRAMS = (
     "pause",
     "helm",
 )
-"""Programs of `fractus cluster up`. Other programs are built on request."""
+"""Programs that `fractus cluster up` needs. All other programs are built on request only."""

@@ -28,7 +28,7 @@ Report = Callable[[str], None]
 
 @dataclass(frozen=True, slots=True)
 class Binaries:
-    """Paths of the programs."""
+    """Paths of programs that are installed or built."""
 
     paths: Mapping[str, Path]
 
@@ -44,7 +44,7 @@ class Binaries:
             raise ClusterError(f"{name} was not provided; run `fractus cluster binaries --with {name}`") from None
 
     def builds(self, *names: str) -> dict[str, int]:
-        """Return the latest modification time of the programs in nanoseconds. A rebuild changes it."""
+        """Return the modification time of each program in nanoseconds. It changes when a program is rebuilt."""
         return {name: self[name].stat().st_mtime_ns for name in names}
 
 

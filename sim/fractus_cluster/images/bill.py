@@ -30,7 +30,7 @@ def image_bill(image: str) -> str:
 
 
 def bill_of_materials(image: str, root: Path) -> str:
-    """Return the components of an image's root file system as CycloneDX in JSON. Equal contents give equal text.
+    """Return the components of an image's root file system as CycloneDX in JSON. The text depends only on the content.
 
     Args:
         image: Name of the image.
@@ -56,7 +56,7 @@ def _packages(root: Path) -> Iterator[tuple[str, dict[str, Any]]]:
         if not paragraph.strip():
             continue
         package = email.message_from_string(paragraph.lstrip("\n"))
-        # Advisories use the name of the source package. Debian omits the field if it equals the package's name.
+        # Security advisories refer to source packages. Debian omits the field if both names are equal.
         source = package.get("Source", "").split(" ")[0]
         qualifiers = {
             "arch": package["Architecture"],
@@ -73,7 +73,7 @@ def _distributions(root: Path) -> Iterator[tuple[str, dict[str, Any]]]:
 
 
 def _component(type_: str, name: str, version: str, qualifiers: dict[str, str]) -> tuple[str, dict[str, Any]]:
-    """Return the package URL of a component, and the component."""
+    """Return the package URL of a component, and its CycloneDX entry."""
     query = "&".join(f"{key}={quote(value, safe='')}" for key, value in qualifiers.items() if value)
     url = f"pkg:{type_}/{quote(name, safe='')}@{quote(version, safe='')}" + (f"?{query}" if query else "")
     return url, {"type": "library", "bom-ref": url, "name": name, "version": version, "purl": url}

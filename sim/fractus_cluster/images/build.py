@@ -47,7 +47,7 @@ TARGETS = tuple(_MORE_SOURCES)
 _NOT_IN_SLIM = (
     "usr/share/locale", "usr/share/man", "var/cache/apt/archives", "var/cache/debconf", "var/lib/apt/lists", "var/log",
 )  # fmt: skip
-"""Directories to empty, as in debian:trixie-slim. The base image replaces that image if no registry is in reach."""
+"""Directories that are emptied in the base image, as in debian:trixie-slim, which it replaces without a registry."""
 _BUILD_TIMEOUT_S = 1800.0
 _LOCK_TIMEOUT_S = 1800.0
 _HOST_CA = Path("/etc/ssl/certs/ca-certificates.crt")
@@ -147,7 +147,7 @@ def _files(source: Path, names: Iterable[str]) -> Iterator[Path]:
 
 
 def _build_stale(source: Path, targets: Sequence[str], tag: str, report: Report) -> None:
-    """Build the first target before all others, so that they find most steps in the cache."""
+    """Build the first target first. The other targets then take most steps from the cache."""
 
     def build_one(target: str) -> None:
         started = time.monotonic()
@@ -161,7 +161,7 @@ def _build_stale(source: Path, targets: Sequence[str], tag: str, report: Report)
 
 
 def _remove_replaced(identities: Iterable[str]) -> None:
-    """Remove images that were replaced by newer ones, so that builds do not fill the disk. Images in use stay."""
+    """Remove images that newer builds have replaced, so that they do not fill the disk. Images in use are kept."""
     for identity in identities:
         run(["buildah", "rmi", identity], check=False)
 
@@ -169,7 +169,8 @@ def _remove_replaced(identities: Iterable[str]) -> None:
 def _build(source: Path, target: str, tag: str) -> None:
     argv = ["buildah", "build", "--quiet", "--layers", "--timestamp", "0", "--build-arg", f"BASE={BASE_IMAGE}"]
     if _HOST_CA.is_file():
-        # A proxy of the package index may have a CA that only this machine trusts. The image does not keep the bundle.
+        # The package index may be behind a proxy whose CA only this machine trusts. The CA bundle is mounted during the
+        # build only.
         argv += ["--volume", f"{_HOST_CA}:{_CA_IN_BUILD}:ro", "--build-arg", f"SSL_CERT_FILE={_CA_IN_BUILD}"]
     argv += ["--target", target, "--tag", image_name(target, tag), str(source)]
     run(argv, timeout_s=_BUILD_TIMEOUT_S, env={**os.environ, "BUILDAH_ISOLATION": "chroot"})
@@ -185,7 +186,7 @@ def ensure_base(*, report: Report) -> None:
         return
     if shutil.which("debootstrap") is None:
         raise PrerequisiteError(
-            "debootstrap is missing, which creates the base image; install it: apt-get install debootstrap"
+            "debootstrap is missing; it creates the base image; install it: apt-get install debootstrap"
         )
     started = time.monotonic()
     report("creating the Debian base image (once)")

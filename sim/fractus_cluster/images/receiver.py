@@ -1,8 +1,8 @@
 """Temporary registry on the loopback interface that receives images from buildah into an OCI layout.
 
-buildah sends only the missing layers if the destination is a registry. It compresses layers but checks for the digest of
-the uncompressed one. The layout therefore stores layers uncompressed, which nodes also import fastest, and the registry
-rewrites manifests accordingly.
+buildah omits layers that the destination already has, but only if the destination is a registry. buildah compresses the
+layers that it sends, but looks for existing layers by the digest of the uncompressed layer. The registry therefore
+stores layers uncompressed and rewrites the manifests accordingly. Nodes also import uncompressed layers fastest.
 """
 
 from __future__ import annotations

@@ -34,7 +34,7 @@ class ImageStore:
     """A directory with images in an OCI layout, and templates of nodes with unpacked images.
 
     Attributes:
-        path: Directory. It is on the file system of the clusters' state, because nodes share files by hard links.
+        path: Directory. Hard links to its files need it on the file system of the clusters' state.
         report: Called with progress lines.
     """
 
@@ -85,7 +85,10 @@ class ImageStore:
                 run([*argv, f"docker://{address}/{name}"], timeout_s=_COPY_TIMEOUT_S)
 
     def template(self, images: Sequence[Image], pause: Path) -> Template:
-        """Return a template of a node's container storage with these images unpacked. Create it if it is missing."""
+        """Return a template of a node's container storage that contains the images.
+
+        Create the template if it is missing.
+        """
         with self._locked():
             sandbox = self._sandbox(pause)
             contents = [sandbox, *images]
@@ -126,7 +129,7 @@ def image_ids() -> dict[str, str]:
 
 
 def _names_of(entry: str) -> list[str]:
-    """Return the image names of an entry, which is a name itself or the path of an archive."""
+    """Return the image names of an entry. The entry is an image name, or the path of an archive to pull."""
     if not Path(entry).is_file():
         return [entry]
     with tarfile.open(entry) as archive:

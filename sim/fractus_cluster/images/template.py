@@ -56,9 +56,9 @@ class Template:
     path: Path
 
     def create(self, layout: Layout, images: Sequence[Image], *, report: Report) -> None:
-        """Create the template unless it exists. A separate container daemon unpacks the images.
+        """Create the template unless it exists. A temporary containerd unpacks the images.
 
-        The daemon starts with a copy of the newest template, so that it unpacks only new layers.
+        This containerd starts with a copy of the newest template, so that it unpacks only new layers.
         """
         if self.path.exists():
             os.utime(self.path)
@@ -103,7 +103,10 @@ def _storage(node: Node) -> Path:
 
 
 def _copy_storage(source: Path, target: Path) -> None:
-    """Copy a daemon's storage by hard links. Databases become real copies, because the daemon writes to them."""
+    """Copy the storage of a containerd by hard links.
+
+    Copy its databases completely, because containerd changes them.
+    """
     linked = run(["cp", "-al", source, target], check=False, timeout_s=_IMPORT_TIMEOUT_S)
     if linked.returncode != 0:  # the target is on another file system
         shutil.rmtree(target, ignore_errors=True)
@@ -116,7 +119,7 @@ def _copy_storage(source: Path, target: Path) -> None:
 
 @contextmanager
 def _daemon(scratch: Path) -> Iterator[list[str]]:
-    """Run a container daemon with its storage in `scratch/root`, and yield the command line of its client."""
+    """Run containerd with its storage in `scratch/root`, and yield the command line of its client."""
     socket = scratch / "s"
     config = scratch / "config.toml"
     log = scratch / "log"

@@ -16,7 +16,7 @@ from fractus_sim.chaos import process_lookup
 from fractus_sim.testbeds.kube_commands import SYSTEM, Kube
 
 SLOW_S = 2.0
-"""Time for which the API server is suspended."""
+"""Duration of each suspension of the API server."""
 
 _RUNNING_S = 0.4
 _POLL_S = 0.2
@@ -60,10 +60,14 @@ def rate_limit_manifests() -> str:
 
 @contextmanager
 def occupied_request_slot(kube: Kube) -> Iterator[None]:
-    """Occupy the single request slot of `rate_limit_manifests`. All other requests of Fractus receive status 429."""
+    """Occupy the only request slot that `rate_limit_manifests` leaves.
+
+    All requests of Fractus then receive status 429.
+    """
 
     def repeat(stop: threading.Event) -> None:
-        # The API server ends the request after one minute, so it is repeated. It is rejected while another request runs.
+        # The API server ends the request after one minute, so it is repeated. It also receives status 429 at first if a
+        # request of Fractus occupies the slot.
         while not stop.is_set():
             with kube.follow(_INCOMPLETE_REQUEST, subprocess.DEVNULL, subprocess.PIPE) as request:
                 while request.poll() is None and not stop.wait(_POLL_S):
@@ -84,7 +88,10 @@ def connections_reset(namespace: Path) -> Iterator[None]:
 
 @contextmanager
 def responses_dropped(namespace: Path) -> Iterator[int]:
-    """Drop all responses on existing connections to the API server, but not on new ones. Yield their number."""
+    """Drop all responses on the existing connections to the API server. Yield the number of these connections.
+
+    New connections are not affected.
+    """
     peers = sorted(_peers(namespace))
     if not peers:
         yield 0
@@ -100,7 +107,7 @@ def responses_dropped(namespace: Path) -> Iterator[int]:
 
 @contextmanager
 def suspended_repeatedly(pids: Callable[[], list[int]]) -> Iterator[None]:
-    """Suspend the API server for two seconds repeatedly."""
+    """Suspend the API server repeatedly, each time for `SLOW_S`."""
 
     def repeat(stop: threading.Event) -> None:
         while not stop.is_set():
@@ -151,9 +158,10 @@ _JOIN_S = 30.0
 
 @contextmanager
 def in_background(action: Callable[[threading.Event], None]) -> Iterator[None]:
-    """Run an action in a thread until the end of the block. The event is set when the action must return."""
+    """Run an action in a thread until the end of the block. Its event is set when the action must return."""
     stop = threading.Event()
-    # A daemon thread, because an interrupted run must not wait for faults. Its cluster is removed anyway.
+    # The thread is a daemon, so that an interrupted run does not wait for the repair of a fault. The run removes its
+    # cluster anyway.
     thread = threading.Thread(target=action, args=(stop,), daemon=True)
     thread.start()
     try:

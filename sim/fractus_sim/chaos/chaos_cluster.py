@@ -37,7 +37,7 @@ DRONE = "drone-1"
 EXAMPLE_IMAGE = "example-traffic-monitoring"
 VEHICLE_PORT = 5760
 DISK_SIZE = "1Gi"
-"""Recordings use at most half of the disk and leave 200 MB for audit logs, which grow by a few megabytes per hour."""
+"""Size of the drone's disk. Recordings use at most half of it and leave 200 MB. Audit logs need a few MB per hour."""
 
 BALLAST = "ballast"
 """File with which a fault fills the disk."""
@@ -45,7 +45,7 @@ BALLAST = "ballast"
 API_TIMEOUT_S = 15.0
 POLL_S = 0.2
 MIN_BATTERY = 0.7
-"""Minimum charge of a drone on the ground. Below this, its battery is replaced, because a long run needs several."""
+"""Charge below which the battery of a drone on the ground is replaced. A long run needs several batteries."""
 
 _ALL_BATTERIES = 0xFFFF
 _CONNECT_S = 10.0
@@ -58,7 +58,7 @@ class ChaosTarget:
 
     Attributes:
         drone: Name of the drone's node.
-        applied: Set for a moment when an Application was applied and the operator begins to reconcile.
+        applied: Set for a moment after an Application was applied, when the operator begins to reconcile it.
     """
 
     cluster: Cluster
@@ -159,7 +159,7 @@ def chaos_cluster(report: Callable[[str], None], *, keep: bool) -> Iterator[Chao
     try:
         kube = fractus.start()
         target = ChaosTarget(fractus.cluster, kube, DRONE)
-        # Remove the ballast file of a run that was killed.
+        # A killed run leaves its ballast file.
         (target.state / BALLAST).unlink(missing_ok=True)
         nodes = [node for node in fractus.cluster.nodes if node.spec.node_class != "cloud"]
         with cluster_errors():
@@ -236,7 +236,7 @@ class VehicleWatch:
 
     def _read_grants(self) -> None:
         for path in self._grants_folder.glob("*.json"):
-            # The agent may remove a file meanwhile.
+            # The agent may remove a file during this loop.
             try:
                 version = path.stat().st_mtime_ns
                 if self._grant_versions.get(path) != version:

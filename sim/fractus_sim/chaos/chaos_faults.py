@@ -27,7 +27,7 @@ Injection = Generator[str, None, None]
 
 MIN_STEP_S = 30.0
 MAX_STEP_S = 26 * 3600.0
-"""Clock offset. NTP makes smaller steps all the time, and no certificate of Fractus is valid for longer than the maximum."""
+"""Range of clock offsets. NTP often makes steps below the minimum. All certificates expire within the maximum."""
 
 _REPAIR_TIMEOUT_S = 180.0
 _FILL_INTERVAL_S = 0.2
@@ -109,7 +109,7 @@ def _api_down(target: ChaosTarget, _generator: random.Random) -> Injection:
 
 def _silent_watches(target: ChaosTarget, _generator: random.Random) -> Injection:
     with api_server_faults.responses_dropped(target.control_plane) as count:
-        yield f"{count} connections to the API server are silent"
+        yield f"{count} connections to the API server receive no responses"
 
 
 def _slow_api(target: ChaosTarget, _generator: random.Random) -> Injection:
@@ -215,7 +215,7 @@ def _remove_label(target: ChaosTarget, generator: random.Random) -> Injection:
 
 
 def _fill_disk(target: ChaosTarget, _generator: random.Random) -> Injection:
-    """Fill the disk of the drone's node, including space that is freed during the fault."""
+    """Keep the disk of the drone's node full. Space that is freed during the fault is filled again."""
     if not target.state.is_mount():
         raise ExperimentError(f"{target.drone} has no separate disk")
     ballast = target.state / BALLAST
@@ -249,11 +249,11 @@ def _allocate_free_space(file: IO[bytes]) -> None:
 
 
 def _step_clock(target: ChaosTarget, generator: random.Random) -> Injection:
-    """Step the clock of one or all services of the drone's node, as a node with a wrong time server."""
+    """Step the clock of one or all services of the drone's node, as a wrong time server does."""
     if not clock_faults.can_step(target.state):
         raise ExperimentError(f"clocks of {target.drone} cannot be stepped")
     services = generator.choice([*((service,) for service in clock_faults.SERVICES), clock_faults.SERVICES])
-    # Logarithmic distribution: minutes are as likely as hours.
+    # The distribution is logarithmic, so that offsets of minutes are as likely as offsets of hours.
     offset_s = generator.choice((-1, 1)) * math.exp(generator.uniform(math.log(MIN_STEP_S), math.log(MAX_STEP_S)))
     try:
         clock_faults.set_offset(target.state, services, offset_s)
@@ -269,10 +269,10 @@ def _select_node(target: ChaosTarget, generator: random.Random) -> str:
 
 
 def _retry(action: Callable[[], object], timeout_s: float = _REPAIR_TIMEOUT_S) -> None:
-    """Retry an action while the API server rejects it or is unavailable, because another fault may be active.
+    """Repeat an action until it succeeds, because another fault may affect the API server at the same time.
 
     Raises:
-        ExperimentError: The action failed until the timeout.
+        ExperimentError: The action did not succeed before the timeout.
     """
     deadline = time.monotonic() + timeout_s
     while True:

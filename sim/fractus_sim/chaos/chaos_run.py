@@ -27,10 +27,10 @@ from fractus_sim.testbeds.embedded_cluster import TRAFFIC_EXAMPLE, read_objects
 from fractus_sim.testbeds.kube_commands import NAMESPACE, Object
 
 FIRST_FAULT_S = 10.0
-"""Time of the first fault. The first mission is being deployed then."""
+"""Time of the first fault. At this time, the first mission is being deployed."""
 
 MAX_FAULT_SHARE = 1 / 3
-"""Maximum share of the run that a fault lasts."""
+"""Maximum duration of a fault, as a share of the run."""
 
 MAX_OVERLAP_S = 10.0
 MAX_PAUSE_S = 25.0
@@ -103,7 +103,8 @@ def execute_run(target: ChaosTarget, watch: VehicleWatch, config: RunConfig, rep
     missions = Missions(target, f"chaos-{config.seed}", run.record)
     # Each fault has its own generator, so that its random values do not depend on the timing of the other faults.
     generators = [random.Random(f"{config.seed}/{number}") for number in range(len(planned))]  # noqa: S311 - repeatable
-    # Daemon threads, because an interrupted run must not wait for faults. Its cluster is removed anyway.
+    # The threads are daemons, so that an interrupted run does not wait for the repair of faults. The run removes its
+    # cluster anyway.
     threads = [
         threading.Thread(target=_inject_planned_fault, args=(target, fault, generator, run), daemon=True)
         for fault, generator in zip(planned, generators, strict=True)
@@ -143,7 +144,7 @@ class PlannedFault:
 def create_schedule(
     seed: int, fault_time_s: float, durations: Mapping[str, tuple[float, float]]
 ) -> tuple[PlannedFault, ...]:
-    """Return the faults of a run: all types in random order, repeated, with pauses or overlaps.
+    """Return the faults of a run: repeatedly all types in random order, with pauses or overlaps.
 
     A fault type never overlaps itself, and all faults end before the run.
 
@@ -187,7 +188,7 @@ def _inject_planned_fault(target: ChaosTarget, planned: PlannedFault, generator:
         result = "not repaired" if injected else "not injected"
         run.record(f"{planned.kind}: {result}: {str(error)[-_MAX_ERROR_LENGTH:]}")
         if injected:
-            run.violations.append(Violation("all recovers", time.time(), f"{planned.kind} was not repaired: {error}"))
+            run.violations.append(Violation("recovery", time.time(), f"{planned.kind} was not repaired: {error}"))
     else:
         if planned.duration_s:
             run.record(f"{planned.kind}: repaired")
@@ -197,7 +198,7 @@ def _inject_planned_fault(target: ChaosTarget, planned: PlannedFault, generator:
 
 
 def short_mission(name: str, namespace: str = NAMESPACE) -> Object:
-    """Return the Navigator of the example on a short path near the depot, about one minute of flight."""
+    """Return an Application with only the Navigator of the example, which flies near the depot for about a minute."""
     application = read_objects(TRAFFIC_EXAMPLE / "application.yaml")[0]
     navigator = next(part for part in application["spec"]["components"] if part["name"] == "Navigator")
     navigator["controlPoints"][0]["path"] = [
@@ -213,11 +214,11 @@ def short_mission(name: str, namespace: str = NAMESPACE) -> Object:
 
 @dataclass
 class Missions:
-    """Consecutive missions of one run. Two Applications at a time compete for one drone.
+    """Missions of one run, started one after another. Two Applications at a time compete for one drone.
 
     Attributes:
-        prefix: Prefix of their names.
-        report: Called when a mission enters another phase.
+        prefix: Prefix of the names of the Applications.
+        report: Called with a text when the phase of a mission changes.
         ended: Phase and message of completed missions by name.
         active: Phase and message of active missions by name.
     """
@@ -230,7 +231,7 @@ class Missions:
     _count: int = 0
 
     def step(self, *, start_new: bool) -> None:
-        """Update the missions, delete ended ones and apply new ones. Errors of the API server are ignored."""
+        """Update the missions, delete ended missions, and apply new missions. Errors of the API server are ignored."""
         with suppress(ExperimentError):
             self._update()
             while start_new and len(self.active) < CONCURRENT_MISSIONS:
@@ -244,7 +245,7 @@ class Missions:
             time.sleep(_STEP_S)
 
     def orphans(self) -> list[Object]:
-        """Return Applications in deletion, and remaining objects and stored Grants of deleted Applications.
+        """Return Applications that are being deleted, and objects and stored Grants of deleted Applications.
 
         Raises:
             ExperimentError: The API server did not respond.
@@ -268,7 +269,7 @@ class Missions:
         grants = []
         for node in self.target.cluster.nodes:
             for path in (node.fractus_state / "grants").glob("*.json"):
-                # The agent may remove a file meanwhile.
+                # The agent may remove a file during this loop.
                 with suppress(FileNotFoundError):
                     grants.append(json.loads(path.read_bytes()))
         return grants
@@ -308,7 +309,10 @@ def _application_name(body: Object) -> str:
 
 
 def _wait_recovered(target: ChaosTarget, missions: Missions) -> list[Violation]:
-    """Wait until deleted objects are gone and all nodes are ready. Return violations for what is not restored after the timeouts."""
+    """Delete all Applications, and wait until their objects are removed and all nodes are ready.
+
+    Return a violation for each of these conditions that is not true after its timeout.
+    """
 
     def applications_deleted() -> bool:
         target.kubectl("delete", "applications.fractus.dev", "--all", "-n", NAMESPACE, "--wait=false")
@@ -323,8 +327,8 @@ def _wait_recovered(target: ChaosTarget, missions: Missions) -> list[Violation]:
         ("every edge node is Ready", "edgenodes.fractus.dev"),
     ):
         if not _wait_until(partial(_all_ready, target, kind), RECOVERY_TIMEOUT_S):
-            text = f"after {RECOVERY_TIMEOUT_S:.0f} s not true: {description}"
-            violations.append(Violation("all recovers", 0.0, text))
+            text = f"not true after {RECOVERY_TIMEOUT_S:.0f} s: {description}"
+            violations.append(Violation("recovery", 0.0, text))
     return violations
 
 

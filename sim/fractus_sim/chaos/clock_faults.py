@@ -13,7 +13,7 @@ SERVICES = ("agent", "mobility", "camera")
 _FOLDER = "chaos"
 _SOURCE = Path(__file__).with_name("clock.c")
 _POD_FOLDER = Path("/var/lib/fractus") / _FOLDER
-"""Path of the library in pods of agents and services."""
+"""Folder of the library and the offset files in pods of agents and services."""
 
 
 def chart_values() -> list[str]:
@@ -27,7 +27,12 @@ def chart_values() -> list[str]:
 
 
 def library_environment(folder: Path, service: str) -> dict[str, str]:
-    """Return the environment of a process that loads the library from a folder with the clock of a service."""
+    """Return the environment of a process that loads the library and uses the clock offset of a service.
+
+    Args:
+        folder: Folder of the library and the offset files.
+        service: Name of the service.
+    """
     return {"LD_PRELOAD": str(folder / "clock.so"), "CLOCK_OFFSET": str(_offset_file(folder, service))}
 
 

@@ -18,13 +18,13 @@ from fractus_core.policy.engine import judge
 Entry = Mapping[str, Any]
 
 AUTHORITY_GAP_S = 12.0
-"""The autopilot's failsafe acts after five seconds without messages. The margin is for a busy machine."""
+"""Maximum time in the air without an authority. The failsafe acts after 5 s. The rest is margin for a busy machine."""
 
 FAILSAFE_MODES = frozenset({"RTL", "SMART_RTL", "LAND", "BRAKE"})
 """Modes in which the autopilot itself lands the drone or returns it."""
 
 MAX_CORRECTION_M = 1.0
-"""Altitude corrections below this are accepted, because the situation of the original decision is not known exactly."""
+"""Maximum altitude correction in a repeated evaluation. Not all inputs of the original decision are known exactly."""
 
 MAX_LANDING_ERROR_M = 8.0
 METRES_PER_DEGREE = 111_195
@@ -56,7 +56,7 @@ def entry_time_s(entry: Entry) -> float:
 
 
 def with_corrected_times(entries: Iterable[Entry], boot_time_s: float) -> Iterator[Entry]:
-    """Yield entries with corrected times, independent of clock steps of their service.
+    """Yield entries with times that are computed from the boot time. Clock steps of the service do not affect them.
 
     Args:
         entries: Entries of an audit log.
@@ -67,10 +67,10 @@ def with_corrected_times(entries: Iterable[Entry], boot_time_s: float) -> Iterat
 
 
 def flights_without_authority(samples: Sequence[TelemetrySample], entries: Iterable[Entry]) -> list[Violation]:
-    """Return the times in the air without a control authority.
+    """Return a violation for each time in the air without a control authority.
 
-    The authority is the controller in the audit log if an entry names it every few seconds, or the autopilot once its
-    failsafe returns or lands the drone.
+    The control authority is the controller that an audit log entry names every few seconds. Without such an entry, it
+    is the autopilot if its failsafe returns or lands the drone.
     """
     named_s: list[float] = []
     violations: list[Violation] = []
@@ -95,7 +95,7 @@ def flights_without_authority(samples: Sequence[TelemetrySample], entries: Itera
 
 
 def flights_of_several_applications(entries: Iterable[Entry], grants: Mapping[str, GrantSpec]) -> list[Violation]:
-    """Return the times in the air when drivers of several applications had Grants for the drone.
+    """Return a violation for each entry in the air at which drivers of several applications had Grants for the drone.
 
     Args:
         entries: Entries of the audit log of the mobility service.
@@ -116,7 +116,7 @@ def flights_of_several_applications(entries: Iterable[Entry], grants: Mapping[st
 
 
 def _update_active_grants(active: dict[str, str], entry: Entry) -> None:
-    """Update the identities of active Grants by key."""
+    """Apply an audit log entry to the active Grants (identities by key)."""
     match entry:
         case {"kind": "started"}:
             active.clear()
@@ -129,13 +129,13 @@ def _update_active_grants(active: dict[str, str], entry: Entry) -> None:
 def forbidden_calls(entries: Iterable[Entry], grants: Mapping[str, GrantSpec], home: Home | None) -> list[Violation]:
     """Return the permitted calls that no Grant of the caller allows.
 
-    Each call is evaluated again for a drone at rest with an exact position, the situation in which policies are least
-    restrictive.
+    Each call is evaluated again for a drone at rest with an exact position. Policies are least restrictive in this
+    case.
 
     Args:
         entries: Entries of the audit log of a service.
         grants: All Grants that were on the node, by key.
-        home: Home of the drone. None on a node without drone.
+        home: Home of the drone. None for a node without a drone.
     """
     violations: list[Violation] = []
     active: dict[str, str] = {}
@@ -165,8 +165,8 @@ def forbidden_calls(entries: Iterable[Entry], grants: Mapping[str, GrantSpec], h
 def _refusal(entry: Entry, grant: CompiledGrant, home: Home | None) -> str:
     """Return the reason why a permitted call should have been denied, or an empty string.
 
-    The log does not contain all inputs of the decision on calls other than Goto. For these, check only that the Grant
-    includes the method.
+    Only Goto calls are evaluated again, because the log does not contain all inputs for other calls. For other calls,
+    check only that the Grant includes the method.
     """
     method = str(entry.get("method"))
     if method not in grant.methods:
@@ -187,7 +187,11 @@ def _refusal(entry: Entry, grant: CompiledGrant, home: Home | None) -> str:
 
 
 def unfinished_missions(missions: Mapping[str, tuple[str, str]]) -> list[Violation]:
-    """Return missions that are neither Completed nor Failed with a message. Values are phase and message by name."""
+    """Return missions that are neither Completed nor Failed with a message.
+
+    Args:
+        missions: Phase and message by name.
+    """
     return [
         Violation("missions end", 0.0, f"{name} is {phase or 'missing'}: {message or 'no message'}")
         for name, (phase, message) in missions.items()
@@ -196,7 +200,7 @@ def unfinished_missions(missions: Mapping[str, tuple[str, str]]) -> list[Violati
 
 
 def landings_away_from_home(samples: Sequence[TelemetrySample], home: Home) -> list[Violation]:
-    """Return landings away from home, and a drone that is in the air at the end."""
+    """Return a violation for each landing away from home, and one if the drone is in the air at the end."""
     violations: list[Violation] = []
     for before, after in itertools.pairwise(samples):
         if before.flying and not after.flying:
@@ -211,7 +215,7 @@ def landings_away_from_home(samples: Sequence[TelemetrySample], home: Home) -> l
 
 
 def orphans(objects: Iterable[Mapping[str, Any]]) -> list[Violation]:
-    """Return objects that remain of deleted applications."""
+    """Return a violation that lists objects without an application, if there are any."""
     names = sorted(map(_describe, objects))
     return [Violation("no orphans", 0.0, f"remaining objects: {', '.join(names)}")] if names else []
 

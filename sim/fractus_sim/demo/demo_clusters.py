@@ -24,11 +24,11 @@ DEMO_CHART = "fractus-demo"
 
 @dataclass
 class CurrentCluster:
-    """The cluster of KUBECONFIG with loaded images. Its nodes are assigned to the nodes of the example.
+    """The user's cluster from KUBECONFIG. Its nodes are used as the nodes of the example.
 
     Attributes:
         report: Called with progress lines.
-        assignments: Nodes selected by the user, by the name of the example's node.
+        assignments: Nodes selected by the user, by the name of the node in the example.
     """
 
     report: Callable[[str], None]

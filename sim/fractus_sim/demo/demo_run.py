@@ -39,7 +39,7 @@ LANDING_TIMEOUT_S = 180.0
 _STOP_TIMEOUT_S = 10.0
 LOGS = "components.log"
 _CHART_VALUES = {"fractus": ("camera.recordings.enabled=true",)}
-"""Chart values on a cluster of the demo. Recordings are needed because components delete their pictures."""
+"""Chart values for an embedded cluster. The report takes its pictures from recordings."""
 
 
 class ConsoleProgress:
@@ -141,10 +141,10 @@ class Demo:
             installed.extend(self.cluster.create_environment(kube))
         else:
             if "fractus" not in installed:
-                # An image with the same name may have new content. Only new pods use it.
+                # The images may have new content under the same names. Restart all pods, so that they use it.
                 selector = ["-l", "app.kubernetes.io/name=fractus"]
                 kube.run("delete", "pods", "-n", SYSTEM, *selector, "--timeout=60s", timeout_s=90)
-            # Vehicles are part of the nodes of the embedded cluster, and agents register them.
+            # Drones are not applied here: the agents register the vehicles of the embedded cluster.
             kube.apply(traffic_example_objects())
         wait_for_drone(kube, READY_TIMEOUT_S, self.progress.show)
 

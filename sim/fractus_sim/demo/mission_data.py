@@ -31,7 +31,7 @@ _STORED_PICTURE = re.compile(rb"\[pod/[^/]+/data-store\] .* stored ")
 _KINDS = "applications,deploymentplans,depots,drones,edgenodes,policies,zones"
 _FETCH_ATTEMPTS = 5
 _PICTURE_SHARES = (0.25, 0.5, 0.75)
-"""Times of the selected pictures as shares of the flight."""
+"""Times of the selected pictures in the report, as shares of the flight time."""
 
 
 def collect_mission_data(kube: Kube, mission: Mission, folder: Path, logs: Path) -> None:
@@ -63,7 +63,7 @@ def collect_mission_data(kube: Kube, mission: Mission, folder: Path, logs: Path)
 
 
 def _belongs_to(body: Object, application: str) -> bool:
-    """Return True for the Application, its plan, and objects that do not belong to an application."""
+    """Return True for the mission's Application and its plan, and for objects that belong to no application."""
     if body["kind"] not in {"Application", "DeploymentPlan"}:
         return True
     metadata = body["metadata"]
@@ -90,7 +90,7 @@ def _fetch_audit_logs(kube: Kube, mission: Mission, folder: Path) -> dict[str, A
 def fetch_audit_logs(kube: Kube, pod: str, folder: Path) -> None:
     """Copy the audit logs of a node's services with all segments.
 
-    The files are listed again after the copy, because a log may have started a new segment meanwhile.
+    A log may start a new segment during the copy. The copy is therefore repeated until the list of files is unchanged.
 
     Raises:
         ExperimentError: The logs cannot be read.
@@ -115,8 +115,8 @@ def _audit_files(kube: Kube, pod: str) -> list[str]:
 def fetch_recordings(kube: Kube, drone: str, since_s: float, folder: Path) -> list[Path]:
     """Copy the recordings that the services of a drone wrote since a time (Unix seconds).
 
-    A recording can begin before the mission, because recordings include the seconds before arming. The result is empty
-    if the services do not record.
+    A recording can begin before this time, because it includes the seconds before arming. The result is empty if the
+    services do not record.
 
     Raises:
         ExperimentError: The recordings cannot be read.
@@ -137,7 +137,7 @@ def fetch_recordings(kube: Kube, drone: str, since_s: float, folder: Path) -> li
 def extract_pictures(recordings: Iterable[Path], record: FlightRecord, folder: Path) -> None:
     """Extract a few in-flight pictures, after privacy filters, from the recordings of the camera service.
 
-    The image stores cannot be used because components delete their pictures after retrieval.
+    The image store of the camera service is not used, because components delete their pictures after retrieval.
     """
     if record.track.takeoff_s is None:
         return
@@ -149,8 +149,8 @@ def extract_pictures(recordings: Iterable[Path], record: FlightRecord, folder: P
 
 
 def _pictures(recording: Path) -> Iterator[tuple[str, bytes]]:
-    """Yield names (by capture time) and contents of pictures. Stop at the end of an incomplete recording."""
-    # A damaged recording must not prevent the report.
+    """Yield names and contents of pictures. The names contain the capture time. Stop where a recording is damaged."""
+    # The report must also be written if a recording is damaged.
     with recording.open("rb") as file, contextlib.suppress(McapError, KeyError, RuntimeError, ValueError):
         for schema, _, message in NonSeekingReader(file).iter_messages(log_time_order=False):
             if schema is not None and schema.name == "foxglove.CompressedImage":
@@ -160,7 +160,7 @@ def _pictures(recording: Path) -> Iterator[tuple[str, bytes]]:
 
 
 def select_pictures(names: list[str], begin_s: float, end_s: float) -> list[str]:
-    """Return the pictures closest to a quarter, half and three quarters of a time span, oldest first."""
+    """Return the names of the pictures nearest to 25, 50 and 75 % of a time span, oldest first."""
     times = {name: picture_time_s(name) for name in names}
     in_span = [name for name in names if begin_s <= times[name] <= end_s]
     if not in_span:

@@ -61,9 +61,11 @@ class ModeReached(VehicleCheck):
     check: Literal["mode"]
     mode: ModeName
     after: Name | Literal["gpsLoss", "linkLoss", "nodePowerOff", "batteryDrop", "motorFailure", "windGust"] | None = (
-        Field(default=None, description="Consider only the time after the first fault of this kind began.")
+        Field(default=None, description="Consider only the time after the begin of the first fault of this kind.")
     )
-    within: Seconds | None = Field(default=None, description="Seconds after that fault, or after the start.")
+    within: Seconds | None = Field(
+        default=None, description="Maximum seconds after the begin of this fault. Without `after`: after the start."
+    )
 
 
 class StatusText(VehicleCheck):

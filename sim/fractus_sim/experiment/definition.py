@@ -53,7 +53,7 @@ class CameraWorld(Model):
 class VehicleEntry(Model):
     """A vehicle, or a row of identical vehicles."""
 
-    name: Name = Field(description="If `count` is above 1, -1, -2, ... is appended.")
+    name: Name = Field(description="Name of the vehicle. If `count` is above 1, the names are NAME-1, NAME-2, ...")
     count: int = Field(default=1, ge=1, le=MAX_VEHICLES)
     spacing: float = Field(default=10, gt=0, le=1000, description="Metres between the vehicles of a row.")
     bearing: float = Field(default=90, ge=0, lt=360, description="Direction in which the row extends, degrees.")
@@ -80,14 +80,14 @@ class VehicleEntry(Model):
         return self
 
     def names(self) -> tuple[str, ...]:
-        """Return the names of the vehicles of this entry."""
+        """Return the name of each vehicle of this entry."""
         if self.count == 1:
             return (self.name,)
         return tuple(f"{self.name}-{number}" for number in range(1, self.count + 1))
 
 
 class NamedZone(Model):
-    """An airspace volume that checks and figures refer to."""
+    """An airspace volume that checks use and figures show."""
 
     name: Name
     kind: Literal["exclusion", "inclusion", "other"] = "other"
@@ -158,7 +158,9 @@ class Experiment(Model):
         " exactly repeatable.",
     )
     timeout: float = Field(default=300, gt=0, le=7200, description="Maximum duration, seconds of the experiment.")
-    settle: float = Field(default=3, ge=0, le=600, description="Seconds to continue after everything has ended.")
+    settle: float = Field(
+        default=3, ge=0, le=600, description="Seconds to continue after the last task, program and fault."
+    )
     wind: Wind = Wind()
     world: CameraWorld = CameraWorld()
     vehicles: tuple[VehicleEntry, ...] = Field(min_length=1, max_length=MAX_VEHICLES)

@@ -18,7 +18,7 @@ class AuditLog:
         path: Current segment.
         entries: Readable entries in order.
         length: Number of entries in the verified chain.
-        problem: First violation of the hash chain with its line. Empty if the log is valid.
+        problem: Description and line of the first violation of the hash chain. Empty if the log is valid.
     """
 
     path: Path

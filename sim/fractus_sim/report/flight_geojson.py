@@ -29,7 +29,7 @@ def feature_collection(features: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 
 def path_feature(track: Track, **properties: Any) -> dict[str, Any]:
-    """Return a track as a LineString Feature with the time of each point."""
+    """Return a track as a LineString Feature. A property contains the time of each point."""
     line = {"type": "LineString", "coordinates": [lonlat(s.place) for s in track.samples]}
     times = [round(s.time_s, 3) for s in track.samples]
     return feature(line, what="path", drone=track.name, times=times, **properties)

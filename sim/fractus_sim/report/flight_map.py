@@ -37,7 +37,7 @@ ZoneKind = Literal["exclusion", "denial", "camera", "inclusion", "limit", "other
 
 @dataclass(frozen=True, slots=True)
 class DrawnZone:
-    """A zone. `shape` is a shapely geometry in metres of the map's frame."""
+    """A zone on a map. `shape` is a shapely geometry in metres, in the frame of the map."""
 
     name: str
     kind: ZoneKind
@@ -60,9 +60,9 @@ class Mark:
 
     Attributes:
         kind: Drawing style.
-        number: Number or letter in the page.
-        position: Position in the map's frame.
-        origin: Position of the drone, if `position` is a position that was denied.
+        number: Number or letter of the event on the report page.
+        position: Position of the event in the frame of the map.
+        origin: Position of the drone, if `position` is a denied target.
         label: Legend text. Default: the kind.
     """
 
@@ -80,7 +80,7 @@ class FlightMap:
     Attributes:
         area: Shape of the operation area.
         depots: Names and positions.
-        links: Position of the drone when its traffic moved to a direct link, and position of the node.
+        links: For each direct link, the positions of the drone when it began to use the link, and of the node.
     """
 
     title: str

@@ -27,7 +27,7 @@ _NAMED_TRACKS = 10
 _HEADROOM = 1.18
 _ROW_POINTS = 12
 _CHARACTER_SHARE = 0.0085
-"""Width of a letter of a fault label, as a share of the axis."""
+"""Width of a letter in the label of a fault, as a share of the axis."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +41,7 @@ class Limit:
 
 @dataclass(frozen=True, slots=True)
 class Span:
-    """A shaded time span. Faults are drawn in the colour of fault marks, with their label above the figure."""
+    """A shaded time span. The span of a fault has the colour of fault marks, and its label is above the figure."""
 
     begin_s: float
     end_s: float
@@ -54,10 +54,10 @@ class Request:
     """A request that policies changed.
 
     Attributes:
-        number: Number in the page.
+        number: Number of the call on the report page.
         altitude_m: Requested altitude.
         label: Legend text.
-        flown_m: Altitude that was flown instead. None if it is equal, or if the request was refused.
+        flown_m: Altitude that was flown instead. None if it equals `altitude_m`, or if the request was refused.
     """
 
     kind: Literal["refused", "corrected"]
@@ -165,7 +165,7 @@ def _draw_requests(axes: Any, profile: Profile) -> list[float]:
 
 
 def _label_rows(profile: Profile) -> list[tuple[Span, int]]:
-    """Return spans with the row of their label, so that labels of neighbours do not overlap."""
+    """Return each span with the row of its label. Labels that would overlap are in different rows."""
     first, last = _time_span(profile)
     ends: list[float] = []
     placed = []

@@ -24,7 +24,7 @@ PICTURES = "pictures"
 _CHANGING_ACTIONS = frozenset({"correct", "deny", "takeover"})
 _FLIGHT_MARGIN_S = 3.0
 _MERGE_S = 60.0
-"""Maximum time between identical calls that are listed as one."""
+"""Maximum time between identical calls that are merged into one."""
 
 _KINDS: tuple[type[Resource], ...] = (Application, DeploymentPlan, Depot, Drone, EdgeNode, Policy, Zone)
 
@@ -36,13 +36,13 @@ class JudgedCall:
     Attributes:
         time_s: Time of the call, seconds. The clock depends on the report.
         caller: Component, or the system.
-        method: Service method. For an action of the system, the action.
+        method: Service method, or the name of the system's action.
         action: allow, correct, deny, or takeover (denied, and control revoked). Empty for an action of the system.
         requested: Requested position, for calls that fly to a position.
         flown: Position that was flown.
         position: Position of the drone.
         arguments: Requested arguments as text.
-        count: Number of identical calls that this one stands for.
+        count: Number of identical calls that are merged into this one.
     """
 
     time_s: float
@@ -94,7 +94,7 @@ class FlightRecord:
         decisions: Calls that policies changed, in order.
         calls: Number of calls of components.
         results: Number of pictures that were checked and kept.
-        audit: Numbers of audit log entries, and the problem of the hash chain.
+        audit: Numbers of audit log entries, and the violation of the hash chain if there is one.
         times: Unix seconds of events of the mission.
         pictures: File names of pictures.
     """
@@ -197,7 +197,10 @@ class FlightRecord:
 
 
 def is_of_mission(entry: Mapping[str, Any], applied_s: float) -> bool:
-    """Return True if an audit log entry was made after the application was applied. Entries without time are ignored."""
+    """Return True if an audit log entry was written after the application was applied.
+
+    False for an entry without time.
+    """
     try:
         return _time_s(entry["time"]) >= applied_s
     except (ValueError, KeyError, TypeError):
@@ -214,7 +217,7 @@ def _time_s(text: str) -> float:
 
 
 def _has_state(entry: Mapping[str, Any]) -> bool:
-    """Return True if an entry contains the position of the drone: telemetry samples and landing entries."""
+    """Return True if an entry contains the position of the drone. It is then a telemetry sample or a landing entry."""
     return entry.get("kind") == "state" or (entry.get("kind") == "control" and entry.get("action") == "landed")
 
 
@@ -241,7 +244,7 @@ def _flight(samples: Iterable[Sample]) -> tuple[Sample, ...]:
 
 
 def policy_decisions(audit: Iterable[Mapping[str, Any]]) -> tuple[JudgedCall, ...]:
-    """Return the calls that policies changed, in order. Repetitions within a short time are merged.
+    """Return the calls that policies changed, in order. Identical calls within a short time are merged.
 
     Args:
         audit: Entries of audit logs in any order.
@@ -251,7 +254,7 @@ def policy_decisions(audit: Iterable[Mapping[str, Any]]) -> tuple[JudgedCall, ..
 
 
 def _policy_decision(entry: Mapping[str, Any]) -> JudgedCall | None:
-    """Return the changed call of a call, monitor or takeover entry. Return None if nothing was changed."""
+    """Return the call of an audit log entry if policies changed the call. Return None for all other entries."""
     kind = entry.get("kind")
     action = entry.get("action")
     if kind not in {"call", "monitor", "takeover"}:
@@ -276,13 +279,13 @@ def _policy_decision(entry: Mapping[str, Any]) -> JudgedCall | None:
 
 
 def component_name(identity: str) -> str:
-    """Return the component of an instance's identity, or the identity if it has a different format."""
+    """Return the component name in the identity of an instance. Return the whole identity if it has no such name."""
     parts = identity.split("/")
     return parts[parts.index("component") + 1] if "component" in parts[:-1] else identity
 
 
 def _place(value: Mapping[str, Any] | None, base: Place | None) -> Place | None:
-    """Return the position of a mapping. Missing coordinates are replaced by the position of the drone."""
+    """Return the position in a mapping. Missing coordinates are taken from `base`, the position of the drone."""
     value = value or {}
     lat = value.get("lat")
     lon = value.get("lon")
@@ -312,7 +315,10 @@ def _format_arguments(args: Mapping[str, Any]) -> str:
 
 
 def _merged(calls: Iterable[JudgedCall]) -> tuple[JudgedCall, ...]:
-    """Merge identical calls of a component with the same verdict within one minute, also if they are interleaved."""
+    """Merge identical calls of a component with the same verdict within one minute.
+
+    Other calls may lie between them.
+    """
     merged: list[JudgedCall] = []
     last: dict[tuple[str, ...], tuple[int, float]] = {}
     for call in calls:

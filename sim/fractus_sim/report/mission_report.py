@@ -100,7 +100,7 @@ def _times_section(record: FlightRecord) -> str:
 
 
 def decisions_section(decisions: Sequence[JudgedCall], format_time: Callable[[float], str]) -> str:
-    """Return the section about calls that policies changed.
+    """Return the section with the calls that policies changed.
 
     Args:
         decisions: Changed calls in the order of their numbers in the figures.
@@ -357,7 +357,7 @@ def _operation_area(record: FlightRecord) -> Any:
 
 
 def _restricted_zones(record: FlightRecord) -> Iterable[DrawnZone]:
-    """Yield each zone with the strictest policy that applies to this drone in it."""
+    """Yield each zone, with the kind of the strictest policy that applies to this drone in the zone."""
     for zone in record.zones:
         kinds = {_zone_kind(p) for p in record.policies_in_force if zone.name in p.spec.selector.zones}
         strictest = next((kind for kind in _STRICTEST_FIRST if kind in kinds), None)

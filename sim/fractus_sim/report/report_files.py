@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    # matplotlib takes a second to import. Commands that draw nothing do not need it.
+    # The import of matplotlib takes a second, which commands without figures save.
     from matplotlib.figure import Figure
 
 PAGE = "summary.md"
@@ -24,7 +24,7 @@ class Expectation:
         text: Description.
         holds: True if the expectation holds.
         observed: Observed value.
-        run: Run that the expectation is about. Empty if the scenario has a single run.
+        run: Name of the run to which the expectation applies. Empty if the scenario has only one run.
     """
 
     text: str
@@ -47,8 +47,8 @@ def write_report(
 ) -> None:
     """Write the files of a report.
 
-    Results are written first so that a failure to draw a figure does not lose them. The page is written last because it
-    links all other files.
+    The results are written first, so that they exist even if a figure cannot be drawn. The page is written last,
+    because it links to all other files.
 
     Args:
         folder: Output folder.
@@ -67,18 +67,18 @@ def write_report(
 
 
 def save_figure(figure: Figure, path: Path) -> None:
-    """Write a PNG without dates and versions, so that the same flight gives the same bytes."""
+    """Write a PNG without dates and versions. The same flight always gives an identical file."""
     figure.savefig(path, metadata={"Software": None})
 
 
 def remove_report(folder: Path, *names: str) -> None:
-    """Remove the page and other files of an earlier run, so that an aborted run does not show an outdated report."""
+    """Remove the page and other files of an earlier run. Otherwise an aborted run would leave an outdated report."""
     for name in (PAGE, *names):
         (folder / name).unlink(missing_ok=True)
 
 
 def write_page(folder: Path, text: str) -> None:
-    """Write the page atomically, as the last file of a report. If the page exists, the report is complete."""
+    """Write the page atomically. It is the last file of a report, so the report is complete if the page exists."""
     scratch = folder / f".{PAGE}"
     try:
         scratch.write_text(text)
@@ -95,7 +95,7 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 def expectations_headline(expectations: Sequence[Expectation]) -> str:
-    """Return a sentence about how many expectations hold."""
+    """Return a sentence with the number of expectations that hold."""
     failed = sum(not expectation.holds for expectation in expectations)
     if failed:
         return f"{failed} of {len(expectations)} expectations do NOT hold."

@@ -23,7 +23,7 @@ from fractus_sim.testbeds.detections import score_detections
 from fractus_sim.testbeds.testbed import Findings
 
 MATCH_S = 0.2
-"""Maximum time between samples of two vehicles that count as simultaneous."""
+"""Maximum difference of the times of two samples that count as simultaneous."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ _SHOWN_IF_ZERO = ("north", "east", "alt", "exitCode")
 
 
 def evaluate_check(check: checks.Check, evidence: Evidence) -> tuple[Verdict, ...]:
-    """Evaluate one check. Return one verdict per vehicle, or a single verdict."""
+    """Evaluate one check. Return one verdict per vehicle, or a single verdict for a check of the whole experiment."""
     if isinstance(check, checks.VehicleCheck) and not isinstance(check, checks.Separation):
         names = check.vehicles or tuple(evidence.flights)
         return tuple(
@@ -249,7 +249,7 @@ def _separation(check: checks.Separation, evidence: Evidence) -> tuple[bool, str
 
 
 def _simultaneous_samples(ones: Sequence[Sample], others: Sequence[Sample]) -> Iterable[tuple[Sample, Sample]]:
-    """Yield pairs of samples at the same time while both vehicles are in the air."""
+    """Yield pairs of simultaneous samples of two vehicles that are both in the air."""
     index = 0
     for one in ones:
         while index < len(others) - 1 and others[index].time_s < one.time_s - MATCH_S / 2:

@@ -30,7 +30,7 @@ LANDED_TIMEOUT_S = 5.0
 SHOW_INTERVAL_S = 0.2
 MAX_SHOWN_VEHICLES = 4
 _SET_UP_OFFSET_S = 1e6
-"""Experiment time is negative during the set-up, so that it always increases."""
+"""Offset that makes experiment time negative during the set-up. The time then increases when the experiment begins."""
 
 
 @dataclass
@@ -113,7 +113,7 @@ class _Session:
         self.report(name, f"task aborted: {reason}")
 
     def over(self) -> bool:
-        """Return True if everything has ended and the settle time has passed."""
+        """Return True if all flights, tasks, programs and faults have ended and the settle time has passed."""
         states = [observer.state for observer in self.testbed.observers.values()]
         required = self.testbed.required_flights
         tasks_running = any(not self.flights[name].task for name in self.tasks)
@@ -158,7 +158,10 @@ def run(experiment: Experiment, out: Path, *, base: Path | None = None, progress
 
 
 def _create_testbed(experiment: Experiment, out: Path, base: Path, progress: Progress) -> Testbed:
-    """Return the testbed of the experiment's mode. Only the modules of this mode are imported, because many are slow."""
+    """Return the testbed for the mode of the experiment.
+
+    Modules of other modes are not imported, because this is slow.
+    """
     testbed: Callable[[Experiment, Path, Path, Callable[[str], None]], Testbed] = VehicleTestbed
     if experiment.mode == "standalone":
         from fractus_sim.testbeds.standalone_testbed import StandaloneTestbed  # noqa: PLC0415
@@ -193,7 +196,7 @@ def _run_session(session: _Session) -> str:
         problem = str(error)
         session.report("", problem)
     for vehicle, title in session.injector.missed:
-        session.report(vehicle, f"{title}: not injected, the experiment ended before")
+        session.report(vehicle, f"{title}: not injected, because the experiment ended earlier")
     testbed.collect()
     return problem
 
@@ -217,7 +220,7 @@ def _wait_ready(session: _Session) -> None:
 
 
 def _run_until_over(session: _Session) -> str:
-    """Run tasks and faults until the experiment is over. Return the reason if it did not complete in time."""
+    """Run tasks and faults until the experiment is over. Return an error message if it did not complete in time."""
     shown_s = 0.0
     while session.now_s < session.experiment.timeout:
         session.poll()

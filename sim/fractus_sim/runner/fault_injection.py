@@ -32,7 +32,7 @@ class Occurrence:
 
 @dataclass(slots=True)
 class _InjectedFault:
-    """A fault for one vehicle. `index` is its number in the occurrences once it has begun."""
+    """A fault for one vehicle. `index` is its index in the occurrences. It is None until the fault has begun."""
 
     fault: Fault
     vehicle: str
@@ -46,7 +46,7 @@ class FaultInjector:
 
     Args:
         faults: Faults of the experiment file.
-        testbed: Provides links and power to cut, and observers that no fault disconnects.
+        testbed: Testbed whose links and power the faults cut. Its observers stay connected during all faults.
         report: Called with the vehicle (empty for a node without a vehicle) and a text when a fault begins or ends.
 
     Attributes:
@@ -79,7 +79,7 @@ class FaultInjector:
 
     @property
     def active(self) -> bool:
-        """True while a fault has begun and not ended."""
+        """True if any fault has begun and not ended yet."""
         return any(not running.over and running.index is not None for running in self._faults)
 
     @property
@@ -88,7 +88,10 @@ class FaultInjector:
         return [(running.vehicle, running.fault.title) for running in self._faults if running.index is None]
 
     def _targets(self, fault: Fault) -> Sequence[str]:
-        """Return the vehicles of a fault, or an empty name for a fault of a node without a vehicle."""
+        """Return the names of the vehicles of a fault.
+
+        The name is empty for the power fault of a node without a vehicle.
+        """
         if isinstance(fault, NodePowerOff) and fault.node is not None:
             return [""]
         return fault.vehicles or tuple(self._observers)
@@ -99,7 +102,7 @@ class FaultInjector:
         return running
 
     def _begin_s(self, running: _InjectedFault) -> float | None:
-        """Return the time when a fault begins, or None before the takeoff that it depends on."""
+        """Return the time when a fault begins. Return None until the takeoff if the time is relative to it."""
         if running.fault.since == "start":
             return running.fault.at
         takeoffs = self.takeoffs_s
@@ -107,7 +110,7 @@ class FaultInjector:
         return None if takeoff_s is None else takeoff_s + running.fault.at
 
     def _inject(self, running: _InjectedFault) -> Generator[None, None, None]:
-        """Wait for the begin of a fault, inject it, and end it after its duration. Restore the changed parameters."""
+        """Wait until a fault begins, inject it, end it after its duration, and restore the changed parameters."""
         fault = running.fault
         while (begin_s := self._begin_s(running)) is None or self._now_s < begin_s:
             yield

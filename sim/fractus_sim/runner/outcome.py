@@ -15,7 +15,7 @@ from fractus_sim.testbeds.testbed import Findings
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """An event of a task or fault. Vehicle is empty if the event concerns the whole experiment."""
+    """An event of a task or fault. `vehicle` is empty for an event of the whole experiment."""
 
     time_s: float
     vehicle: str

@@ -278,7 +278,7 @@ class Load:
     """Changes applications, and measures the time until the operator has processed each change.
 
     Attributes:
-        answers_s: Seconds from each change to its plan, by kind of change. NaN if the kind needs no new plan.
+        answers_s: Seconds until each change was processed, by kind of change. NaN if the change needs no new plan.
         faults: Changes that failed or were not processed in time.
     """
 
@@ -319,7 +319,7 @@ class Load:
     def _attempt(self, slot: Slot, change: Callable[[Slot], None]) -> None:
         try:
             change(slot)
-        except Exception as error:  # a failed change is a finding and must not stop the others
+        except Exception as error:  # a failed change is recorded and must not stop later changes
             self.faults.append(f"{slot.key[1]}: {change.__name__}: {type(error).__name__}: {error}")
         finally:
             slot.busy = False
@@ -346,14 +346,14 @@ class Load:
         self._apply(slot, "limit")
 
     def label(self, slot: Slot) -> None:
-        """Change a label, which needs no new plan."""
+        """Change a label. This needs no new plan."""
         assert slot.body is not None
         slot.body["metadata"]["labels"] = {"tier": f"t{self._rng.randint(0, 10**6)}"}
         self._api.apply(slot.path, slot.body)
         self.answers_s["label"].append(math.nan)
 
     def policy(self, slot: Slot) -> None:
-        """Change the altitude limit of the site, which needs no new plan."""
+        """Change the altitude limit of the site. This needs no new plan."""
         with self._lock:
             limit = self._limits[slot.site] = 50.0 + (self._limits.get(slot.site, 60.0) - 50.0 + 1) % 30
             body = slot.site.policy(limit)

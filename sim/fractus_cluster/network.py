@@ -185,7 +185,7 @@ def unwire(cluster: str) -> None:
 
 
 def cut_link(wiring: Wiring, index: int) -> None:
-    """Take a node's uplink down at its far end, like a loss of radio contact."""
+    """Take a node's uplink down at its remote end. For the node, this looks like a loss of radio contact."""
     _ip(wiring.namespace(), f"link set {port(index)} down")
 
 
@@ -207,7 +207,7 @@ def links_cut(wiring: Wiring) -> set[int]:
 
 
 def flush_firewall(wiring: Wiring, node: str) -> None:
-    """Remove a node's firewall rules, like a loss of power."""
+    """Remove a node's firewall rules, which do not survive a loss of power."""
     run(["ip", "netns", "exec", wiring.namespace(node), "nft", "flush", "ruleset"])
 
 

@@ -19,7 +19,7 @@ CONTAINERD_SOCKET = "/run/containerd/containerd.sock"
 CONFIG = RUN / "config"
 
 SHOWN_SYSCTLS = {
-    # kubelet would set these kernel settings of the machine. It does not if it already sees the required values.
+    # kubelet sets these kernel settings unless they have the values that it requires. It must not change the machine.
     "vm.overcommit_memory": "1",
     "vm.panic_on_oom": "0",
     "kernel.panic": "10",

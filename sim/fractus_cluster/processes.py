@@ -120,7 +120,7 @@ def kill(record: ProcessRecord, *, timeout_s: float = 10.0) -> None:
         except ProcessLookupError:
             return
         try:
-            if record.alive:  # now the pidfd refers to the recorded process
+            if record.alive:  # the process still runs, so the pidfd refers to it
                 signal.pidfd_send_signal(handle, signal.SIGKILL)
         finally:
             os.close(handle)

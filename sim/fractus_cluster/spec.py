@@ -31,7 +31,7 @@ _SUFFIXES: dict[str, Decimal | int] = {
     "Ti": 2**40,
 }
 MIN_DISK_BYTES = 16 * 2**20
-"""Minimum size of a node's disk: file system overhead and some files."""
+"""Minimum size of a node's disk. It is sufficient for the file system and some files."""
 
 _DEFAULT_CONNECTION = "tcp:127.0.0.1:5760"
 
@@ -137,7 +137,7 @@ class DiskHardware(_Frozen):
 
 
 class Hardware(_Frozen):
-    """Simulated hardware of a node that keeps its power when the node is powered off."""
+    """Simulated hardware of a node. It keeps its power when the node is powered off."""
 
     vehicle: VehicleHardware | None = None
     camera: CameraHardware | None = None
@@ -150,7 +150,7 @@ class AirSpec(_Frozen):
     """Settings shared by all WiFi devices of a cluster.
 
     Attributes:
-        fading: Shape of Nakagami fading, at least 0.5. Smaller values give a softer range limit. Default: hard limit.
+        fading: Shape of Nakagami fading, at least 0.5. Smaller values blur the range limit more. Default: sharp limit.
         seed: Seed of fading.
     """
 
@@ -354,7 +354,7 @@ def parse_spec(content: object, *, source: str, documents: Documents | None = No
         return ClusterSpec.model_validate(content)
     except ValidationError as error:
         wrong = [(".".join(str(part) for part in fault["loc"]), fault["msg"]) for fault in error.errors()]
-        # pydantic reports a list with an invalid entry also as too short. Only the error of the entry is useful.
+        # For an invalid list entry, pydantic also reports that the list is too short. Omit that second error.
         real = [(place, text) for place, text in wrong if not any(other.startswith(f"{place}.") for other, _ in wrong)]
         faults = "; ".join(f"{place or 'file'}: {text.removeprefix('Value error, ')}" for place, text in real)
         where = documents.where(content, real[0][0]) if documents is not None else source

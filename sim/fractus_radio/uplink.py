@@ -12,7 +12,7 @@ QUEUE_BYTES = 128 * 1024
 
 @dataclass(slots=True)
 class Uplink:
-    """One direction of an uplink, a pure model with time as input.
+    """One direction of an uplink. It is a pure model: all times are arguments.
 
     Attributes:
         rate_bps: Bits per second.

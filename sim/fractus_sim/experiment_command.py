@@ -73,7 +73,7 @@ def schema() -> None:
 
 
 def _with_changes(definition: Experiment, **fields: float | None) -> Experiment:
-    """Return the experiment with the fields that are not None changed.
+    """Return a copy of the experiment with new values for the fields that are not None.
 
     Raises:
         InvalidObject: A changed field is invalid for this experiment.

@@ -40,9 +40,9 @@ class _Stop:
 def run(simulation: Simulation, hub: Hub, speedup: float, stop: _Stop, until_s: float | None = None) -> None:
     """Keep simulated time at `speedup` times real time (0: as fast as possible) until stopped.
 
-    Steps between two messages are not observable and waking costs more than a step. The loop therefore sleeps until a
-    message is due (at most `MAX_NAP` steps) or a message arrives, and then runs the missed steps together. A received
-    message takes effect in the step in which it arrived. The response is sent in the next step.
+    A wake-up costs more than a step, and clients cannot observe the steps between two messages. The loop therefore
+    sleeps until a message is due (at most `MAX_NAP` steps) or arrives, and then runs the missed steps together. A
+    received message takes effect in the step in which it arrived. The response is sent in the next step.
     """
     wall_0 = time.monotonic()
     time_0 = simulation.time_s
@@ -192,7 +192,7 @@ def _parameters(_context: click.Context, _option: click.Parameter, texts: tuple[
 @click.option(
     "--lockstep",
     metavar="HOST:PORT",
-    help="Let a TCP client drive time: it sends a number of 10 ms steps per line and receives the total number of steps.",
+    help="Advance time for a TCP client only. It sends the number of 10 ms steps per line, and gets the total number.",
 )
 @click.option("--duration", type=float, callback=_finite, help="Exit after this many simulated seconds.")
 def vehicle(

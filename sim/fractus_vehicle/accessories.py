@@ -33,8 +33,8 @@ SWITCHED_MODES = {
 SWITCH_LOW = 0
 SWITCH_HIGH = 2
 FENCE_SWITCH = 11
-# Commands that fail because the simulated vehicle has no camera, mount, gripper, winch, receiver pairing or running
-# calibration.
+# Commands that fail, because the simulated vehicle lacks their device or function: camera, mount, gripper, winch,
+# receiver pairing and accelerometer calibration.
 ABSENT_DEVICE = (
     mavlink.MAV_CMD_DO_GRIPPER,
     mavlink.MAV_CMD_DO_MOUNT_CONFIGURE,

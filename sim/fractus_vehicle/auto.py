@@ -22,7 +22,7 @@ CURVES = frozenset({mavlink.MAV_CMD_NAV_WAYPOINT, mavlink.MAV_CMD_NAV_SPLINE_WAY
 
 
 class AutoFlight(Flight):
-    """AUTO mode: run NAV commands in order, and the DO commands between them as soon as they are reached."""
+    """AUTO mode: run the NAV commands in order, and run the DO commands before a NAV command when it begins."""
 
     def __init__(self, set_mode: Callable[[int], bool]) -> None:
         self._set_mode = set_mode
@@ -35,7 +35,7 @@ class AutoFlight(Flight):
         self._returning: ReturnToLaunch | None = None
         self.paused = False
         self._leg: Leg | SplineLeg | None = None
-        self._track: Point = (0.0, 0.0, 0.0)  # direction of arrival of the current leg; zero if the leg stops
+        self._track: Point = (0.0, 0.0, 0.0)  # direction at the end of the current leg; zero if the vehicle stops there
         self._commands = MissionCommands()
         self._circle_centre: tuple[float, float] | None = None
         self._turned = 0.0
@@ -52,7 +52,7 @@ class AutoFlight(Flight):
         v.heading.follow_course()
 
     def _start(self, v: VehicleState) -> None:
-        """Continue at the current item, or restart the mission."""
+        """Start the mission at its current item, or at its beginning."""
         self._started = True
         mission = v.mission
         if mission.complete or int(v.params["MIS_RESTART"]) == 1 or mission.current == 0:
@@ -62,15 +62,15 @@ class AutoFlight(Flight):
             self._start_from(v, mission.current)
 
     def wait(self, v: VehicleState) -> None:
-        """Announce the item that the mission will start with, while the motors are off."""
+        """Report the first item of the mission in a STATUSTEXT while the motors are off."""
         if not self._announced and v.origin is not None:
             self._announced = True
             self._announce(v)
 
     def start_by_command(self, v: VehicleState) -> None:
-        """Handle MISSION_START: announce the first item if the mission is not running yet.
+        """Handle MISSION_START: report the first item in a STATUSTEXT if the mission is not running yet.
 
-        The first step announces the item again when it starts the mission.
+        `step` reports the item again when it starts the mission.
         """
         if not self._started and not self._announced:
             self._announce(v)
@@ -98,7 +98,7 @@ class AutoFlight(Flight):
         self._start_from(v, index)
 
     def _start_from(self, v: VehicleState, index: int | None) -> None:
-        """Begin the next NAV command. Run the DO and CONDITION commands before it during its flight."""
+        """Begin the next NAV command from `index` on. The DO and CONDITION commands before it run while it is flown."""
         waiting: list[int] = []
         for _ in range(len(v.mission.items) + 1):
             if index is None or index >= len(v.mission.items):
@@ -166,7 +166,10 @@ class AutoFlight(Flight):
                 self._leg = Leg(v, north, east, down)
 
     def _following(self, v: VehicleState, item: Item) -> Item | None:
-        """Return the next waypoint if it follows without a stop and is a CURVES command, otherwise None."""
+        """Return the next NAV item if the vehicle flies on to it without a stop.
+
+        Return None if the vehicle stops at `item`.
+        """
         at = v.mission.peek_after(self._index)
         if item.command not in CURVES or item.param1 > 0.0 or at is None:
             return None
@@ -174,10 +177,10 @@ class AutoFlight(Flight):
         return following if following.command in CURVES else None
 
     def _arrival(self, v: VehicleState, item: Item, start: Point, end: Point) -> Point:
-        """Return the direction in which a spline leg ends.
+        """Return the direction at the end of a spline leg, or zero if the vehicle stops there.
 
-        The direction follows the next leg if that is straight, or passes the end point towards the next spline
-        waypoint.
+        If the next leg is straight, it is the direction of that leg. If the next leg is a spline, it is the direction
+        from the start of this leg to the end of the next leg.
         """
         following = self._following(v, item)
         if following is None:
@@ -221,7 +224,10 @@ class AutoFlight(Flight):
             self._finish_if_down(v)
 
     def _finish_if_down(self, v: VehicleState) -> None:
-        """Complete the item when a landing or return has stopped the motors. The next item begins after the next start."""
+        """Complete a landing or return item if the motors have stopped.
+
+        The next item begins when the motors start again.
+        """
         if v.armed:
             return
         self._item = None

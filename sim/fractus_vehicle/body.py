@@ -1,7 +1,7 @@
 """The airframe: a rigid quadcopter with six degrees of freedom, four lagging motors, drag, wind and the ground.
 
-World axes are north, east, down; body axes forward, right, down; the quaternion turns body into world. The step is
-scalar on purpose: for one vehicle plain floats are several times faster than small numpy arrays.
+World axes are north, east, down. Body axes are forward, right, down. The quaternion rotates from body to world axes.
+The code uses plain floats, because for one vehicle they are several times faster than small numpy arrays.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ import random
 from dataclasses import dataclass
 
 GRAVITY = 9.80665
-# The propellers break if the vehicle hits the ground while leaning, or while falling and rotating fast. An upright fall
-# without rotation does no damage, as in SITL.
+# The propellers break if the vehicle hits the ground while it leans, or while it both falls and rotates fast. A fall
+# without lean and rotation does no damage, as in SITL.
 CRASH_IMPACT_MPS = 4.0
 CRASH_TURN_RPS = 1.0
 CRASH_LEAN_COSINE = 0.5
@@ -21,7 +21,7 @@ CRASHED_ROLL_RAD = math.radians(75.0)
 
 @dataclass(frozen=True, slots=True)
 class Airframe:
-    """Constants of the quadcopter (an X frame, near ArduPilot's simulated one)."""
+    """Constants of the quadcopter, an X frame with values close to ArduPilot's simulated quadcopter."""
 
     mass_kg: float = 1.8
     arm_m: float = 0.17  # lever arm of a motor about the roll and pitch axes

@@ -20,7 +20,7 @@ TIMEOUT_S = 15.0
 CLEANUP_AFTER = 50  # new points
 LOW_SPACE = 10  # free points
 LOW_SPACE_TEXT_INTERVAL_S = 10.0
-PRUNE_SHARE = 0.99  # of the accuracy: segments closer than this are joined
+PRUNE_SHARE = 0.99  # segments that are closer than this share of the accuracy are joined
 COMPARISONS_PER_TICK = 400  # bounds the cost of path cleanup in one control step
 
 Point = tuple[float, float, float]
@@ -46,7 +46,7 @@ class Breadcrumbs:
         self.path: list[Point] = []
         self._limit = min(max(int(params["SRTL_POINTS"]), 0), POINTS_MAX)  # read once at startup, like ArduPilot
         self._accuracy_m = 2.0
-        self._simplified = 0  # leading points that are already simplified
+        self._simplified = 0  # number of points at the start of the path that are already simplified
         self._pruned = 0
         self._work: Iterator[None] | None = None
         self._next_s = 0.0
@@ -54,7 +54,7 @@ class Breadcrumbs:
         self._low_space_text_s = -math.inf
 
     def restart(self, now_s: float, position: Point | None) -> None:
-        """Clear the path and start at the current position, if it is known (at startup and on arming)."""
+        """Clear the path, and start a new path at the current position if it is known."""
         self._accuracy_m = self._params["SRTL_ACCURACY"]
         self.path.clear()
         self._simplified = self._pruned = 0
@@ -69,7 +69,7 @@ class Breadcrumbs:
             self.path.append(position)
 
     def step(self, now_s: float, position: Point | None, mode: int, *, armed: bool) -> None:
-        """Record the position three times a second while armed, and simplify the path. SMART_RTL records nothing.
+        """Record the position three times a second while armed, except in SMART_RTL mode, and simplify the path.
 
         Args:
             now_s: Vehicle time.
@@ -129,7 +129,7 @@ class Breadcrumbs:
     # -- simplification ----------------------------------------------------------------------------------------
 
     def simplify_fully(self) -> Iterator[None]:
-        """Simplify the whole path. Each iteration does a bounded amount of work."""
+        """Return an iterator that simplifies the whole path, with limited work per iteration."""
         self._work = None
         self.simplify()
         return self._prune(POINTS_MAX)
@@ -163,7 +163,7 @@ class Breadcrumbs:
         self._pruned = min(self._pruned, len(self.path))
 
     def _prune(self, enough: int) -> Iterator[None]:
-        """Cut loops that end in new points, newest first, until `enough` points are removed."""
+        """Cut loops that end in new points, newest loop first, until `enough` points have been removed."""
         loops: list[Loop] = []
         count = 0
         done = len(self.path)

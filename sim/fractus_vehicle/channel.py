@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from fractus_runtime.mavlink_codec import Endpoint, Message, Value
 
-# Limit of memory used by a client that does not read. Further frames are dropped, as on a radio link.
+# Maximum size of queued frames for a client that does not read. Frames beyond it are dropped, as on a radio link.
 OUTBOX_LIMIT = 256 * 1024
 PARAMETERS_PER_TICK = 23
 # Tolerance for rounding: sums of intervals differ slightly from multiples of the step.
@@ -37,7 +37,7 @@ class Channel(Endpoint):
         discard: bool = False,
         port: int | None = None,
     ) -> None:
-        # Simulated quantities may exceed the range of their field. The drivers of a real autopilot saturate, too.
+        # Simulated values that exceed the range of a message field are limited, as in the drivers of a real autopilot.
         super().__init__(sysid, compid, saturate=True)
         self.name = name
         self.port = port  # ArduPilot serial port number, selects the SRn_ parameters
@@ -124,7 +124,7 @@ class Channel(Endpoint):
     def due(self, now_s: float) -> list[str]:
         """Return the names of the messages due now.
 
-        Long-term rates are exact; missed messages are not sent in a burst.
+        Long-term rates are exact. Messages that were missed during a delay are not sent later.
         """
         if now_s + TIME_SLACK_S < self.next_due_s:
             return []

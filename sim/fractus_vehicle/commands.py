@@ -73,7 +73,7 @@ def _takeoff(vehicle: Vehicle, o: Command, _c: Channel) -> int:
     v = vehicle.state
     if o.frame != mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT:
         return mavlink.MAV_RESULT_DENIED
-    # ALT_HOLD can take off if the client does not require a horizontal position.
+    # The third parameter is not zero if the client accepts a takeoff without horizontal position, as in ALT_HOLD.
     may_take_off = v.mode in TAKEOFF_MODES or (v.mode == mavlink.COPTER_MODE_ALT_HOLD and o.params[2] != 0.0)
     if not v.armed or not v.landed or not may_take_off or not v.altitude_m < o.z < ALTITUDE_MAX_M:
         return mavlink.MAV_RESULT_FAILED
@@ -112,7 +112,7 @@ def _set_mode(vehicle: Vehicle, o: Command, _c: Channel) -> int:
 
 def _change_speed(vehicle: Vehicle, o: Command, _c: Channel) -> int:
     v = vehicle.state
-    # ArduPilot compares with these thresholds.
+    # ArduPilot uses these thresholds for the floating-point parameter.
     kind = 0
     if o.params[0] > 2.9:
         kind = 3
@@ -140,8 +140,8 @@ def _reposition(vehicle: Vehicle, o: Command, _c: Channel) -> int:
         return mavlink.MAV_RESULT_DENIED
     if not valid_coordinates(o.x, o.y) or not _has_valid_position(v, o):
         return mavlink.MAV_RESULT_DENIED
-    # Missing coordinates, or a missing height above home or ground, would mean the current position. ArduPilot denies
-    # that.
+    # A zero for the coordinates, or for the height above home or ground, would stand for the current value. ArduPilot
+    # denies such a command.
     if not o.has_place or (o.frame not in ABSOLUTE_FRAMES and abs(o.z) < CENTIMETRE):
         return mavlink.MAV_RESULT_DENIED
     north, east, down = item_target(v, o.item)
@@ -150,7 +150,7 @@ def _reposition(vehicle: Vehicle, o: Command, _c: Channel) -> int:
     if v.mode not in GUIDED_MODES and not vehicle.modes.change(mavlink.COPTER_MODE_GUIDED):
         return mavlink.MAV_RESULT_FAILED
     flight = vehicle.modes.flight
-    # On the ground the target has no effect, because a takeoff sets another one.
+    # On the ground, the target is ignored, because the takeoff would replace it.
     if isinstance(flight, GuidedFlight) and not v.landed:
         flight.go_to(v, north, east, down)
         v.heading.follow_course()  # the yaw parameter of the command is ignored
@@ -158,7 +158,7 @@ def _reposition(vehicle: Vehicle, o: Command, _c: Channel) -> int:
 
 
 def _yaw(vehicle: Vehicle, o: Command, _c: Channel) -> int:
-    """Handle CONDITION_YAW. Accepted in every mode, effective in automatic modes only."""
+    """Handle CONDITION_YAW. It is accepted in every mode, but has an effect in automatic modes only."""
     v = vehicle.state
     angle, rate, direction, relative = o.params
     if relative not in (0.0, 1.0) or not 0.0 <= angle <= 360.0:
@@ -230,8 +230,8 @@ def _prearm(vehicle: Vehicle, _o: Command, _c: Channel) -> int:
 def _calibrate(vehicle: Vehicle, o: Command, _c: Channel) -> int:
     """Handle PREFLIGHT_CALIBRATION.
 
-    Accepts calibrations that need no handling by a pilot: gyroscopes, barometer, level. They have no effect because
-    simulated sensors do not drift.
+    Accepts calibrations during which nobody has to move the vehicle: gyroscopes, barometer, level. They have no effect
+    because simulated sensors do not drift.
     """
     v = vehicle.state
     if v.armed or v.motor_test_until_s is not None:
@@ -277,7 +277,7 @@ HEADING_MODES = frozenset({mavlink.COPTER_MODE_GUIDED, mavlink.COPTER_MODE_AUTO,
 CENTIMETRE = 0.01
 # Maximum climb of a takeoff in a pilot mode.
 PILOT_TAKEOFF_MAX_M = 10.0
-# Values of the fifth parameter of PREFLIGHT_CALIBRATION (the last one also of the second).
+# Values of the fifth parameter of PREFLIGHT_CALIBRATION. FORCE_SAVE is also a value of the second parameter.
 LEVEL = 2
 SIMPLE_ACCELEROMETER = 4
 FORCE_SAVE = 76

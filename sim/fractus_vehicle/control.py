@@ -21,7 +21,7 @@ from fractus_vehicle.shaping import (
     wrap_pi,
 )
 
-# The vehicle counts as stopped below this speed, and holds its position from then on.
+# Speed below which the vehicle counts as stopped. It then holds its position.
 STOPPED_MPS = 0.05
 
 
@@ -29,7 +29,7 @@ Vector = tuple[float, float, float]
 
 
 class Axis(Enum):
-    """Controlled quantity: a position, a velocity, an attitude, or a trajectory set point by point."""
+    """Controlled quantity: a position, a velocity, an attitude, or the points of an external trajectory (PATH)."""
 
     POSITION = "position"
     VELOCITY = "velocity"
@@ -46,8 +46,8 @@ class Limits:
     sink_mps: float = 1.5
     accel_mps2: float = 2.5
     accel_z_mps2: float = 1.0
-    jerk_mps3: float = 3.0  # for position targets
-    velocity_jerk_mps3: float = 5.0  # for velocity targets
+    jerk_mps3: float = 3.0  # jerk limit for position targets
+    velocity_jerk_mps3: float = 5.0  # jerk limit for velocity targets
     tilt_max_rad: float = math.radians(30.0)
     yaw_rate_rps: float = math.radians(60.0)
 
@@ -110,7 +110,7 @@ class Gains:
 
 
 class Control:
-    """Targets, the shaped trajectory toward the targets, and the feedback that tracks the trajectory."""
+    """The controller. It shapes a trajectory towards the targets, and tracks the trajectory by feedback."""
 
     def __init__(self, airframe: Airframe) -> None:
         self.airframe = airframe
@@ -162,7 +162,7 @@ class Control:
         self.go_to_altitude(self.pos[2] + vd * abs(vd) / (2.0 * BRAKING_SHARE * self.limits.accel_z_mps2))
 
     def stop(self, accel_mps2: float | None = None) -> None:
-        """Brake with the maximum acceleration, or with `accel_mps2`, then hold the position reached."""
+        """Brake with the maximum acceleration, or with `accel_mps2`. Then hold the position."""
         vn = self.vel[0]
         ve = self.vel[1]
         speed = math.hypot(vn, ve)
@@ -196,7 +196,7 @@ class Control:
             self.climb(vd)
 
     def track(self, position: Vector, velocity: Vector, acceleration: Vector) -> None:
-        """Set the current point of an externally shaped trajectory."""
+        """Set the current point of a trajectory that the caller has shaped."""
         self.horizontal = self.vertical = Axis.PATH
         self._stopping = False
         self.pos[:] = position
@@ -251,7 +251,7 @@ class Control:
         error_e = pos[1] - est.east
         distance = math.hypot(error_n, error_e)
         if distance > 4.0:
-            # After a gust or motor failure the trajectory waits for the vehicle instead of running ahead.
+            # If a gust or motor failure holds the vehicle back, keep the trajectory within 4 m of it.
             pos[0] = est.north + error_n * 4.0 / distance
             pos[1] = est.east + error_e * 4.0 / distance
         if self.horizontal is Axis.VELOCITY and distance > 2.0:
@@ -336,7 +336,7 @@ class Control:
         frame = self.airframe
         roll, pitch = self.lean
         # Direction of the demanded body down axis in the world frame, then in the body frame. Thrust direction and
-        # heading are controlled separately, so that a yaw turn does not bend the flight path.
+        # heading are controlled separately, so that a change of heading does not bend the flight path.
         cr = math.cos(roll)
         sr = math.sin(roll)
         cp = math.cos(pitch)

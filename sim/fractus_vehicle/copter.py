@@ -10,7 +10,13 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 @dataclass(frozen=True, slots=True)
 class ModeTraits:
-    """Requirements of a mode: a position, a throttle stick passed to the motors, and if the vehicle may arm in it."""
+    """Properties of a mode.
+
+    Attributes:
+        needs_position: True if the mode needs a position estimate.
+        manual_throttle: True if the throttle stick controls the motors directly.
+        arms: True if the vehicle may be armed in the mode.
+    """
 
     needs_position: bool = True
     manual_throttle: bool = False
@@ -37,11 +43,11 @@ TRAITS = {
     mavlink.COPTER_MODE_ZIGZAG: ModeTraits(arms=True),
 }
 SUPPORTED_MODES = frozenset(TRAITS)
-# Modes that accept targets of a companion computer, and modes in which NAV_TAKEOFF works.
+# GUIDED_MODES accept targets of a companion computer. TAKEOFF_MODES accept NAV_TAKEOFF.
 GUIDED_MODES = frozenset({mavlink.COPTER_MODE_GUIDED, mavlink.COPTER_MODE_GUIDED_NOGPS, mavlink.COPTER_MODE_AVOID_ADSB})
 TAKEOFF_MODES = GUIDED_MODES | {mavlink.COPTER_MODE_LOITER, mavlink.COPTER_MODE_POSHOLD, mavlink.COPTER_MODE_ZIGZAG}
-# Modes that exist but cannot be entered without a pilot, a sensor or a setting: STATUSTEXTs and the reason of the
-# refusal.
+# Modes that this vehicle cannot enter, because they need a pilot, a sensor or a setting. The values are the STATUSTEXTs
+# and the reason of the refusal.
 UNAVAILABLE: dict[int, tuple[tuple[str, ...], str]] = {
     mavlink.COPTER_MODE_FLIP: ((), "init failed"),
     mavlink.COPTER_MODE_AUTOTUNE: ((), "init failed"),
@@ -61,7 +67,8 @@ def mode_title(mode: int) -> str:
 _TITLES = {mavlink.COPTER_MODE_SMART_RTL: "SMARTRTL", mavlink.COPTER_MODE_AUTO_RTL: "AUTO RTL"}
 
 
-# Frames with altitudes above mean sea level, terrain and home. The deprecated *_INT frames are equivalent.
+# Frames by the reference of their altitude: mean sea level, terrain, or (in GLOBAL_FRAMES) also home. The deprecated
+# *_INT frames are equivalent.
 ABSOLUTE_FRAMES = frozenset({mavlink.MAV_FRAME_GLOBAL, mavlink.MAV_FRAME_GLOBAL_INT})
 TERRAIN_FRAMES = frozenset({mavlink.MAV_FRAME_GLOBAL_TERRAIN_ALT, mavlink.MAV_FRAME_GLOBAL_TERRAIN_ALT_INT})
 GLOBAL_FRAMES = (

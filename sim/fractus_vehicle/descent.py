@@ -1,4 +1,4 @@
-"""Landing descent: fast at height, slow near the ground, disarm after touchdown."""
+"""Landing descent: first fast, then slow near the ground. The vehicle disarms after touchdown."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ LANDING_CONFIRMED_S = 1.0
 
 
 def descend(v: VehicleState) -> None:
-    """Descend like LAND: fast at height, slowly below LAND_ALT_LOW. Disarm after touchdown."""
+    """Descend for one control step as in LAND: fast at first, slowly below LAND_ALT_LOW. Disarm after touchdown."""
     p = v.params
     slow = p["LAND_SPEED"] / 100.0
     high = (p["LAND_SPEED_HIGH"] / 100.0) or v.control.limits.sink_mps

@@ -39,7 +39,7 @@ def dispatch(vehicle: Vehicle, message: Message, channel: Channel) -> None:
 
 
 def _is_for_other_component(v: VehicleState, component: int) -> bool:
-    """Return True if the addressed component is a known peer. Otherwise the autopilot handles the message itself."""
+    """Return True if a message is addressed to another component that is a known peer."""
     if component in (0, v.compid):
         return False
     return any((v.sysid, component) in channel.peers for channel in v.channels)
@@ -112,7 +112,10 @@ def _timesync(vehicle: Vehicle, m: Message, c: Channel) -> None:
 
 
 def _file_transfer(_vehicle: Vehicle, m: Message, c: Channel) -> None:
-    """Refuse every MAVFTP request, because there is no file system. Clients then use the plain protocols."""
+    """Refuse every MAVFTP request, because there is no file system.
+
+    Clients then use the parameter and mission protocols.
+    """
     request = bytes(int(value) for value in m.array("payload"))
     sequence = (int.from_bytes(request[:2], "little") + 1) & 0xFFFF
     answer = sequence.to_bytes(2, "little") + bytes(
@@ -143,7 +146,7 @@ def _mission(vehicle: Vehicle, m: Message, c: Channel) -> None:
 def _mission_set_current(vehicle: Vehicle, m: Message, c: Channel) -> None:
     """Set the current item and reply with the requested number.
 
-    Clients take the number for the acknowledgement, even if another item is current afterwards.
+    Clients expect the requested number as acknowledgement, even if a different item is current after the request.
     """
     if set_current(vehicle, m.integer("seq")):
         c.send("MISSION_CURRENT", {**mission_current(vehicle.state), "seq": m.integer("seq")})
@@ -173,7 +176,7 @@ def _set_home(vehicle: Vehicle, m: Message, _c: Channel) -> None:
 
 
 def _setup_signing(vehicle: Vehicle, m: Message, _c: Channel) -> None:
-    """Set the signing key, or disable signing if the key is all zeros. Refused while armed, as in ArduPilot."""
+    """Set the signing key, or disable signing if the key is all zeros. As in ArduPilot, this is refused while armed."""
     v = vehicle.state
     if v.armed:
         v.send_text(mavlink.MAV_SEVERITY_DEBUG, "ERROR: Won't setup signing when armed")
@@ -204,7 +207,7 @@ HANDLERS: dict[str, Handler] = {
     "MISSION_SET_CURRENT": _mission_set_current,
     "RC_CHANNELS_OVERRIDE": _sticks,
     "MANUAL_CONTROL": _manual,
-    # The origin comes from GPS. The reply reports its position.
+    # The vehicle keeps its origin from GPS, and replies with it.
     "SET_GPS_GLOBAL_ORIGIN": _reply_with("GPS_GLOBAL_ORIGIN"),
     "SET_HOME_POSITION": _set_home,
     "SETUP_SIGNING": _setup_signing,

@@ -16,8 +16,8 @@ from fractus_vehicle.sensors import Drift, Gps
 GPS_INTERVAL_S = 0.2
 GPS_TIMEOUT_S = 7.0
 
-# Times of startup events in a sequence of this length, as measured on a real autopilot. A shorter `ready_after_s`
-# scales them.
+# Times of startup events, as measured on a real autopilot that is ready after FULL_START_S. A different `ready_after_s`
+# scales all of them.
 FULL_START_S = 41.0
 INITIALISED_S = 2.6
 FILTER_STARTED_S = 5.0
@@ -44,7 +44,7 @@ ANNOUNCEMENTS = (
     (9.5, "GPS 1: probing for u-blox at 230400 baud"),
     (FIRST_FIX_S, "GPS 1: detected u-blox"),
 )
-# The heading is aligned again when the vehicle first climbs through this height.
+# Height at which the EKF aligns its heading again, in the first climb.
 FINAL_ALIGNMENT_M = 2.5
 
 _FLAGS_STARTING = (
@@ -112,7 +112,7 @@ class Estimator:
 
     @property
     def active(self) -> bool:
-        """True if the EKF runs and is in use."""
+        """True if the autopilot uses the EKF."""
         return self.since_boot(FILTER_ACTIVE_S)
 
     @property
@@ -122,7 +122,7 @@ class Estimator:
 
     @property
     def consistent(self) -> bool:
-        """True if the accelerometers have been consistent for long enough."""
+        """True if the accelerometers have been consistent for as long as arming requires."""
         return self.since_boot(ACCELS_CONSISTENT_S)
 
     @property

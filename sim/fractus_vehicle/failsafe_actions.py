@@ -12,7 +12,7 @@ from fractus_vehicle.state import VehicleState
 
 
 class Action(IntEnum):
-    """Values of BATT_FS_*_ACT. Other parameters have separate tables."""
+    """Failsafe actions, with the values of BATT_FS_*_ACT. The tables below map the values of other parameters."""
 
     NONE = 0
     LAND = 1
@@ -71,7 +71,7 @@ def execute_action(v: VehicleState, modes: FlightModes, action: Action) -> None:
                 v.send_text(mavlink.MAV_SEVERITY_WARNING, "SmartRTL Unavailable, Using Land Mode")
                 _land(v, modes)
         case Action.AUTO_LAND_START:
-            # Landing sequences in missions are not simulated. ArduPilot falls back to RTL without one.
+            # Landing sequences in missions are not simulated. Without a landing sequence, ArduPilot falls back to RTL.
             v.send_text(mavlink.MAV_SEVERITY_WARNING, "Trying RTL Mode")
             _return(v, modes)
         case Action.BRAKE_LAND:

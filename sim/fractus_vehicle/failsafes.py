@@ -18,13 +18,13 @@ POSITION_LOST_S = 1.0
 CRASH_ANGLE_DEG = 30.0
 CRASH_CONFIRMED_S = 2.0
 
-# Beyond this distance outside the fence, the autopilot only lands.
+# Distance outside the fence beyond which the autopilot lands instead of the fence action.
 FENCE_GIVE_UP_M = 100.0
 # FS_EKF_ACTION
 EKF_REPORTS_ONLY = 0
 EKF_HOLDS_ALTITUDE = 2
 EKF_LANDS_ALWAYS = 3
-# Full throttle for THRUST_LOST_S, level and still sinking: potential thrust loss of a motor.
+# If a level vehicle sinks at more than THRUST_LOST_SHARE of full thrust for THRUST_LOST_S, a motor may have failed.
 THRUST_LOST_S = 1.0
 THRUST_LOST_SHARE = 0.9
 _PILOT_MODES = frozenset({mavlink.COPTER_MODE_STABILIZE, mavlink.COPTER_MODE_ALT_HOLD, mavlink.COPTER_MODE_LOITER})
@@ -44,7 +44,7 @@ class Option(IntFlag):
 class Failsafes:
     """Detect and clear the failsafes of a vehicle, and start their actions.
 
-    `_*_since_s` is the start time of a condition.
+    Each field `_*_since_s` is the time since which a condition has been true.
     """
 
     def __init__(self, state: VehicleState, modes: FlightModes) -> None:
@@ -65,7 +65,7 @@ class Failsafes:
         self._gcs_seen_s = self._state.time_s
 
     def step(self) -> None:
-        """Run all checks at 10 Hz. Called in each control step."""
+        """Run all checks if they are due (10 Hz). Call this in each control step."""
         v = self._state
         if v.time_s < self._next_check_s:
             return
@@ -129,7 +129,10 @@ class Failsafes:
             self._take_over(v, "GCS", GCS_ACTIONS.get(setting, Action.RTL))
 
     def _check_radio(self, v: VehicleState) -> None:
-        """Check the simulated receiver. SIM_RC_FAIL makes it silent unless a ground station overrides its channels."""
+        """Check the simulated radio receiver.
+
+        With SIM_RC_FAIL it has no signal, unless a ground station overrides channels.
+        """
         setting = int(v.params["FS_THR_ENABLE"])
         silent = int(v.params["SIM_RC_FAIL"]) != 0 and not v.receiver.overridden
         if not silent:

@@ -29,7 +29,10 @@ def _to_edge_m(north: float, east: float, a: Vertex, b: Vertex) -> float:
 
 
 def _ahead_m(position: Vertex, course: Vertex, a: Vertex, b: Vertex) -> float | None:
-    """Return the distance along a course to the crossing of an edge, or None if the course misses the edge."""
+    """Return the distance along a course to its intersection with an edge.
+
+    Return None if it does not intersect the edge.
+    """
     run_n = b[0] - a[0]
     run_e = b[1] - a[1]
     turn = course[0] * run_e - course[1] * run_n
@@ -198,7 +201,7 @@ class Fence:
     margin_m: float = 2.0
     avoid: bool = True  # limit velocities in front of the fence
     limiting: bool = False
-    recovery_until_s: float = -math.inf  # checks are suspended until then after a mode change during a breach
+    recovery_until_s: float = -math.inf  # after a mode change during a breach, checks are suspended until this time
 
     @property
     def present(self) -> bool:
@@ -230,7 +233,7 @@ class Fence:
         return breaches
 
     def distance_m(self, north: float, east: float, altitude_m: float, home: Vertex = (0.0, 0.0)) -> float:
-        """Return the distance of a point beyond the breached limits in metres, 0 inside."""
+        """Return the distance in metres by which a point exceeds the breached limits. It is 0 inside the fence."""
         breaches = self.outside(north, east, altitude_m, home)
         beyond = [0.0]
         if breaches & mavlink.FENCE_TYPE_ALT_MAX:
@@ -247,7 +250,7 @@ class Fence:
     def speed_allowed(
         self, north: float, east: float, home: Vertex, course: Vertex, brake: Callable[[float], float]
     ) -> float:
-        """Return the maximum speed along a course that allows a stop at the margin before the fence, in m/s.
+        """Return the maximum speed (m/s) along a course from which the vehicle can stop at the margin before the fence.
 
         Args:
             north: Local position in metres.
@@ -264,7 +267,7 @@ class Fence:
         allowed = math.inf
         for shape in shapes:
             if shape.contains(north, east) != shape.inclusion:
-                continue  # already outside this shape: handled as a breach
+                continue  # the vehicle is on the wrong side of this shape, which is a breach
             ahead = shape.distance_along_m((north, east), course)
             if ahead is not None:
                 allowed = min(allowed, brake(max(ahead - self.margin_m, 0.0)))

@@ -8,7 +8,7 @@ from fractus_vehicle.state import VehicleState
 class Flight:
     """A flight in one mode.
 
-    A new object is created each time the mode begins. It sets the controller targets in each step.
+    Each mode change creates a new object. The object sets the targets of the controller in each control step.
     """
 
     @property

@@ -1,4 +1,4 @@
-"""Three-axis gimbal: holds the camera angles over the horizon and turns at a limited rate."""
+"""Three-axis gimbal: holds the camera angles relative to the horizon, and rotates at a limited rate."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ TURN_DEG_S = 60.0
 PITCH_DEG = (-90.0, 20.0)
 YAW_DEG = (-180.0, 180.0)
 ROLL_DEG = (-30.0, 30.0)
-# MNT1_TYPE values without feedback (servo and brushless PWM). They report their target as the measured attitude.
+# MNT1_TYPE values without feedback (servo and brushless PWM). Their target is reported as the measured attitude.
 SERVOS = frozenset({1, 7})
 
 
@@ -34,7 +34,7 @@ class Gimbal:
         self.target = clamp(pitch_deg, *PITCH_DEG), clamp(yaw_deg, *YAW_DEG)
 
     def step(self, step_s: float) -> None:
-        """Turn towards the target for one step."""
+        """Rotate towards the target for one control step."""
         most = TURN_DEG_S * step_s
         self.pitch_deg += clamp(self.target[0] - self.pitch_deg, -most, most)
         self.yaw_deg += clamp(self.target[1] - self.yaw_deg, -most, most)

@@ -11,8 +11,8 @@ from fractus_vehicle.settings import leg_speeds_mps
 from fractus_vehicle.shaping import clamp, sqrt_controller
 from fractus_vehicle.state import CONTROL_STEP_S, VehicleState
 
-# Fence avoidance overestimates the braking ability by this factor. At 6 m/s a real ArduCopter crosses a circle of 30 m
-# by 2 m.
+# Factor by which fence avoidance overestimates the braking ability. A real ArduCopter at 6 m/s flies 2 m beyond a fence
+# circle of 30 m.
 AVOIDANCE_OPTIMISM = 1.3
 
 
@@ -46,8 +46,8 @@ class GuidedFlight(Flight):
     def use(self, v: VehicleState, controller: Task) -> None:
         """Select the position or velocity controller.
 
-        ArduCopter starts a controller with the speeds of the parameters. A change of controller therefore discards a
-        commanded speed. Stopping keeps the controller and the speed.
+        As in ArduCopter, a change of the controller discards a commanded speed, because the new controller uses the
+        speeds of the parameters. `stop` keeps the controller and the commanded speed.
         """
         if controller is not self._controller:
             self._controller = controller
@@ -61,7 +61,7 @@ class GuidedFlight(Flight):
         v.begin_takeoff(down)
 
     def go_to(self, v: VehicleState, north: float, east: float, down: float) -> None:
-        """Fly to a local position. While paused, store the position for the resume."""
+        """Fly to a local position. While the flight is paused, store the position until it is resumed."""
         if self.paused:
             self._resume = (north, east, down)
             return
@@ -76,9 +76,9 @@ class GuidedFlight(Flight):
         velocity: tuple[float, float, float],
         position: tuple[float, float, float] | None = None,
     ) -> None:
-        """Fly with a velocity, or with a position that moves with the velocity, until GUID_TIMEOUT.
+        """Fly with a velocity until GUID_TIMEOUT. With a position, follow a point that moves from it with the velocity.
 
-        Ignored while paused.
+        The target is ignored while the flight is paused.
         """
         if self.paused:
             return
@@ -166,7 +166,7 @@ class GuidedFlight(Flight):
 
 
 class GuidedWithoutGps(GuidedFlight):
-    """GUIDED_NOGPS mode: attitude targets only. Keeps level until a target arrives."""
+    """GUIDED_NOGPS mode: accepts attitude targets only. The vehicle stays level until it receives a target."""
 
     def begin(self, v: VehicleState) -> None:
         """Level out."""
@@ -174,7 +174,7 @@ class GuidedWithoutGps(GuidedFlight):
         self.lean(v, 0.0, 0.0, None, 0.0)
 
     def go_to(self, _v: VehicleState, _north: float, _east: float, _down: float) -> None:
-        """Ignore position targets: there is no position estimate."""
+        """Ignore the target, because the mode has no position estimate."""
 
     def fly(
         self,
@@ -182,7 +182,7 @@ class GuidedWithoutGps(GuidedFlight):
         _velocity: tuple[float, float, float],
         _position: tuple[float, float, float] | None = None,
     ) -> None:
-        """Ignore velocity targets: there is no position estimate."""
+        """Ignore the target, because the mode has no position estimate."""
 
     def stop(self, v: VehicleState) -> None:
         """Level out."""

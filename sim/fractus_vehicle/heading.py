@@ -8,9 +8,9 @@ from fractus_vehicle.control import Control, Estimate
 from fractus_vehicle.params import Parameters
 from fractus_vehicle.shaping import clamp, wrap_pi
 
-# Below this share of the speed limit the vehicle keeps its heading instead of following the course.
+# Share of the speed limit below which the vehicle keeps its heading instead of following the course.
 COURSE_SHARE = 0.05
-# Closer to the target angle than this, a commanded direction does not cause a full turn.
+# If the heading is within this angle of the target, a commanded direction does not cause a full turn.
 ANGLE_REACHED_RAD = math.radians(0.5)
 
 
@@ -26,7 +26,7 @@ class Heading:
         self._rate_rps = 0.0
 
     def follow_course(self) -> None:
-        """Follow the course, the default of WP_YAW_BEHAVIOR."""
+        """Point the nose along the course, as with the default of WP_YAW_BEHAVIOR."""
         self._left = 0.0
         self._roi = None
         self._fixed = False
@@ -38,7 +38,7 @@ class Heading:
         self._fixed = True
 
     def look_at(self, point: tuple[float, float] | None) -> None:
-        """Point the nose at a local position, or stop doing so (None)."""
+        """Point the nose at a local position. None: follow the course again."""
         self._left = 0.0
         self._roi = point
         self._fixed = False

@@ -7,8 +7,8 @@ from fractus_vehicle.descent import descend
 from fractus_vehicle.flight import Flight
 from fractus_vehicle.state import VehicleState
 
-# Deceleration limit of BRAKE, independent of WPNAV_ACCEL. PSC_JERK_XY prevents it from being reached below about 11
-# m/s.
+# Maximum deceleration of BRAKE, independent of WPNAV_ACCEL. Below about 11 m/s, the vehicle does not reach it, because
+# PSC_JERK_XY limits the jerk.
 BRAKE_MPS2 = 7.5
 # Delay of a landing that a failsafe has started, so that a pilot can intervene.
 FAILSAFE_PAUSE_S = 4.0
@@ -26,7 +26,7 @@ class Brake(Flight):
     """BRAKE mode: stop at maximum deceleration and hold."""
 
     def begin(self, v: VehicleState) -> None:
-        """Stop hard and hold."""
+        """Stop with `BRAKE_MPS2` and hold."""
         v.control.hold_position()
         v.control.stop(BRAKE_MPS2)
 
@@ -43,7 +43,7 @@ class Land(Flight):
         return True
 
     def pause(self, v: VehicleState) -> None:
-        """Delay the descent, as all failsafe landings do."""
+        """Delay the descent. All failsafe landings do this."""
         self._sink_from_s = v.time_s + FAILSAFE_PAUSE_S
         v.control.climb(0.0)
 

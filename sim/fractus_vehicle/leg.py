@@ -9,7 +9,7 @@ from fractus_vehicle.profile import Profile
 from fractus_vehicle.shaping import clamp, shape_velocity, shape_velocity_xy
 from fractus_vehicle.state import CONTROL_STEP_S, VehicleState
 
-# Previous motion counts as stopped below this speed. STOP_STEPS limits the time for it.
+# Speed below which the motion before a leg counts as stopped. STOP_STEPS limits the control steps until then.
 RESTING_MPS = 0.02
 _STILL = (0.0, 0.0, 0.0)
 STOP_STEPS = 3000
@@ -19,7 +19,10 @@ Vector = tuple[float, float, float]
 
 
 def _stopping(v: VehicleState) -> list[tuple[Vector, Vector, Vector]]:
-    """Compute how the current motion comes to rest: position, velocity and acceleration in each control step."""
+    """Simulate how the vehicle stops.
+
+    Return position, velocity and acceleration for each control step until it rests.
+    """
     control = v.control
     limits = v.control.limits
     dt = CONTROL_STEP_S
@@ -53,9 +56,9 @@ def resting_place(v: VehicleState) -> Vector:
 
 
 class Leg:
-    """Leg from the resting position of the current trajectory to a local point.
+    """Leg from the position where the current motion would come to rest to a local point.
 
-    Create the leg when it begins, and call `step` until it is left.
+    Create the object when the leg begins. Then call `step` in each control step while the vehicle flies the leg.
     """
 
     def __init__(self, v: VehicleState, north: float, east: float, down: float) -> None:
@@ -96,11 +99,14 @@ class Leg:
 
     @property
     def finished(self) -> bool:
-        """True if the trajectory has reached the end."""
+        """True if the trajectory has reached the end of the leg."""
         return self._at >= len(self._rest) and self._time_s >= self._profile.duration_s
 
     def step(self, v: VehicleState) -> None:
-        """Advance the trajectory by one control step. Apply a changed speed limit with the acceleration of legs."""
+        """Advance the trajectory by one control step.
+
+        If the speed limit has changed, approach it with limited acceleration.
+        """
         control = v.control
         limits = v.control.limits
         dt = CONTROL_STEP_S
@@ -125,5 +131,5 @@ class Leg:
         )
 
     def reached(self, v: VehicleState, radius_m: float) -> bool:
-        """Return True if the vehicle is within a radius of the end."""
+        """Return True if the vehicle is within a radius of the end of the leg."""
         return math.dist((v.est.north, v.est.east, v.est.down), self.end) <= radius_m

@@ -61,7 +61,9 @@ class LinkSpec:
         raise LinkError(f"link {text!r}: expected tcp:, udpin:, udpout:, serial: or pty:")
 
     def shifted(self, by: int) -> LinkSpec:
-        """Return the link of the vehicle at position `by` of a formation: next port (10 apart for TCP) or next path.
+        """Return the link of the vehicle with index `by` in a formation. Its port or path differs for each index.
+
+        Ports of TCP links are 10 apart.
 
         Raises:
             LinkError: The port number would be too large.
@@ -112,7 +114,7 @@ class Hub:
         self._selector.unregister(fileno)
 
     def add_flush(self, flush: Callable[[], None]) -> None:
-        """Call `flush` at each flush."""
+        """Register a function that is called at each flush."""
         self._flushers.append(flush)
 
     def remove_flush(self, flush: Callable[[], None]) -> None:
@@ -120,18 +122,18 @@ class Hub:
         self._flushers.remove(flush)
 
     def add_close(self, close: Callable[[], None]) -> None:
-        """Call `close` when the hub closes."""
+        """Register a function that is called when the hub closes."""
         self._closers.append(close)
 
     def poll(self, timeout_s: float = 0.0) -> None:
-        """Receive available data. Wait at most `timeout_s` for it."""
+        """Receive available data. If there is none, wait for it up to `timeout_s`."""
         for key, _ in self._selector.select(timeout_s):
             key.data()
 
     def wait(self, timeout_s: float) -> bool:
-        """Wait until data is available, which the next poll reads. Return True if so.
+        """Wait until data is available for the next poll, or the timeout expires. Return True if data is available.
 
-        Returns up to one millisecond before `timeout_s`, because the selector rounds timeouts up to milliseconds.
+        The timeout is rounded down to milliseconds, because the selector would round it up.
         """
         return bool(self._selector.select(math.floor(timeout_s * 1e3) / 1e3))
 
@@ -245,7 +247,7 @@ class _Udp:
         family = socket.AF_INET6 if ":" in spec.host else socket.AF_INET
         self._socket = socket.socket(family, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
-        # Channels by peer address. A connected socket has one channel with the key None.
+        # Channels by the address of the peer. A `udpout` link has only one channel, with the key None.
         self._channels: dict[tuple[str, int] | None, Channel] = {}
         try:
             if spec.kind == "udpin":

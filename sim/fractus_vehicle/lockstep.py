@@ -1,8 +1,8 @@
 """Lockstep mode: another process drives simulated time.
 
 The protocol is line-based over TCP. The driver sends a number of control steps (10 ms each). The simulation receives
-pending data on its links, advances, sends, and replies with the number of steps since its start. With a fixed seed,
-runs are repeatable to the byte.
+pending data on its links, runs the steps, sends its messages, and replies with the number of steps since its start.
+Runs with the same seed and input give identical output.
 """
 
 from __future__ import annotations
@@ -103,7 +103,7 @@ def run_lockstep(
         if not steps:
             hub.flush()
             continue
-        # Poll the links again before time advances: data sent before the request has arrived by now.
+        # Poll the links again, because data that the driver sent before its request has arrived by now.
         hub.poll()
         for _ in range(steps):
             simulation.step()

@@ -51,7 +51,7 @@ def pilot_climb(v: VehicleState) -> None:
 
 
 class Stabilize(Flight):
-    """STABILIZE mode: sticks set lean angles and thrust."""
+    """STABILIZE mode: the sticks set lean angles and thrust."""
 
     def begin(self, v: VehicleState) -> None:
         """Switch to attitude control."""
@@ -72,7 +72,10 @@ class Stabilize(Flight):
 
 
 class Acro(Stabilize):
-    """ACRO mode: sticks set rotation rates and thrust. Released sticks level the vehicle (ACRO_TRAINER 2)."""
+    """ACRO mode: the sticks set rotation rates and thrust.
+
+    If they are released, the vehicle levels (ACRO_TRAINER 2).
+    """
 
     def step(self, v: VehicleState) -> None:
         """Follow the sticks."""
@@ -89,11 +92,11 @@ class Acro(Stabilize):
 
 
 class Throw(Flight):
-    """THROW mode: waits for a throw with stopped motors. Throws are not simulated."""
+    """THROW mode: waits with stopped motors for a throw, which is not simulated."""
 
 
 class AltHold(Flight):
-    """ALT_HOLD mode: sticks set lean angles. The altitude is held while the throttle is centred."""
+    """ALT_HOLD mode: the sticks set lean angles. The altitude is held while the throttle stick is centred."""
 
     def begin(self, v: VehicleState) -> None:
         """Hold the altitude."""
@@ -137,7 +140,7 @@ class Loiter(Flight):
 class Circle(Flight):
     """CIRCLE mode: circles around a point CIRCLE_RADIUS ahead with the nose towards it.
 
-    The throttle stick climbs and sinks.
+    The throttle stick sets the climb rate.
     """
 
     def __init__(self) -> None:

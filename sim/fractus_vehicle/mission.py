@@ -43,16 +43,16 @@ class Mission:
         return next((at for at in range(max(index, 1), len(self.items)) if self.items[at].navigates), None)
 
     def takes_off(self, *, restart: bool) -> bool:
-        """Return True if the first NAV item to execute, apart from delays, is a takeoff."""
+        """Return True if the first NAV item to execute is a takeoff. Delays are skipped."""
         at = self.first_navigating(0 if restart else self.current)
         while at is not None and self.items[at].command == mavlink.MAV_CMD_NAV_DELAY:
             at = self.first_navigating(at + 1)
         return at is not None and self.items[at].command == mavlink.MAV_CMD_NAV_TAKEOFF
 
     def peek_after(self, index: int) -> int | None:
-        """Return the index of the next NAV item without counting jumps.
+        """Return the index of the next NAV item, without changing the counters of jumps.
 
-        Returns None if there is no such item or jumps form a loop.
+        Returns None if there is no further NAV item, or if jumps form a loop.
         """
         jumps = dict(self._jumps)
         at = self.next_after(index)
@@ -88,7 +88,7 @@ class Mission:
         return None
 
     def find_tag(self, tag: int) -> int | None:
-        """Return the index of the first item with a JUMP_TAG, or None."""
+        """Return the index of the first JUMP_TAG item with a tag, or None."""
         marks = (
             at for at, item in enumerate(self.items) if item.command == mavlink.MAV_CMD_JUMP_TAG and item.param1 == tag
         )

@@ -17,14 +17,14 @@ YAW_REACHED_RAD = math.radians(2.0)
 
 
 class MissionCommands:
-    """Queue of DO and CONDITION commands. The next NAV command discards pending commands."""
+    """Queue of DO and CONDITION commands. When the next NAV command begins, pending commands are discarded."""
 
     def __init__(self) -> None:
         self._indices: deque[int] = deque()
         self._begun_s: float | None = None
 
     def begin(self, v: VehicleState, indices: list[int]) -> None:
-        """Queue the commands before a NAV command that has just begun, and run them up to the first unmet condition."""
+        """Queue the commands that precede the current NAV command, and run them up to the first unmet condition."""
         self._indices = deque(indices)
         self._begun_s = None
         self.step(v)
@@ -79,7 +79,7 @@ def _do(v: VehicleState, item: Item) -> None:
         case mavlink.MAV_CMD_DO_SET_HOME:
             set_home_to_position(v) if item.param1 > 0.5 else set_home_at(v, item.x, item.y, item.z)
         case _:
-            pass  # no device is simulated for cameras, mounts and grippers
+            pass  # commands for cameras, mounts and grippers have no effect
 
 
 def switch_fence(v: VehicleState, action: float) -> bool:
@@ -100,7 +100,7 @@ def switch_fence(v: VehicleState, action: float) -> bool:
 def item_target(v: VehicleState, item: Item) -> tuple[float, float, float]:
     """Return the local position (north, east, down) of an item.
 
-    An item without coordinates refers to the current target.
+    An item without coordinates gets the horizontal position of the current target.
     """
     origin = v.origin or v.start
     base = v.altitude_base_m(item.frame)

@@ -87,7 +87,7 @@ class Item:
 
     @property
     def navigates(self) -> bool:
-        """True for NAV commands, which the mission waits for."""
+        """True for NAV commands. The mission does not continue before a NAV command is complete."""
         return (
             mavlink.MAV_CMD_NAV_WAYPOINT <= self.command < mavlink.MAV_CMD_NAV_LAST
             or self.command >= mavlink.MAV_CMD_NAV_FENCE_RETURN_POINT
@@ -103,7 +103,7 @@ def home_item(home: Place) -> Item:
 
 @dataclass(slots=True)
 class ItemStore:
-    """List of stored items. `home` replaces item 0 while a mission is empty."""
+    """List of stored items. `home` is item 0 of an empty mission."""
 
     kind: int
     items: list[Item] = field(default_factory=list)
@@ -114,7 +114,7 @@ def _finite(value: float) -> float:
     return value if math.isfinite(value) else 0.0
 
 
-# Replacements of the deprecated *_INT frames.
+# Frames that replace the deprecated *_INT frames and MAV_FRAME_MISSION.
 _CURRENT_FRAMES: dict[int, int] = {
     mavlink.MAV_FRAME_GLOBAL_INT: mavlink.MAV_FRAME_GLOBAL,
     mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT_INT: mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT,
@@ -142,7 +142,7 @@ PLACED = frozenset(
 )
 
 
-# Number of stored parameters of these commands: only the first one, a delay in whole seconds, or none.
+# Commands of which not all parameters are stored. 1: only the first parameter, a delay in whole seconds. 0: none.
 STORED_PARAMETERS: dict[int, int] = {
     mavlink.MAV_CMD_NAV_WAYPOINT: 1,
     mavlink.MAV_CMD_NAV_SPLINE_WAYPOINT: 1,
@@ -153,7 +153,7 @@ _UINT16_MAX = 65535
 
 
 def _parameters(message: Message, command: int) -> tuple[float, float, float, float]:
-    """Return the four parameters in the form in which ArduPilot stores them."""
+    """Return the four parameters as ArduPilot stores them."""
     one, *more = (_finite(message.real(f"param{at}")) for at in range(1, 5))
     stored = STORED_PARAMETERS.get(command)
     if stored is None:

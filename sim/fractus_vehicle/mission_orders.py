@@ -56,7 +56,7 @@ def jump_to_tag(vehicle: Vehicle, o: Command, c: Channel) -> int:
 
 
 def set_current(vehicle: Vehicle, index: int) -> bool:
-    """Make an item current, or the first NAV item after it. AUTO mode continues there.
+    """Set the current item. In flight, AUTO mode continues at this item.
 
     Returns:
         False if there is no such item.

@@ -16,7 +16,7 @@ from fractus_vehicle.smart_rtl import SmartReturn
 from fractus_vehicle.state import VehicleState
 from fractus_vehicle.telemetry import send_on_all
 
-# The fence is not checked for this time after a mode change during a breach.
+# If the mode changes during a fence breach, the fence is not checked for this number of seconds.
 MANUAL_RECOVERY_S = 10.0
 
 _FLIGHTS: dict[int, type[Flight]] = {
@@ -40,14 +40,14 @@ _FLIGHTS: dict[int, type[Flight]] = {
 
 
 class FlightModes:
-    """Current flight mode. Each change creates a new flight."""
+    """Current flight mode. Each mode change creates a new `Flight` object."""
 
     def __init__(self, state: VehicleState) -> None:
         self._state = state
         self.flight = self._new_flight(state.mode)
 
     def _refusal(self, mode: int) -> str | None:
-        """Return the reason why a mode cannot be entered now, or None. Few modes are refused while disarmed."""
+        """Return the reason why a mode cannot be entered now, or None. A disarmed vehicle may enter most modes."""
         v = self._state
         if mode in UNAVAILABLE:
             for text in UNAVAILABLE[mode][0]:
@@ -69,7 +69,7 @@ class FlightModes:
     def _has_mission(self) -> bool:
         """Return True if the mission can be flown from the current state.
 
-        On the ground it must begin with a takeoff.
+        If the vehicle is on the ground, the mission must begin with a takeoff.
         """
         v = self._state
         if len(v.mission.items) <= 1:
@@ -109,5 +109,5 @@ class FlightModes:
         send_on_all(v, "HEARTBEAT")
 
     def _new_flight(self, mode: int) -> Flight:
-        # Missions may end by a change to another mode.
+        # AUTO gets `change`, because a mission may end with a change to another mode.
         return AutoFlight(self.change) if mode == mavlink.COPTER_MODE_AUTO else _FLIGHTS[mode]()

@@ -11,9 +11,9 @@ from fractus_vehicle.state import ARMING_DELAY_S, CONTROL_STEP_S, VehicleState
 PHYSICS_PER_CONTROL = 2
 # Share of full thrust at which armed motors idle.
 IDLE_SPIN = 0.05
-# After a bounce, further ground contacts are not reported for this time.
+# Time after a reported ground contact in which further contacts (bounces) are not reported.
 IMPACT_TEXTS_S = 1.0
-# Beyond the range of its gyroscopes, the vehicle has lost its attitude permanently.
+# Range of the gyroscopes. If the rotation is faster, the vehicle loses its attitude estimate permanently.
 GYRO_RANGE_RPS = math.radians(2000.0)
 # Throttle stick position above which the vehicle lifts off in STABILIZE mode.
 LIFT_THROTTLE_US = 1550

@@ -1,4 +1,4 @@
-"""Sensor noise as a function of seed and time, so that requests on one link do not change the data of another link."""
+"""Sensor noise as a function of seed and time. A request on one link therefore does not change data on other links."""
 
 from __future__ import annotations
 

@@ -27,9 +27,9 @@ WIRE_TYPES = {
 """MAV_PARAM_TYPE that PARAM_VALUE reports for each type of the table."""
 # Names of later ArduCopter releases for the same parameters.
 ALIASES = {"MAV_GCS_SYSID": "SYSID_MYGCS", "MAV_SYSID": "SYSID_THISMAV"}
-# Item counts and the system id. A real autopilot lets a client overwrite them.
+# Item counts and the system id. Unlike on a real autopilot, clients cannot change them.
 READ_ONLY = frozenset({"MIS_TOTAL", "FENCE_TOTAL", "RALLY_TOTAL", "SYSID_THISMAV"})
-# Added to a value before truncation to an integer.
+# Tolerance for rounding errors, which is added to a value before its truncation to an integer.
 ROUNDING = 0.01
 
 
@@ -86,7 +86,7 @@ class ParameterValueError(ValueError):
 def _stored(path: Path) -> Iterator[tuple[str, float]]:
     """Parse a file of changed parameters.
 
-    An unexpected line is an error, because the file may belong to another program and must not be overwritten.
+    A line in any other format is an error. The file may then belong to another program and must not be overwritten.
     """
     try:
         lines = path.read_text(encoding="ascii").splitlines()
@@ -129,7 +129,7 @@ class Parameters(Mapping[str, float]):
         self._watchers.append(watcher)
 
     def assign(self, name: str, value: float) -> float:
-        """Set a parameter without access checks (also read-only ones) and return the stored value.
+        """Set a parameter, even if it is read-only for clients, and return the stored value.
 
         Raises:
             UnknownParameterError: The parameter does not exist.
@@ -160,7 +160,7 @@ class Parameters(Mapping[str, float]):
         self._save()
 
     def changes(self) -> dict[str, float]:
-        """Return the stored parameters that differ from their defaults, as restored by the next boot."""
+        """Return the parameters that the next boot restores: stored values that differ from their defaults."""
         return {
             row.name: self._values[row.name]
             for row in table()

@@ -6,7 +6,7 @@ import math
 
 
 class Profile:
-    """Distance, speed and acceleration over time. The profile is symmetric in time."""
+    """Distance, speed and acceleration over time. The second half of the profile mirrors the first half."""
 
     def __init__(self, length_m: float, speed_mps: float, accel_mps2: float, jerk_mps3: float) -> None:
         speed = min(speed_mps, self._fastest(length_m, accel_mps2, jerk_mps3))
@@ -21,7 +21,7 @@ class Profile:
 
     @staticmethod
     def _fastest(length_m: float, accel: float, jerk: float) -> float:
-        """Return the speed that can just be reached halfway."""
+        """Return the maximum speed that can be reached at half of the distance."""
         speed = 0.5 * accel * (math.sqrt((accel / jerk) ** 2 + 4.0 * length_m / accel) - accel / jerk)
         return speed if speed * jerk >= accel * accel else (length_m * length_m * jerk / 4.0) ** (1.0 / 3.0)
 

@@ -40,9 +40,9 @@ def mandatory_refusals(v: VehicleState) -> list[str]:
 
 
 def mode_refusal(v: VehicleState) -> str | None:
-    """Return the refusal if the vehicle cannot be armed in the current mode, or None.
+    """Return the refusal if the current mode does not allow arming, or None.
 
-    Used after all checks have passed.
+    Call this after all other checks have passed.
     """
     return None if TRAITS[v.mode].arms else f"{mode_title(v.mode)} mode not armable"
 

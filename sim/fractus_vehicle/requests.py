@@ -93,7 +93,7 @@ def _request_message(v: VehicleState, o: Command, c: Channel) -> int:
     name = _message_name(o.params[0])
     if name is None:
         return mavlink.MAV_RESULT_FAILED
-    send(v, c, name)  # accepted even if the message has no data now
+    send(v, c, name)  # the command is accepted even if the message cannot be sent for lack of data
     return mavlink.MAV_RESULT_ACCEPTED
 
 

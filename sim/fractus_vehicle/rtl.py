@@ -60,7 +60,7 @@ class ReturnToLaunch(Flight):
         v.touch_time_s = 0.0
 
     def step(self, v: VehicleState) -> None:
-        """Fly the current stage and switch to the next one."""
+        """Fly the current stage. Switch to the next stage when it is complete."""
         control = v.control
         if self._leg is not None:
             self._leg.step(v)
@@ -82,7 +82,7 @@ class ReturnToLaunch(Flight):
             descend(v)
 
     def _climb(self, v: VehicleState) -> None:
-        """Stop and climb at the stopping position. The return leg begins at the top."""
+        """Stop, and climb at the position where the vehicle comes to rest. Then begin the return leg."""
         if self._leg is None:
             self._leg = Leg(v, *resting_place(v)[:2], self._down)
         elif self._arrived(v):

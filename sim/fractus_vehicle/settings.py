@@ -11,7 +11,7 @@ from fractus_vehicle.params import Parameters
 from fractus_vehicle.sensors import Battery
 from fractus_vehicle.shaping import clamp
 
-# Share of the jerk parameter that remains available after the attitude controllers.
+# Share of PSC_JERK_XY that is used for position targets. The attitude controllers need the rest.
 JERK_SHARE = 0.75
 
 # AVOID_ENABLE bit: limit velocities at the fence.
@@ -49,7 +49,8 @@ def set_limits(params: Parameters, control: Control) -> None:
 def set_fence(params: Parameters, fence: Fence, changed: str = "FENCE_ENABLE") -> None:
     """Set the limits of the fence.
 
-    Only a change of FENCE_ENABLE switches the fence on or off, because commands can switch it too.
+    Changes of other parameters than FENCE_ENABLE do not enable or disable the fence, because a command may have done
+    so.
     """
     if changed == "FENCE_ENABLE":
         fence.enabled = int(params["FENCE_ENABLE"]) != 0

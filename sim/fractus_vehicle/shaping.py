@@ -1,15 +1,15 @@
 """Motion shaping: approach a target under speed, acceleration and jerk limits.
 
 Reimplements the square-root controller and kinematic shaping of ArduPilot (AP_Math/control.cpp) for scalars and pairs
-of floats. They determine flight times and peak speeds.
+of floats. Flight times and peak speeds depend on these functions.
 """
 
 from __future__ import annotations
 
 import math
 
-# Share of the acceleration limit used to approach a position without overshoot. Fitted to a real ArduCopter, together
-# with the share of PSC_JERK_XY in `settings`: 50 m in 9.3 s with a peak of 8.4 m/s.
+# Share of the acceleration limit that is used to approach a position without overshoot. This value and
+# `settings.JERK_SHARE` are fitted to a real ArduCopter, which flies 50 m in 9.3 s with a peak speed of 8.4 m/s.
 BRAKING_SHARE = 0.5
 
 
@@ -26,7 +26,10 @@ def wrap_pi(angle_rad: float) -> float:
 
 
 def sqrt_controller(error: float, gain: float, limit: float, dt: float) -> float:
-    """Return a correction whose rate of change never exceeds `limit`: linear near zero, a square root beyond."""
+    """Return a correction for an error: linear near zero, a square root beyond.
+
+    Its rate of change is at most `limit`.
+    """
     linear = limit / (gain * gain)
     if error > linear:
         correction = math.sqrt(2.0 * limit * (error - linear / 2.0))
@@ -41,7 +44,7 @@ def sqrt_controller(error: float, gain: float, limit: float, dt: float) -> float
 def shape_velocity(
     target: float, velocity: float, acceleration: float, *, accel_max: float, jerk_max: float, dt: float
 ) -> float:
-    """Return the next acceleration that brings `velocity` to `target` under both limits."""
+    """Return the next acceleration that brings `velocity` to `target` within the acceleration and jerk limits."""
     demand = sqrt_controller(target - velocity, jerk_max / accel_max, jerk_max, dt)
     demand = clamp(demand, -accel_max, accel_max)
     step = jerk_max * dt

@@ -21,7 +21,7 @@ _LINK_LOCAL = frozenset({"RADIO_STATUS", "RADIO", "SETUP_SIGNING"})
 
 
 class Craft:
-    """A vehicle with its links. It survives a reboot of the vehicle."""
+    """A vehicle with its links. The links stay open when the vehicle reboots."""
 
     def __init__(self, config: VehicleConfig) -> None:
         self.config = config
@@ -91,7 +91,7 @@ class Craft:
             self._recorder.write(struct.pack(">Q", self.vehicle.state.unix_us) + frame)
 
     def record(self, file: BinaryIO, rate_hz: float = 4.0) -> None:
-        """Record a tlog of all sent streams at `rate_hz` and all received messages."""
+        """Record a tlog with all received messages and, at `rate_hz`, all stream messages."""
         self._recorder = file
         channel = Channel(self.config.sysid, name="recorder", tap=self._log, discard=True)
         self.vehicle.attach(channel)
@@ -124,7 +124,10 @@ class Simulation:
             craft.step()
 
     def quiet_steps(self, most: int) -> int:
-        """Return the number of steps until a stream message is due, from 1 to `most`. STATUSTEXTs are not predicted."""
+        """Return the number of steps until the next stream message is due, from 1 to `most`.
+
+        STATUSTEXTs are not considered.
+        """
         quiet_s = min(
             (
                 channel.next_send_s - craft.vehicle.state.time_s

@@ -15,7 +15,7 @@ from fractus_vehicle.home import return_point
 from fractus_vehicle.leg import Leg
 from fractus_vehicle.state import CONTROL_STEP_S, VehicleState
 
-# Height above the last point at which it is approached.
+# Height of the approach above the last point of the path.
 ABOVE_LAST_M = 2.0
 STOPPED_MPS = 0.5
 
@@ -52,12 +52,12 @@ class SmartReturn(Flight):
         self._cleanup = v.breadcrumbs.simplify_fully()
 
     def end(self, v: VehicleState) -> None:
-        """Put back the point that was not reached, so that the path stays complete."""
+        """Put the current target point back into the path if it was not reached, so that the path stays complete."""
         if self.stage is SmartStage.PATH_FOLLOW and self._popped is not None and not v.breadcrumbs.add(self._popped):
             v.send_text(mavlink.MAV_SEVERITY_ERROR, "SmartRTL: lost one point")
 
     def step(self, v: VehicleState) -> None:
-        """Fly the current stage and switch to the next one."""
+        """Fly the current stage. Switch to the next stage when it is complete."""
         if self.stage is SmartStage.WAIT_FOR_PATH_CLEANUP:
             try:
                 next(self._cleanup)

@@ -11,8 +11,8 @@ from fractus_vehicle.state import CONTROL_STEP_S, VehicleState
 
 _SAMPLES = 64
 _SLOWEST_MPS = 0.3
-# Length of the tangent at an end at rest, as a share of the distance. A zero tangent would leave the curve without
-# direction there.
+# Length of the tangent at an end where the vehicle rests, as a share of the distance. A tangent of length zero would
+# have no direction.
 AT_REST = 0.1
 
 
@@ -41,7 +41,10 @@ class SplineLeg:
         self._allowed_mps = self._profile(v)
 
     def _profile(self, v: VehicleState) -> list[float]:
-        """Return the maximum speed at each sample that allows braking for bends, climbs and the end."""
+        """Return the maximum speed at each sample of the curve.
+
+        The vehicle can brake from it for bends, climbs and the end.
+        """
         allowed = [self._local_limit(v, step / _SAMPLES) for step in range(_SAMPLES + 1)]
         allowed[-1] = 0.0 if self._stops else allowed[-1]
         limits = v.control.limits
@@ -51,14 +54,14 @@ class SplineLeg:
             distance_m = math.dist(self.at(step / _SAMPLES), self.at((step + 1) / _SAMPLES))
             allowed[step] = min(allowed[step], math.sqrt(allowed[step + 1] ** 2 + braking * distance_m))
             left_m += distance_m
-            if self._stops:  # the last metres approach a position: the jerk limit allows no more
+            if self._stops:  # the jerk limit restricts the speed of the approach to the end
                 gain = 0.5 * limits.jerk_mps3 / limits.accel_mps2
                 slower = sqrt_controller(left_m, gain, BRAKING_SHARE * limits.accel_mps2, CONTROL_STEP_S)
                 allowed[step] = min(allowed[step], slower)
         return allowed
 
     def at(self, share: float) -> Point:
-        """Return the point at a share (0 to 1) of the curve parameter."""
+        """Return the point of the curve at a parameter from 0 to 1."""
         x, y, z = (((d * share + c) * share + b) * share + a for a, b, c, d in self._curve)
         return (x, y, z)
 
@@ -101,7 +104,8 @@ class SplineLeg:
             dt=dt,
         )
         if self._speed_mps + self._accel_mps2 * dt > speed_mps:
-            # The profile already allows for braking. Shaping it again would make the vehicle arrive too fast.
+            # Brake exactly as the profile requires, because its speeds already include the braking distance. With jerk
+            # limits, the vehicle would arrive too fast.
             self._accel_mps2 = max((speed_mps - self._speed_mps) / dt, -control.limits.accel_mps2)
         self._speed_mps = max(self._speed_mps + self._accel_mps2 * dt, 0.0)
         slope, bend = self._slopes(self._share)

@@ -69,7 +69,7 @@ class ActiveFailsafes:
 
 
 class VehicleState:
-    """State of one vehicle, with derived values and simple transitions."""
+    """State of one vehicle, with derived values and simple state changes."""
 
     def __init__(self, config: VehicleConfig) -> None:
         self.config = config
@@ -202,9 +202,9 @@ class VehicleState:
         return -self.est.down
 
     def altitude_base_m(self, frame: int) -> float | None:
-        """Return the AMSL altitude of the zero level of a global frame.
+        """Return the altitude above mean sea level to which altitudes in a global frame are relative.
 
-        Returns None for other frames, and for terrain frames if TERRAIN_ENABLE is not set.
+        Returns None for all other frames, and for terrain frames if TERRAIN_ENABLE is not set.
         """
         if frame in ABSOLUTE_FRAMES:
             return 0.0
@@ -284,7 +284,7 @@ class VehicleState:
 
     def begin_takeoff(self, down: float) -> None:
         """Spool up and climb to `down` (local)."""
-        if not self.taking_off:  # the motors are already running if a takeoff is repeated
+        if not self.taking_off:  # in a repeated takeoff command, the motors have already spooled up
             ready = self.armed_at_s + ARMING_DELAY_S
             spool = self.params["MOT_SPOOL_TIME"] + 0.5 * self.params["TKOFF_SLEW_TIME"]
             self.lift_after_s = max(self.time_s, ready) + spool

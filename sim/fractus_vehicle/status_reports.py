@@ -53,7 +53,7 @@ def heartbeat(v: VehicleState) -> Values:
         | mavlink.MAV_MODE_FLAG_STABILIZE_ENABLED
         | mavlink.MAV_MODE_FLAG_MANUAL_INPUT_ENABLED
     )
-    # Set while the position controller runs, and until the main loop starts.
+    # The guided flag is set in modes with position control. In all modes, it is also set until the main loop starts.
     if v.mode not in WITHOUT_POSITION_CONTROL or not v.estimator.initialised:
         flags |= mavlink.MAV_MODE_FLAG_GUIDED_ENABLED
     if v.armed or v.motor_test_until_s is not None:

@@ -54,7 +54,7 @@ BUILDERS: dict[str, Builder] = {
     "ALTITUDE": motion_reports.altitude,
 }
 
-# Messages that ArduCopter supports but sends only with a device or in a state that is not simulated.
+# Messages that ArduCopter supports. It sends them only with a device or in a state that is not simulated.
 SILENT = frozenset(
     [
         "ADSB_VEHICLE",

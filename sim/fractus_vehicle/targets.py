@@ -83,7 +83,7 @@ def global_target(v: VehicleState, flight: Flight, m: Message) -> None:
     position = (0.0, 0.0, 0.0)
     if origin is None or not isinstance(flight, GuidedFlight):
         return
-    if not m.integer("type_mask") & IGNORE_POSITION:  # without a position, frame and coordinates are ignored
+    if not m.integer("type_mask") & IGNORE_POSITION:  # otherwise frame and coordinates are ignored
         if not valid_coordinates(lat, lon):
             _stop(v, flight)
             return
@@ -98,7 +98,7 @@ def global_target(v: VehicleState, flight: Flight, m: Message) -> None:
 
 
 def _stop(v: VehicleState, flight: Flight) -> None:
-    """Stop, as ArduCopter does on an invalid target."""
+    """Stop the vehicle, as ArduCopter does when it receives an invalid target."""
     if isinstance(flight, GuidedFlight) and v.armed and not v.landed:
         v.taking_off_until_m = None
         flight.stop(v)
@@ -108,7 +108,7 @@ def _target(v: VehicleState, flight: Flight, m: Message, setpoint: Setpoint) -> 
     """Validate the type mask and pass the target to GUIDED. Silently drop targets outside the fence."""
     if not isinstance(flight, GuidedFlight) or not v.armed:
         return
-    # A target ends a takeoff. If the vehicle has not left the ground yet, it stays there, like ArduCopter.
+    # As in ArduCopter, a target aborts a takeoff. The vehicle stays on the ground if it has not left it yet.
     v.taking_off_until_m = None
     if v.landed:
         return

@@ -26,7 +26,7 @@ def send_on_all(v: VehicleState, name: str) -> None:
 
 
 def serve(v: VehicleState, channel: Channel) -> None:
-    """Send all due stream messages and a part of a requested parameter list on one link."""
+    """Send all due stream messages, and the next part of a requested parameter list, on one link."""
     for name in channel.due(v.time_s):
         send(v, channel, name)
     for _ in range(min(PARAMETERS_PER_TICK, len(channel.parameters))):

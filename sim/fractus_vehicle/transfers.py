@@ -30,7 +30,7 @@ TITLES = {
     mavlink.MAV_MISSION_TYPE_FENCE: "Fence",
     mavlink.MAV_MISSION_TYPE_RALLY: "Rally",
 }
-# Requests refused during an upload of the same list. The older MISSION_REQUEST is still served.
+# Requests that are refused during an upload of the same list. The older MISSION_REQUEST is not refused.
 REFUSED_DURING_UPLOAD = {
     "MISSION_REQUEST_LIST": mavlink.MAV_MISSION_DENIED,
     "MISSION_REQUEST_INT": mavlink.MAV_MISSION_DENIED,
@@ -107,7 +107,7 @@ class Transfers:
             case "MISSION_WRITE_PARTIAL_LIST":
                 start = message.integer("start_index")
                 end = message.integer("end_index")
-                # A write may append one item.
+                # A partial write may also append one item.
                 if 0 <= start <= end <= len(store.items):
                     self._begin(channel, message, store, range(start, end + 1))
                 else:
@@ -124,7 +124,7 @@ class Transfers:
             case "MISSION_CLEAR_ALL":
                 self._ack(channel, message, kind, self._clear(store))
             case _:
-                pass  # MISSION_ACK: an upload cancelled by its sender times out
+                pass  # MISSION_ACK of a client that cancels its upload: the upload then times out
 
     def _begin(self, channel: Channel, message: Message, store: ItemStore, item_range: range) -> None:
         """Start the upload of the given item range: a whole new list, or a part of the stored list."""
@@ -166,7 +166,7 @@ class Transfers:
             self._send_text(mavlink.MAV_SEVERITY_WARNING, "got MISSION_ITEM; GCS should send MISSION_ITEM_INT")
         seq = message.integer("seq")
         if seq != up.next or not up.is_from(message):
-            # The upload continues. A repeated item gets the same error.
+            # An error for a wrong or repeated item does not end the upload.
             refusal = mavlink.MAV_MISSION_INVALID_SEQUENCE if seq != up.next else mavlink.MAV_MISSION_DENIED
             self._ack(channel, message, store.kind, refusal)
             return
@@ -178,8 +178,8 @@ class Transfers:
             return
         up.items[seq : seq + 1] = [item]
         if store.kind == mavlink.MAV_MISSION_TYPE_MISSION and up.next < up.last:
-            # Mission items are stored as they arrive. An aborted upload leaves the received items and none of the old
-            # ones.
+            # Each mission item is stored when it arrives. After an aborted upload, the mission consists of the received
+            # items only.
             self._replace(store, list(up.items))
         up.next += 1
         up.received_s = self.now_s

@@ -57,7 +57,7 @@ class Vehicle:
         self.transfers.detach(channel)
 
     def arm(self) -> None:
-        """Start the motors. The caller has run the arming checks."""
+        """Start the motors. The caller must have run the arming checks."""
         v = self.state
         v.armed = True
         v.armed_at_s = v.idle_since_s = v.time_s

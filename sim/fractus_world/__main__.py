@@ -62,7 +62,7 @@ def _origin(_context: click.Context, _option: click.Parameter, text: str | None)
     default=DEFAULT_LISTEN,
     show_default=True,
     metavar="HOST:PORT",
-    help="Address to serve at.",
+    help="Address of the HTTP server.",
 )
 @click.option(
     "--vehicle",
@@ -75,7 +75,7 @@ def _origin(_context: click.Context, _option: click.Parameter, text: str | None)
     "--pose",
     callback=_pose,
     metavar="LAT,LON,HEIGHT[,HEADING[,PITCH[,ROLL]]]",
-    help="Use a fixed camera HEIGHT metres above the ground instead of --vehicle.",
+    help="Use a fixed camera instead of --vehicle. HEIGHT is in metres above the ground.",
 )
 @click.option(
     "--ground",
@@ -110,7 +110,10 @@ def _origin(_context: click.Context, _option: click.Parameter, text: str | None)
     help="Direction of the camera, degrees clockwise from the nose.",
 )
 @click.option(
-    "--stabilised/--fixed-mount", default=True, show_default=True, help="Whether a gimbal compensates roll and pitch."
+    "--stabilised/--fixed-mount",
+    default=True,
+    show_default=True,
+    help="Camera with or without a gimbal.",
 )
 @click.option("--seed", type=int, default=7, show_default=True, help="Seed of the landscape and of the moving objects.")
 @click.option(

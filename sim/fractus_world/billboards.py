@@ -39,9 +39,9 @@ class Billboard:
 
     Attributes:
         id: Identical in every picture.
-        x: Metres east of the world's origin, middle of the lower edge.
-        y: Metres north.
-        heading_deg: Upright: direction that the front faces. Lying: direction of the top edge.
+        x: Metres east of the world's origin, of the middle of the lower edge.
+        y: Metres north of the world's origin, of the middle of the lower edge.
+        heading_deg: Direction of the front side. For a billboard on the ground: direction of its top edge.
         standing: True if the billboard is upright.
         height_m: Height of the picture.
         variation: Index of the variation of the photograph.
@@ -79,7 +79,7 @@ class Billboard:
         return np.array([base + (u - 0.5) * width * right + (1.0 - v) * self.height_m * up for u, v in shares])
 
     def faces(self, viewer: Matrix) -> bool:
-        """Return True if a viewer at a point of the world's frame, shape (3,), sees the front."""
+        """Return True if a viewer sees the front. `viewer` is a point in the world's frame, shape (3,)."""
         corners = self.corners()
         front = np.cross(corners[3] - corners[0], corners[1] - corners[0])
         return bool(front @ (viewer - corners[0]) > 0.0)

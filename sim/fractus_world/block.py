@@ -1,4 +1,4 @@
-"""A block: one mesh of the road network with ground, buildings, trees and parked cars."""
+"""A block: the area between four roads, with ground, buildings, trees and parked cars."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ class Roof:
     """Top view of a building.
 
     Attributes:
-        corners: Four corners. The ridge is parallel to the side from the first to the second.
-        height_m: Height above the ground, for its shadow.
+        corners: Four corners. The ridge is parallel to the side between the first two corners.
+        height_m: Height above the ground. It determines the length of the shadow.
         colour: Blue, green, red.
         gabled: True if the roof has a ridge.
     """
@@ -59,7 +59,7 @@ class Parking:
 
 @dataclass
 class Block:
-    """One mesh of the road network.
+    """The area between four roads.
 
     Attributes:
         kind: Land use.

@@ -1,4 +1,4 @@
-"""Shapes of vehicles and people: convex parts that are drawn one over the other."""
+"""Shapes of vehicles and people: convex parts that are drawn on top of each other."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def parts_of(thing: Thing) -> tuple[Part, ...]:
 
 
 def _outline(length: float, width: float, *, nose: float = 0.0, round_m: float = 0.3) -> Points:
-    """Return a rectangle with cut corners around the origin. `nose` shifts it ahead."""
+    """Return a rectangle with cut corners around the origin, shifted ahead by `nose` metres."""
     a = length / 2
     b = width / 2
     c = round_m

@@ -224,7 +224,7 @@ class CameraApi:
 
 
 class _RenderSlot:
-    """Permission to render. One request renders at a time, and a few others wait for a limited time."""
+    """Permission to render. One request renders at a time. A few other requests wait for a limited time."""
 
     def __init__(self, waiting: threading.BoundedSemaphore, busy: threading.Lock) -> None:
         self._waiting = waiting

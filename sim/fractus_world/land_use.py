@@ -45,11 +45,11 @@ class Site:
     """A block during its layout.
 
     Attributes:
-        block: Current content.
+        block: Block to which content is added.
         inside: Ground area without roads and verges.
         roll: Random source.
         crop: Crop of the first field.
-        trees: Trees as in `Block`, but as a list.
+        trees: Trees: x, y, crown radius, and a number that selects the appearance.
         built: Ground areas of houses.
     """
 
@@ -63,14 +63,14 @@ class Site:
 
 @dataclass(frozen=True, slots=True)
 class _Frontage:
-    """A point at a road with the directions along the road and away from it into the block."""
+    """A point at a road, with two directions: along the road, and from the road into the block."""
 
     origin: tuple[float, float]
     along: tuple[float, float]
     away: tuple[float, float]
 
     def box(self, a0: float, n0: float, a1: float, n1: float) -> shapely.Polygon:
-        """Return a rectangle between two distances along the road and two distances away from it."""
+        """Return the rectangle between two distances along the road and two distances from the road."""
         x, y = self.origin
         ax, ay = self.along
         nx, ny = self.away
@@ -168,14 +168,14 @@ def _park(site: Site) -> None:
 
 
 def _works(site: Site) -> None:
-    """Add halls on a paved yard with a car park."""
+    """Add industrial halls on a paved yard with a car park."""
     block = site.block
     inside = site.inside
     roll = site.roll
     block.patches.append(Patch(_corners(inside), _tinted(_PAVEMENT, roll, 6), 50))
     sides = inside.minimum_rotated_rectangle.exterior.coords
-    turn = math.degrees(math.atan2(sides[1][1] - sides[0][1], sides[1][0] - sides[0][0])) % 90.0
-    level = affinity.rotate(inside, -turn, origin=inside.centroid)
+    angle = math.degrees(math.atan2(sides[1][1] - sides[0][1], sides[1][0] - sides[0][0])) % 90.0
+    level = affinity.rotate(inside, -angle, origin=inside.centroid)
     west, south, east, north = level.bounds
     taken = shapely.Polygon()
     for _ in range(12):
@@ -186,16 +186,16 @@ def _works(site: Site) -> None:
         hall = shapely.box(x, y, x + w, y + d)
         if level.contains(hall.buffer(4)) and not hall.buffer(9).intersects(taken):
             taken = taken.union(hall)
-            corners = _corners(affinity.rotate(hall, turn, origin=inside.centroid))
+            corners = _corners(affinity.rotate(hall, angle, origin=inside.centroid))
             block.roofs.append(
                 Roof(corners, roll.uniform(6, 11), _tinted(roll.choice(_HALLS), roll, 8), roll.random() < 0.3)
             )
-    _car_park(site, level, taken, turn)
+    _car_park(site, level, taken, angle)
     rim = inside.difference(inside.buffer(-5.0))
     _scatter(site, rim, 60, (1.2, 3.2))
 
 
-def _car_park(site: Site, level: shapely.Polygon, taken: shapely.Geometry, turn: float) -> None:
+def _car_park(site: Site, level: shapely.Polygon, taken: shapely.Geometry, angle: float) -> None:
     block = site.block
     roll = site.roll
     origin = site.inside.centroid
@@ -207,11 +207,11 @@ def _car_park(site: Site, level: shapely.Polygon, taken: shapely.Geometry, turn:
             place = shapely.box(x, y, x + 2.5, y + 5.0)
             if not level.contains(place) or taken.intersects(place):
                 continue
-            shape = affinity.rotate(place, turn, origin=origin)
+            shape = affinity.rotate(place, angle, origin=origin)
             block.patches.append(Patch(_corners(shape), (108, 110, 112), 40))
             if roll.random() < 0.42:
                 middle = shape.centroid
-                block.parked.append(Parking(middle.x, middle.y, -turn + 180.0 * (roll.random() < 0.4)))
+                block.parked.append(Parking(middle.x, middle.y, -angle + 180.0 * (roll.random() < 0.4)))
 
 
 def _houses(site: Site) -> None:
@@ -222,15 +222,15 @@ def _houses(site: Site) -> None:
     block.patches.append(Patch(_corners(inside), _tinted(_LAWN, roll, 6), 110))
     whole = shapely.Polygon(block.outline)
     sides = inside.minimum_rotated_rectangle.exterior.coords
-    turn = math.degrees(math.atan2(sides[1][1] - sides[0][1], sides[1][0] - sides[0][0]))
-    west, south, east, north = affinity.rotate(inside, -turn, origin=inside.centroid).bounds
+    angle = math.degrees(math.atan2(sides[1][1] - sides[0][1], sides[1][0] - sides[0][0]))
+    west, south, east, north = affinity.rotate(inside, -angle, origin=inside.centroid).bounds
     rows: shapely.Geometry = inside
     count = max(round((north - south) / 88.0), 1)
     for k in range(1, count):
         y = south + (north - south) * k / count
         for half, colour in ((4.6, (150, 154, 157)), (2.8, _STREET)):
             street = affinity.rotate(
-                shapely.box(west - 40, y - half, east + 40, y + half), turn, origin=inside.centroid
+                shapely.box(west - 40, y - half, east + 40, y + half), angle, origin=inside.centroid
             )
             part = street.intersection(whole)
             if isinstance(part, shapely.Polygon):
@@ -267,7 +267,7 @@ def _row(site: Site, ground: shapely.Polygon) -> list[shapely.Geometry]:
 
 
 def _frontage(line: shapely.LinearRing, at_m: float) -> _Frontage:
-    """Return the frontage at a distance along a ring of any orientation. `away` points to its inside."""
+    """Return the frontage at a distance along a closed line. Its direction `away` points to the inside of the line."""
     behind = line.interpolate(at_m - 1.0)
     ahead = line.interpolate(at_m + 1.0)
     length = max(math.hypot(ahead.x - behind.x, ahead.y - behind.y), 1e-6)

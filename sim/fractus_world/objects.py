@@ -31,7 +31,7 @@ _SHADELESS_PX = 5.0
 _TINY_PX = 1.2
 _MIN_BOARD_PX = 6.0
 _REACH = 0.55
-"""Maximum distance of drawn objects in metres, divided by the focal length in pixels."""
+"""Maximum distance of drawn objects, as metres per pixel of the focal length."""
 _SHADOW = 0.5
 _BOARD_BACK = (96, 100, 104)
 _FRAME_WARMTH = 118
@@ -60,7 +60,7 @@ class _InSight:
     Attributes:
         what: The object or billboard.
         away_m: Distance from the camera. Nearer objects cover farther ones.
-        shapes: Drawn parts. A billboard has one.
+        shapes: Drawn parts. A billboard has only one part.
         shadow: Shadow in fixed-point pixels. None without shadow or if one of its corners is out of sight.
         points: All corners in pixels.
     """
@@ -107,7 +107,7 @@ class ObjectLayer:
     def truth(
         self, view: View, in_sight: list[_InSight], frame: LocalFrame
     ) -> tuple[tuple[Seen, ...], tuple[SeenFace, ...]]:
-        """Return the visible share of each object."""
+        """Return the visible objects and faces with their visible shares."""
         lens = view.intrinsics
         labels = np.zeros((lens.height, lens.width), np.int32)
         for number, item in enumerate(in_sight, start=1):
@@ -129,7 +129,7 @@ class ObjectLayer:
 
 
 def _thing_actors(view: View, things: list[Thing]) -> list[_InSight]:
-    """Return the visible things. The corners of all things are projected together."""
+    """Return the visible things. The corners of all things are projected in one step, which is faster."""
     if not things:
         return []
     place = np.array([(thing.x, thing.y) for thing in things]) - view.place
@@ -226,7 +226,7 @@ def _hull(pixels: Matrix) -> Fixed:
 
 
 def _fixed(points: Matrix) -> Fixed:
-    """Return pixel coordinates as fixed-point numbers of OpenCV. Their origin is the centre of the first pixel."""
+    """Convert pixel coordinates to OpenCV's fixed-point coordinates, whose origin is the centre of the first pixel."""
     return np.round((np.clip(points, -_FAR_PX, _FAR_PX) - 0.5) * (1 << _SHIFT)).astype(np.int32)
 
 
@@ -316,7 +316,14 @@ def _box(points: Matrix, view: View) -> Box | None:
 
 
 def _shares(view: View, hulls: Iterable[Fixed], labels: Labels, number: int) -> tuple[float, float]:
-    """Return the share of hulls inside the picture, and the share that is also visible, according to the labels."""
+    """Return the share of hulls inside the picture, and the share that is also not occluded.
+
+    Args:
+        view: Geometry of the picture.
+        hulls: Parts of the object.
+        labels: Number of the nearest object at each pixel.
+        number: Number of the object.
+    """
     pieces = list(hulls)
     points = np.vstack(pieces)[:, 0, :] / (1 << _SHIFT)
     low = np.floor(points.min(axis=0)) - 1
@@ -342,7 +349,7 @@ def _shares(view: View, hulls: Iterable[Fixed], labels: Labels, number: int) -> 
 def _true_heading(view: View, heading_deg: float) -> float:
     """Convert a heading in the world's frame to a heading from true north at the camera."""
     angle = math.radians(heading_deg)
-    east, north = view.unturn @ np.array([math.sin(angle), math.cos(angle)])
+    east, north = view.from_world @ np.array([math.sin(angle), math.cos(angle)])
     return math.degrees(math.atan2(east, north))
 
 

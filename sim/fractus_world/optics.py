@@ -1,4 +1,4 @@
-"""Camera geometry: position, attitude, mount and lens as one mapping between ground and pixels.
+"""Camera geometry: the mapping between ground and pixels by position, attitude, mount and lens.
 
 Frames: the ground is the plane through the point below the camera, in metres east and north of it. Directions are east,
 north, up. Pixel coordinates have their origin in the upper left corner of the picture, so the centre of the first pixel
@@ -118,7 +118,7 @@ def _about_z(angle_deg: float) -> Matrix:
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
-# Camera axes (right, down, ahead) to airframe axes (ahead, right, down), and north, east, down to east, north, up.
+# _AXES: camera axes (right, down, ahead) to airframe axes (ahead, right, down). _TO_ENU: north, east, down to ENU.
 _AXES = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 _TO_ENU = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 
@@ -131,8 +131,8 @@ def camera_rotation(pose: Pose, mount: Mount) -> Matrix:
     return np.asarray(_TO_ENU @ body @ _about_z(mount.yaw_deg) @ _about_y(mount.pitch_deg) @ _AXES)
 
 
-def plane_turn(frame: LocalFrame, lat: float, lon: float) -> Matrix:
-    """Return one metre east and north at a place as vectors of a frame, because north differs between places."""
+def local_axes(frame: LocalFrame, lat: float, lon: float) -> Matrix:
+    """Return the matrix from metres east and north at a place to metres in a frame. The directions differ slightly."""
     phi = math.radians(lat)
     origin = math.radians(frame.lat)
     apart = math.radians(lon - frame.lon)
@@ -156,28 +156,28 @@ class View:
         rotation: Rotation from camera axes to east, north, up.
         height_m: Height of the camera above the ground.
         place: Point below the camera, metres east and north of the world's origin.
-        turn: One metre east and north at the camera as vectors of the world's frame.
-        unturn: Inverse of `turn`.
+        to_world: Matrix from metres east and north at the camera to metres in the world's frame.
+        from_world: Inverse of `to_world`.
     """
 
     intrinsics: Intrinsics
     rotation: Matrix
     height_m: float
     place: Matrix
-    turn: Matrix
-    unturn: Matrix
+    to_world: Matrix
+    from_world: Matrix
 
     @classmethod
     def of(cls, pose: Pose, mount: Mount, intrinsics: Intrinsics, frame: LocalFrame) -> View:
         """Return the view of a camera on an airframe, in the frame of a world."""
-        turn = plane_turn(frame, pose.lat, pose.lon)
+        to_world = local_axes(frame, pose.lat, pose.lon)
         return cls(
             intrinsics,
             camera_rotation(pose, mount),
             max(pose.height_m, MIN_HEIGHT_M),
             np.array(frame.xy(pose.lat, pose.lon)),
-            turn,
-            np.asarray(np.linalg.inv(turn), np.float64),
+            to_world,
+            np.asarray(np.linalg.inv(to_world), np.float64),
         )
 
     def rays(self, pixels: Matrix) -> Matrix:
@@ -200,14 +200,14 @@ class View:
         )
         rays = self.rotation @ inverse
         local = -self.height_m * rays[:2]
-        return np.vstack((self.turn @ local + np.outer(self.place, rays[2]), rays[2]))
+        return np.vstack((self.to_world @ local + np.outer(self.place, rays[2]), rays[2]))
 
     def project(self, points: Matrix) -> tuple[Matrix, Matrix]:
         """Return pixels, shape (n, 2), and depths in metres, shape (n,), of points of the world's frame, shape (n, 3), z up.
 
         Pixels of points nearer than `NEAR_M` are invalid.
         """
-        plane = (points[:, :2] - self.place) @ self.unturn.T
+        plane = (points[:, :2] - self.place) @ self.from_world.T
         camera = np.column_stack((plane, points[:, 2] - self.height_m)) @ self.rotation
         depth = camera[:, 2]
         lens = self.intrinsics
@@ -216,7 +216,10 @@ class View:
         return pixels, depth
 
     def ground_within(self, limit_m: float) -> Matrix | None:
-        """Return the bounding box ((x0, y0), (x1, y1)) of the visible ground up to a distance, or None if no ground is visible."""
+        """Return the bounding box ((x0, y0), (x1, y1)) of the visible ground up to a distance.
+
+        Returns None if no ground is visible.
+        """
         lens = self.intrinsics
         steps = np.linspace(0.0, 1.0, 9)
         u, v = np.meshgrid(steps * lens.width, steps * lens.height)
@@ -228,5 +231,5 @@ class View:
         far = np.where(down > 1e-6, self.height_m * flat / np.maximum(down, 1e-6), limit_m)
         far = np.minimum(far, limit_m)
         local = rays[:, :2] / np.maximum(flat, 1e-9)[:, None] * far[:, None]
-        ground = local @ self.turn.T + self.place
+        ground = local @ self.to_world.T + self.place
         return np.array([ground.min(axis=0), ground.max(axis=0)])

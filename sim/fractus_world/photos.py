@@ -1,4 +1,4 @@
-"""Photographs of a place instead of a rendered world: the geotagged picture of a directory that was taken nearest."""
+"""Photographs instead of a rendered world. The camera shows the geotagged picture that was taken nearest to it."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class Photo:
 
 
 class Photos:
-    """Index of geotagged pictures, separate for daylight and thermal.
+    """Index of geotagged pictures, separately for daylight and thermal pictures.
 
     A picture is thermal if a folder in its path below the directory is named `ir` or `thermal`, or if its name ends in
     `_ir`, `-ir`, `_thermal` or `_T` (DJI).
@@ -77,7 +77,7 @@ class Photos:
             PhotoError: The directory does not exist, is too large, or contains no geotagged picture.
         """
         if not directory.is_dir():
-            raise PhotoError(f"{directory}: is no directory")
+            raise PhotoError(f"{directory}: is not a directory")
         paths = sorted(path for path in directory.rglob("*") if path.suffix.lower() in _SUFFIXES and path.is_file())
         if len(paths) > MAX_FILES:
             raise PhotoError(f"{directory}: has {len(paths):,} pictures; at most {MAX_FILES:,} are indexed")
@@ -87,7 +87,7 @@ class Photos:
         return cls(photos)
 
     def nearest(self, lat: float, lon: float, amsl_m: float, band: Band) -> tuple[Photo, float]:
-        """Return the picture of a band that was taken nearest to a position, and its distance in three dimensions in metres.
+        """Return the picture of a band that was taken nearest to a position, and its spatial distance in metres.
 
         Raises:
             PhotoError: There is no picture of the band.
@@ -129,7 +129,7 @@ def _read(path: Path, directory: Path) -> Photo | None:
 
 
 def _angle(parts: Any, reference: Any, negative: str) -> float:
-    """Return an EXIF angle (degrees, minutes, seconds) in degrees, with the sign of its reference letter."""
+    """Convert an EXIF angle (degrees, minutes, seconds) to degrees. Its sign follows from the reference letter."""
     degrees, minutes, seconds = (float(part) for part in parts)
     sign = -1.0 if str(reference).upper().startswith(negative) else 1.0
     return sign * (degrees + minutes / 60.0 + seconds / 3600.0)

@@ -148,9 +148,9 @@ class TownPopulation:
             for n in range(int(7 * unit(self._seed, 41, family, i, j))):
                 key = (self._seed, 42, family, i, j, n)
                 pace = WALK_MPS * (0.8 + 0.4 * unit(*key))
-                turn = (unit(*key, 1) + time_s * pace / (2 * SPACING_M)) % 1.0
-                direction = 1 if turn < 0.5 else -1
-                share = 0.04 + 0.92 * (2 * turn if direction > 0 else 2 - 2 * turn)
+                phase = (unit(*key, 1) + time_s * pace / (2 * SPACING_M)) % 1.0
+                direction = 1 if phase < 0.5 else -1
+                share = 0.04 + 0.92 * (2 * phase if direction > 0 else 2 - 2 * phase)
                 x, y, dx, dy = self._roads.along(road, step + share)
                 length = math.hypot(dx, dy)
                 side = (self._roads.width_m(road, step) / 2 + 1.2) * (1 if unit(*key, 2) < 0.5 else -1)
@@ -199,7 +199,7 @@ def _vehicle_kind(looks: int, main: bool) -> Kind:
 
 
 def nearest(things: list[Thing], place: Matrix, count: int) -> list[Thing]:
-    """Return the `count` things nearest to a place, the farthest of them first."""
+    """Return the `count` things nearest to a place, in order of decreasing distance."""
     if not things:
         return []
     distances = np.hypot([t.x - place[0] for t in things], [t.y - place[1] for t in things])

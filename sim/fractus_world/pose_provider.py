@@ -210,7 +210,7 @@ def _pose(position: Message, attitude: Message, age_s: float, ground_amsl_m: flo
 
 
 def _gimbal(message: Message, attitude: Message | None) -> Mount | None:
-    """Return the mount described by a gimbal's quaternion and flags, or None if the quaternion is no attitude."""
+    """Return the camera attitude that a gimbal reports. Return None if the length of its quaternion is not about 1."""
     w, x, y, z = (float(part) for part in message.array("q") if not isinstance(part, bytes))
     norm = math.sqrt(w * w + x * x + y * y + z * z)
     if not 0.5 < norm < 2.0:

@@ -28,7 +28,7 @@ def dice(*keys: int) -> random.Random:
 
 
 def smooth(seed: int, x: float, y: float) -> float:
-    """Return value noise from 0 to 1 over a lattice of unit cells."""
+    """Return smooth noise from 0 to 1 at a point: random values on a lattice of unit cells, interpolated."""
     i = int(x // 1)
     j = int(y // 1)
     a = x - i

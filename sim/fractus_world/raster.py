@@ -65,7 +65,7 @@ class Raster:
         return np.asarray(drawn, np.uint8)
 
     def _source(self, level: int, column: int, row: int) -> Matrix:
-        """Return pixels of the whole picture at the corners of a tile's cells, shape (n, n, 2)."""
+        """Return pixel positions in the whole picture, at a grid of points of a tile, shape (n, n, 2)."""
         metres = self.finest_m * 2**level
         at = np.linspace(0.0, TILE_PX, _GRID + 1)
         x, y = np.meshgrid((column * TILE_PX + at) * metres, -(row * TILE_PX + at) * metres)
@@ -73,13 +73,13 @@ class Raster:
         return self._reference.pixels(places[:, 0], places[:, 1]).reshape(_GRID + 1, _GRID + 1, 2)
 
     def _place(self, east_m: float, north_m: float) -> tuple[float, float]:
-        # Positions beyond 1000 km may be outside the frame. They are outside the picture in any case.
+        # The frame cannot convert positions far beyond 1000 km. They are limited, because they are outside the picture.
         distance_m = math.hypot(east_m, north_m)
         share = min(1.0, 1e6 / distance_m) if distance_m else 1.0
         return self.frame.latlon(east_m * share, north_m * share)
 
     def _half(self, level: int) -> Picture:
-        """Return the picture, halved `level` times."""
+        """Return the picture with its width and height halved `level` times."""
         while len(self._halved) <= level:
             last = self._halved[-1]
             size = (max(-(-last.shape[1] // 2), 1), max(-(-last.shape[0] // 2), 1))

@@ -57,7 +57,7 @@ def render_ground(view: View, store: TileStore, band: Band) -> Picture:
 
 @dataclass(frozen=True, slots=True)
 class _Cells:
-    """Level of detail of each cell, and haze and elevation of the ray at its corners."""
+    """Cells of a picture: level of detail per cell, and haze and elevation of the view rays at the corners of cells."""
 
     levels: NDArray[np.int64]
     haze: NDArray[np.float32]
@@ -77,13 +77,13 @@ class _Cells:
         flat = np.hypot(rays[..., 0], rays[..., 1])
         away = view.height_m * np.sqrt(flat**2 + down**2) / np.maximum(down, 1e-9)
         away = np.where(down > 1e-9, np.minimum(away, 1e7), 1e7)
-        # A pixel is h / f / down wide and h / f / down^2 long. The exponent is close to its length, which avoids flicker.
+        # A pixel covers h / f / down by h / f / down^2 of ground. The exponent is close to 2, which avoids flicker.
         size_m = view.height_m / lens.focal_px / np.maximum(down, 1e-9) ** 1.75
         level = np.log2(np.maximum(size_m, 1e-9) / store.ground.finest_m) + _LEVEL_BIAS
         level = np.clip(np.floor(level), 0, store.ground.levels - 1).astype(np.int64)
         level = np.where(away < FARTHEST_M, level, _NOTHING)
         corners = np.stack((level[:-1, :-1], level[1:, :-1], level[:-1, 1:], level[1:, 1:]))
-        # A cell uses the finest level of its corners, so that near parts stay sharp.
+        # A cell has the finest level of its corners, so that its near parts stay sharp.
         seen = np.where(corners == _NOTHING, 99, corners).min(axis=0)
         haze = 1.0 - np.exp(-((away / VISIBILITY_M) ** 1.2))
         elevation = np.arctan2(-down, flat)
@@ -121,7 +121,7 @@ def _warped(source: Picture, mapping: Matrix, size: tuple[int, int]) -> Picture:
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     border = cv2.BORDER_REPLICATE
     if float(np.abs(mapping[2, :2]).max()) * max(size) < 1e-9 * abs(float(mapping[2, 2])):
-        # A view straight down has no perspective, and an affine transformation takes half the time.
+        # A view straight down has no perspective. An affine transformation is then exact, and takes half the time.
         drawn = cv2.warpAffine(source, mapping[:2] / mapping[2, 2], size, flags=flags, borderMode=border)
     else:
         drawn = cv2.warpPerspective(source, mapping, size, flags=flags, borderMode=border)
@@ -131,8 +131,11 @@ def _warped(source: Picture, mapping: Matrix, size: tuple[int, int]) -> Picture:
 def _window(
     view: View, store: TileStore, level: int, marked: NDArray[np.bool_]
 ) -> tuple[tuple[int, int, int, int], int]:
-    """Return the window of a level for the marked cells. Use a coarser level if the window would be too large."""
-    # The farthest ground points are at the ends of rows of cells.
+    """Return the window of a level that the marked cells need, and the level.
+
+    The level is coarser for a large window.
+    """
+    # The ends of the rows of cells are sufficient, because the extreme ground points are there.
     rows = np.flatnonzero(marked.any(axis=1))
     first = marked[rows].argmax(axis=1)
     last = marked.shape[1] - marked[rows][:, ::-1].argmax(axis=1)
@@ -184,7 +187,7 @@ def _add_air(picture: Picture, cells: _Cells, sky: Sky) -> None:
 
 
 def _enlarged(corners: NDArray[Any]) -> NDArray[Any]:
-    """Interpolate values at the corners of cells for every pixel."""
+    """Return a value for every pixel, interpolated from values at the corners of cells."""
     size = (corners.shape[1] * CELL_PX, corners.shape[0] * CELL_PX)
     whole = cv2.resize(np.ascontiguousarray(corners), size, interpolation=cv2.INTER_LINEAR)
     # `resize` places the value of a corner at the centre of a cell.

@@ -37,11 +37,11 @@ def cell(x: float, y: float) -> tuple[float, float]:
 
 @dataclass(frozen=True, slots=True)
 class Road:
-    """One line of the road network.
+    """A road across the whole network.
 
     Attributes:
         family: Approximate direction.
-        index: Number in the family. Every third line is a main road.
+        index: Number in the family. Every third road of a family is a main road.
     """
 
     family: Family
@@ -49,7 +49,7 @@ class Road:
 
     @property
     def main(self) -> bool:
-        """True if the road is paved between towns and has a centre line."""
+        """True if the road is paved outside of towns and has a centre line."""
         return self.index % _MAIN_EVERY == 1
 
     def vertex(self, step: int) -> tuple[int, int]:
@@ -83,7 +83,7 @@ class Roads:
         )
 
     def built_up(self, road: Road, step: int) -> bool:
-        """Return True if houses are on either side of a road from vertex `step` to the next."""
+        """Return True if at least one side of a road has houses from vertex `step` to the next vertex."""
         i, j = road.vertex(step)
         return self.town(i, j) or (self.town(i, j - 1) if road.family == "east" else self.town(i - 1, j))
 
@@ -96,7 +96,8 @@ class Roads:
     def at(self, road: Road, along: float) -> tuple[float, float, float, float]:
         """Return the point at a fractional vertex number of a road, and its direction in metres per vertex.
 
-        The road is a Catmull-Rom curve through its vertices, so adjacent segments meet without a bend.
+        The road is a Catmull-Rom curve through its vertices, so adjacent segments have the same direction where they
+        meet.
         """
         step = math.floor(along)
         t = along - step
@@ -112,7 +113,10 @@ class Roads:
         return place[0], place[1], direction[0], direction[1]
 
     def along(self, road: Road, along: float) -> tuple[float, float, float, float]:
-        """Return the same as `at` with the precision of the drawn road, twenty times faster."""
+        """Return the same values as `at`, linearly interpolated between points of the drawn road.
+
+        It is 20 times faster.
+        """
         step = math.floor(along)
         share = (along - step) * (EDGE_POINTS - 1)
         k = min(int(share), EDGE_POINTS - 2)
@@ -141,7 +145,7 @@ class Roads:
 
 
 def strip(edge: Points, left_m: float, right_m: float) -> Points:
-    """Return the polygon between two parallels of a line. Both distances are positive to the left."""
+    """Return the polygon between two lines that are parallel to a line. Both distances are positive to the left."""
     return np.vstack((edge[:, :2] + left_m * edge[:, 2:], (edge[:, :2] + right_m * edge[:, 2:])[::-1]))
 
 

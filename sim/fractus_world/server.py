@@ -30,7 +30,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         if self._is_client_gone():
-            # The client closed the connection after its request, so nobody waits for the picture.
+            # The client closed the connection after its request. Do not render a picture for it.
             self.close_connection = True
             return
         parts = urlsplit(self.path)

@@ -7,7 +7,7 @@ import numpy as np
 
 from fractus_world.tiles import Picture, TileStore
 
-# Weights of blue, green and red, and an offset: plants (green) are cool, asphalt and roofs (grey, red) warmer, water cold.
+# Weights of blue, green and red, and an offset. Water is cold, plants (green) are cool, asphalt and roofs are warmer.
 _WEIGHTS = np.array([[-0.10, -0.28, 0.62, 62.0]] * 3)
 
 

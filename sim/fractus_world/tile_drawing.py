@@ -15,7 +15,7 @@ Points = NDArray[np.float64]
 Colour = tuple[int, int, int]
 
 SUN_SHADOW = (-0.62, 0.55)
-"""Shadow offset of an object of one metre height, metres east and north."""
+"""Shadow offset per metre of height of an object, metres east and north."""
 
 _SHIFT = 4
 _LATTICE = 256
@@ -27,16 +27,16 @@ _CROWNS = 7
 
 
 class Noise:
-    """Seamless noise over the plane: octaves of repeating random lattices."""
+    """Seamless noise on an unbounded plane, as a sum of octaves. Each octave is a random lattice that repeats."""
 
     def __init__(self, seed: int) -> None:
         random = np.random.default_rng(mixed(seed, 77))
         self._lattices = [random.standard_normal((_LATTICE, _LATTICE)).astype(np.float32) for _ in range(_OCTAVES)]
 
     def octave(self, octave: int, drawing: TileDrawing) -> NDArray[np.float32]:
-        """Return one octave over a square tile, standard deviation below 1."""
+        """Return one octave of the noise for a square tile. Its standard deviation is below 1."""
         cell = _FINEST_OCTAVE_M * 2**octave
-        # Octaves much coarser than a pixel are computed for every eighth pixel, with a margin, and enlarged.
+        # An octave much coarser than a pixel is computed for every eighth pixel only, with a margin, and enlarged.
         step = _ENLARGED if cell >= 2 * _ENLARGED * drawing.pixel_m else 1
         rim, size = (1, drawing.size // step + 2) if step > 1 else (0, drawing.size)
         scale = step * drawing.pixel_m / cell
@@ -52,7 +52,10 @@ class Noise:
         return np.asarray(drawn, np.float32)
 
     def between(self, finest_m: float, coarsest_m: float, drawing: TileDrawing) -> NDArray[np.float32]:
-        """Return the sum of octaves over a tile from one cell size to another. Octaves below a pixel are omitted."""
+        """Return the sum of the octaves with cells between two sizes, for a tile.
+
+        Octaves finer than a pixel are omitted.
+        """
         total = np.zeros((drawing.size, drawing.size), np.float32)
         for octave in range(_OCTAVES):
             cell = _FINEST_OCTAVE_M * 2**octave
@@ -149,7 +152,7 @@ class TileDrawing:
         cv2.circle(self.shade, centre, max(radius, 8), (230,), -1, cv2.LINE_AA, _SHIFT)
 
     def darken_shadows(self, depth: float) -> None:
-        """Darken the added shadows. Half of the remaining light is bluish sky light."""
+        """Darken the ground in the added shadows. Half of the remaining light is bluish light from the sky."""
         if not self.shade.any():
             return
         soft = max(int(0.25 / self.pixel_m), 0)
@@ -179,7 +182,7 @@ class TileDrawing:
 
 @lru_cache(maxsize=2048)
 def _crown(kind: int, diameter: int, shade: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return a crown of `diameter` pixels: its colours multiplied by its coverage, and its transparency."""
+    """Return a tree crown of `diameter` pixels: its colours multiplied by its opacity, and its transparency."""
     colour, alpha = _drawn_crown(kind)
     colour = colour * (0.84 + 0.08 * shade)
     size = (diameter, diameter)

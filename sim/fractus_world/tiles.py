@@ -42,7 +42,7 @@ def pixel_m(ground: Ground, level: int) -> float:
 
 
 class TileStore:
-    """Cache of the last used tiles and of the last mosaic of each level.
+    """Cache of recently used tiles, and of the last mosaic of each level.
 
     Args:
         ground: Creates the tiles.
@@ -104,7 +104,7 @@ class TileStore:
 
 
 def interpolated(grid: NDArray[np.float64], at: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
-    """Interpolate a square grid at positions between its points, equal for rows and columns."""
+    """Interpolate a square grid. `at` contains the positions of both the rows and the columns of the result."""
     first = np.minimum(at.astype(int), len(grid) - 2)
     weights = np.zeros((len(at), len(grid)))
     weights[np.arange(len(at)), first] = 1.0 - (at - first)

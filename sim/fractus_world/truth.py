@@ -62,9 +62,9 @@ class SeenFace:
         lon: Longitude, degrees.
         standing: True if the billboard is upright, False if it lies on the ground.
         box: Bounding box of the part of the face inside the picture.
-        height_px: Height of the whole face with perspective.
+        height_px: Height of the whole face in the picture.
         in_frame: Share inside the picture.
-        visible: Share inside the picture that is not occluded. 0 from behind its billboard.
+        visible: Share inside the picture that is not occluded. 0 if the camera is behind the billboard.
     """
 
     id: str

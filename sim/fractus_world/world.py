@@ -22,7 +22,7 @@ DEFAULT_MOUNT = Mount()
 
 
 class World:
-    """A ground with objects. Pictures depend only on the arguments.
+    """A ground with objects. Equal arguments always give equal pictures.
 
     Args:
         ground: Appearance of the ground from above.
@@ -47,7 +47,10 @@ class World:
 
     @classmethod
     def on(cls, ground: Ground, seed: int = 7) -> World:
-        """Create a world on a ground from the user. Its roads are unknown, so it has billboards near the origin but no traffic."""
+        """Create a world on a ground from the user.
+
+        It has billboards near the origin, but no traffic, because its roads are unknown.
+        """
         return cls(ground, ObjectLayer(Unpopulated(), BillboardsAroundOrigin(seed)))
 
     @property
@@ -75,7 +78,7 @@ class World:
             pose: Pose of the airframe.
             intrinsics: Lens and sensor.
             mount: Mount of the camera on the airframe.
-            time_s: Time in seconds on any clock. Moving objects are a function of it.
+            time_s: Time in seconds on any clock. It determines the positions of moving objects.
             band: Daylight or thermal.
             hidden: Ids of objects to omit.
 
@@ -89,7 +92,7 @@ class World:
             return picture
 
     def truth(self, pose: Pose, intrinsics: Intrinsics, *, mount: Mount = DEFAULT_MOUNT, time_s: float = 0.0) -> Truth:
-        """Return the ground truth of the picture with the same arguments."""
+        """Return the ground truth of the picture that `render` returns for the same arguments."""
         with self._lock:
             view = self.view(pose, intrinsics, mount)
             return Truth(pose, *self._objects.truth(view, self._objects.in_sight(view, time_s), self.frame))

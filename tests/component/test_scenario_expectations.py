@@ -241,7 +241,7 @@ def test_program_may_request_control_but_not_fly_after_a_takeover():
     assert _failed(RunEvaluation(SITE, _later(_guarded(), "GetControl", "allow")).guarded()) == []
     for action in ("allow", "correct"):
         failed = _failed(RunEvaluation(SITE, _later(_guarded(), "Goto", action)).guarded())
-        assert failed == ["the program moves nothing after the takeover"]
+        assert failed == ["no call of the program is executed after the takeover"]
 
 
 def test_flight_without_policies_fails_the_expectations_with_policies():
@@ -274,7 +274,7 @@ def _changed(run: Evidence, place: str, **changes: object) -> Evidence:
 @pytest.mark.parametrize(
     ("incorrect", "text"),
     [
-        (_without(_guarded(), "revoke"), "revokes access"),
+        (_without(_guarded(), "revoke"), "revokes the control"),
         (_without(_guarded(), "CaptureImage"), "pictures are taken"),
         (_changed(_guarded(), "WP-E1", action="allow"), "discarded"),
         (_changed(_guarded(), "WP3", action="deny"), "continues"),

@@ -72,7 +72,7 @@ def test_world_photo_without_position_is_ignored(tmp_path: Path) -> None:
 
 
 def test_world_photo_errors_state_the_reason(tmp_path: Path) -> None:
-    with pytest.raises(PhotoError, match="is no directory"):
+    with pytest.raises(PhotoError, match="is not a directory"):
         Photos.of(tmp_path / "nowhere")
     with pytest.raises(PhotoError, match="none of its 0 pictures"):
         Photos.of(tmp_path)

@@ -147,7 +147,7 @@ def _files(source: Path, names: Iterable[str]) -> Iterator[Path]:
 
 
 def _build_stale(source: Path, targets: Sequence[str], tag: str, report: Report) -> None:
-    """Build the first target first. The other targets then take most steps from the cache."""
+    """Build one target before all others, which then take most steps from the cache."""
 
     def build_one(target: str) -> None:
         started = time.monotonic()

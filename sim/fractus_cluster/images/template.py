@@ -103,7 +103,7 @@ def _storage(node: Node) -> Path:
 
 
 def _copy_storage(source: Path, target: Path) -> None:
-    """Copy the storage of a containerd by hard links.
+    """Copy the storage of containerd by hard links.
 
     Copy its databases completely, because containerd changes them.
     """

@@ -86,7 +86,7 @@ class Demo:
     """One run of the demo.
 
     Attributes:
-        cluster: An embedded cluster, which is removed at the end if the demo started it, or the user's cluster.
+        cluster: The user's cluster or an embedded cluster. The demo removes an embedded cluster that it started.
         out: Output folder of the report.
         keep: Do not remove cluster, Fractus and objects at the end.
         timeout_s: Maximum duration of the mission.

@@ -87,7 +87,7 @@ class VehicleEntry(Model):
 
 
 class NamedZone(Model):
-    """An airspace volume that checks use and figures show."""
+    """An airspace volume. Checks refer to it, and figures show it."""
 
     name: Name
     kind: Literal["exclusion", "inclusion", "other"] = "other"
@@ -158,9 +158,7 @@ class Experiment(Model):
         " exactly repeatable.",
     )
     timeout: float = Field(default=300, gt=0, le=7200, description="Maximum duration, seconds of the experiment.")
-    settle: float = Field(
-        default=3, ge=0, le=600, description="Seconds to continue after the last task, program and fault."
-    )
+    settle: float = Field(default=3, ge=0, le=600, description="Seconds to continue after the last task and fault.")
     wind: Wind = Wind()
     world: CameraWorld = CameraWorld()
     vehicles: tuple[VehicleEntry, ...] = Field(min_length=1, max_length=MAX_VEHICLES)

@@ -104,7 +104,7 @@ _ZONE_STYLES: Mapping[str, tuple[str, str, str]] = {
     "denial": (PURPLE, "...", "calls denied"),
     "camera": (PURPLE, "\\\\\\", "privacy filter"),
     "inclusion": (GREEN, "", "stay inside"),
-    "limit": (GREY, "", "limits hold"),
+    "limit": (GREY, "", "limits apply"),
     "other": (GREY, "", "zone"),
 }
 Bounds = tuple[float, float, float, float]
@@ -186,7 +186,7 @@ def _draw_zones(axes: Any, content: FlightMap, bounds: Bounds) -> None:
             continue
         if zone.kind == "limit":
             axes.annotate(
-                f"zone {zone.name}: limits hold", (bounds[0], bounds[3]), xytext=(6, -12), textcoords="offset points",
+                f"zone {zone.name}: limits apply", (bounds[0], bounds[3]), xytext=(6, -12), textcoords="offset points",
                 fontsize=8, color=GREY, style="italic",
             )  # fmt: skip
             continue

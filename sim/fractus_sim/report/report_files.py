@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    # The import of matplotlib takes a second, which commands without figures save.
+    # matplotlib is not imported at run time here, because it takes a second and not every command draws figures.
     from matplotlib.figure import Figure
 
 PAGE = "summary.md"

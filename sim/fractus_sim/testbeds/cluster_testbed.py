@@ -31,14 +31,14 @@ POLL_S = 1.0
 CONNECT_S = 10.0
 DELETE_TIMEOUT_S = 180.0
 BEHIND_TAP_PORT = 5770
-"""Port of the vehicle. The link tap listens on the port to which the services connect."""
+"""Port on which the vehicle listens. A link tap listens on the port to which the services connect."""
 
 ENDED = frozenset({"Completed", "Failed", "Invalid"})
 MAX_NAME = 30
 
 
 class ClusterTestbed(Testbed):
-    """An embedded cluster named after the experiment, removed at the end unless it was already running."""
+    """An embedded cluster with the name of the experiment. It is removed at the end unless it was already running."""
 
     def __init__(self, experiment: Experiment, folder: Path, base: Path, report: Callable[[str], None]) -> None:
         super().__init__(experiment, folder, base, report)
@@ -118,7 +118,7 @@ class ClusterTestbed(Testbed):
             self._kube.delete(self._applications, DELETE_TIMEOUT_S)
 
     def _attach(self, setup: VehicleSetup) -> None:
-        """Insert a link tap between the vehicle and its clients, and connect the observer."""
+        """Insert link taps between a vehicle and its clients, and connect the observer."""
         node = self._cluster.node(setup.name)
         namespace = node.wiring.namespace_path(setup.name)
         logs = self.folder / "logs"
@@ -154,7 +154,7 @@ class ClusterTestbed(Testbed):
 
 
 def _cluster_spec(experiment: Experiment, path: Path) -> ClusterSpec:
-    """Return the cluster specification with seed, wind and parameters of the vehicles, which listen behind the link taps.
+    """Return the cluster specification with the vehicles of the experiment, which listen on `BEHIND_TAP_PORT`.
 
     Raises:
         ExperimentError: The file cannot be read, or has no vehicle of this name.
@@ -192,7 +192,7 @@ def _with_vehicle(node: NodeSpec, setup: VehicleSetup, experiment: Experiment) -
 
 
 def _autopilot_port(spec: ClusterSpec, name: str) -> int:
-    """Return the port on which the services of the node expect the autopilot."""
+    """Return the port to which the services of a node connect for the autopilot."""
     node = next(node for node in spec.nodes if node.name == name)
     vehicle = node.vehicle()
     listen = vehicle[1] if vehicle is not None else ""

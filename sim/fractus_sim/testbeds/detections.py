@@ -34,7 +34,7 @@ class ObservedObject:
 
 @dataclass(frozen=True, slots=True)
 class Score:
-    """Numbers of detections and of objects in view, and how many of them match."""
+    """Numbers of detections and objects in view, and the numbers of matches among them."""
 
     detections: int
     correct_detections: int
@@ -59,7 +59,7 @@ def score_detections(
 
     Args:
         detections: Detections of the program.
-        truths: Objects of each picture. A moving object appears once per position.
+        truths: Objects in all pictures. An object appears once for each picture.
         kind: Class to compare.
         radius_m: Maximum distance between a detection and its object.
     """
@@ -90,7 +90,7 @@ def read_detections(lines: Iterable[str]) -> list[ObservedObject]:
 
 
 class TruthWatch:
-    """Records the objects in view of a camera world at each snapshot, polling twice a second."""
+    """Records the objects in view at each snapshot of a camera world. Polls the camera world twice a second."""
 
     def __init__(self, url: str, path: Path) -> None:
         self.objects: list[ObservedObject] = []

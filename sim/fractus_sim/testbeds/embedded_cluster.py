@@ -67,7 +67,7 @@ class FractusCluster:
         return Kube(programs["kubectl"], programs["helm"], self.cluster.kubeconfig)
 
     def remove(self) -> None:
-        """Remove the cluster. Signals are deferred meanwhile.
+        """Remove the cluster. Signals are deferred until the removal is complete.
 
         Raises:
             ExperimentError: A part of the cluster cannot be removed.

@@ -1,4 +1,4 @@
-"""A tap in a TCP link that forwards bytes, records both directions as a tlog, and can cut the link."""
+"""TCP proxy in a MAVLink link. It forwards bytes, records both directions as a tlog, and can cut the link."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ BACKLOG_LIMIT = 1024 * 1024
 
 @dataclass(slots=True, eq=False)
 class _End:
-    """One end of a connection, with the bytes that wait to be sent to it."""
+    """One end of a connection, with the bytes that are still to be sent to it."""
 
     socket: socket.socket
     framer: Framer
@@ -33,11 +33,10 @@ class _End:
 class LinkTap:
     """Forwards each client of a listening socket to a server, in one thread.
 
-    While the link is cut, connections stay open and received data is dropped, as with a radio out of range. New
-    connections receive nothing.
+    While the link is cut, existing and new connections stay open and all data is dropped, as with a radio out of range.
 
     Args:
-        listener: Listening socket. It is closed with the tap.
+        listener: Listening socket. The tap closes it.
         connect: Connects to the server. If it raises OSError or ExperimentError, the client is disconnected.
         log: File of the tlog.
     """
@@ -62,7 +61,7 @@ class LinkTap:
         return cls(listener, lambda: socket.create_connection(target, CONNECT_S), log)
 
     def set_link(self, *, connected: bool) -> None:
-        """Forward traffic, or drop it."""
+        """Forward all traffic, or drop all traffic."""
         self._connected = connected
 
     def close(self) -> None:

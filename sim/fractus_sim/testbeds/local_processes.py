@@ -110,12 +110,12 @@ class Processes:
         return " | ".join(line.strip() for line in text.splitlines()[-4:] if line.strip()) or "the log is empty"
 
     def stop(self, *names: str, kill: bool = False) -> None:
-        """Stop processes. Processes that have ended are ignored. If interrupted, kill the processes without waiting."""
+        """Stop processes that are still running. After an interrupt, kill them without waiting."""
         chosen = [self._running[name] for name in names if self.running(name)]
         try:
             if not kill:
                 for process in chosen:
-                    # Popen.terminate would reap a process that has just ended, and its group would not be killed.
+                    # Popen.terminate is not used: it reaps a process that has ended, before its group is killed.
                     with contextlib.suppress(ProcessLookupError, PermissionError):
                         os.kill(process.pid, signal.SIGTERM)
                 self._wait_ended(chosen)
@@ -126,9 +126,10 @@ class Processes:
             self._wait_ended(chosen)
 
     def stop_all(self, *stages: Callable[[str], bool]) -> None:
-        """Stop all processes in stages: the processes selected by the first predicate first, the unselected ones last.
+        """Stop all processes in stages. After an interrupt, kill the remaining processes without waiting.
 
-        If interrupted, kill the remaining processes without waiting.
+        Args:
+            stages: Predicates of process names. The processes that no predicate selects are stopped last.
         """
         names = list(reversed(self._running))
         try:
@@ -149,7 +150,7 @@ class Processes:
     def _poll(self, process: subprocess.Popen[bytes]) -> int | None:
         """Return the exit code of a process, or None while it is running. Kill its group when it has ended."""
         if process.returncode is None and _is_zombie(process.pid):
-            # The process is not reaped yet, so its id is still valid as the group id.
+            # The process is not reaped yet, so its id cannot belong to another group.
             _kill_group(process.pid)
             self._guard.release(process.pid)
         return process.poll()

@@ -33,7 +33,7 @@ class Mission:
         application: Name of the Application.
         times: Unix seconds of events: applied, planned, running, ended, landed.
         pods: Last observed state of each pod, by name.
-        links: Changes of the traffic path: Unix seconds, node, cloud or direct, and reason.
+        links: Changes of the traffic path, each with time (Unix seconds), node, new path and reason.
         phase: Phase of the Application.
         message: Message of the Application.
         drone: Name of the drone. Empty until one is selected.
@@ -173,7 +173,7 @@ def follow_mission(kube: Kube, mission: Mission, logs: Path, progress: Progress,
 
 
 def report_driver_lines(logs: Path, start: int, report: Report) -> int:
-    """Report new complete log lines of the Navigator.
+    """Report the complete lines that the Navigator has logged since the last call.
 
     Returns:
         Offset in the file at which the next call continues.
@@ -228,6 +228,6 @@ def _start_failures(kube: Kube) -> list[str]:
 
 
 def _is_stopping(pod: Object) -> bool:
-    """Return True if a pod is deleted or stopped after its mission. Its last running state is kept."""
+    """Return True if a pod is being deleted or has stopped after its mission. Its earlier state is then kept."""
     metadata = pod["metadata"]
     return "deletionTimestamp" in metadata or "fractus.dev/finished" in metadata.get("labels", {})

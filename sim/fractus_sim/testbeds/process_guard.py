@@ -55,7 +55,7 @@ class ProcessGuard:
 
     def _send(self, number: int) -> None:
         if self._guard is not None:
-            # If the guard was killed, the processes are stopped without it.
+            # The guard may have been killed. This process then stops the groups itself.
             with contextlib.suppress(BrokenPipeError):
                 os.write(self._pipe, b"%d\n" % number)
 

@@ -6,8 +6,8 @@
         drones.run("navigator", [sys.executable, "navigator.py"], identity)
         drones.processes.wait_end("navigator", timeout_s=120.0)
 
-Each program gets the environment of its pod (FRACTUS_*), so programs that use the SDK run unchanged. All processes are
-stopped at the end of the block.
+Each program gets the environment variables that a pod would have (FRACTUS_*), so programs that use the SDK run
+unchanged. All processes are stopped at the end of the block.
 
 Files in the directory:
 
@@ -40,7 +40,7 @@ from fractus_sim.testbeds.local_processes import Processes, listening
 
 @dataclass(frozen=True, slots=True)
 class _Program:
-    """Command of a program. It restarts the program when its node is powered on."""
+    """Start command of a program. It is kept to start the program again when its node is powered on."""
 
     node: str
     command: tuple[str, ...]
@@ -180,7 +180,7 @@ class Standalone:
 
         Args:
             node: Name of the drone.
-            wait: Start the programs after the services listen instead of immediately.
+            wait: Start the programs only after the services listen. False: start them immediately.
 
         Raises:
             ExperimentError: A process did not start.
@@ -244,8 +244,8 @@ class CameraSetup:
     """A camera of a drone, with its own camera world.
 
     Attributes:
-        world: Additional arguments of `fractus camera-world`, such as `("--seed", "7")`. None: no camera world, the
-            driver's test picture.
+        world: Additional arguments of `fractus camera-world`, such as `("--seed", "7")`. None: no camera world. The
+            camera service then uses its test picture.
         features: Camera fields of the drone description, in addition to `resolution` and `methods`.
     """
 

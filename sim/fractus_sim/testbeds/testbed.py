@@ -26,7 +26,7 @@ _JUDGED_KINDS = frozenset({"call", "monitor", "takeover"})
 
 @dataclass(frozen=True, slots=True)
 class Moment:
-    """Seconds since the start of the testbed on its own clock, and Unix time in microseconds."""
+    """A time on two clocks: seconds since the start of the testbed on its own clock, and Unix time in microseconds."""
 
     time_s: float
     unix_us: int
@@ -67,8 +67,8 @@ class Testbed(ABC):
     """Vehicles of an experiment and their environment.
 
     Attributes:
-        observers: Link of each vehicle that records and injects faults. It is never cut.
-        pilots: Ground station of each vehicle that flies its task. Empty in modes where applications fly.
+        observers: Ground station of each vehicle for recording and fault injection. Its link is never cut.
+        pilots: Ground station of each vehicle for its task. Empty in modes in which applications fly.
         endpoints: MAVLink endpoint of each vehicle for QGroundControl or Mission Planner.
         findings: Results, complete after `collect`.
         processes: Local processes. None if the mode starts none.
@@ -95,7 +95,7 @@ class Testbed(ABC):
         self._resources = ExitStack()
 
     def keep(self, resource: _Resource) -> _Resource:
-        """Register an object to be closed with the testbed. Call this right after its creation."""
+        """Register an object that the testbed closes at its end. Call this right after the creation of the object."""
         self._resources.callback(resource.close)
         return resource
 
@@ -104,13 +104,13 @@ class Testbed(ABC):
         self._resources.callback(action)
 
     def observe(self, setup: VehicleSetup, link: Link) -> None:
-        """Record a vehicle over a separate link."""
+        """Add the observer of a vehicle, which uses a separate link."""
         log = self.keep(TlogWriter(self.folder / "logs" / f"{setup.name}-observer.tlog"))
         station = Station(link, setup.system_id, log, own_id=OBSERVER_ID, sends_heartbeats=False)
         self.observers[setup.name] = self.keep(station)
 
     def close(self) -> None:
-        """Close everything in reverse order. Failures and interrupts do not skip the remaining objects."""
+        """Close all registered objects in reverse order, even after an error or interrupt."""
         self._resources.close()
 
     @abstractmethod
@@ -142,7 +142,7 @@ class Testbed(ABC):
 
     @property
     def required_flights(self) -> Sequence[str]:
-        """Vehicles of which at least one must fly before the experiment can end."""
+        """Names of vehicles. If it is not empty, the experiment does not end before one of these vehicles has flown."""
         return ()
 
     @abstractmethod
@@ -158,7 +158,7 @@ class Testbed(ABC):
         raise ExperimentError(f"{node}: cannot power {'on' if on else 'off'}; the mode has no nodes")
 
     def collect(self) -> None:
-        """Collect results into `findings` before the testbed is closed. This method adds exit codes of programs."""
+        """Collect results into `findings` before the testbed is closed. The base class adds exit codes of programs."""
         if self.processes is not None:
             for program in self.experiment.programs:
                 self.findings.programs[program.name] = self.processes.exit_code(program.name)

@@ -34,7 +34,7 @@ class TlogWriter:
 
 
 class Framer:
-    """Parser of one direction of a link that writes its frames to a tlog."""
+    """Writes the frames of one direction of a link to a tlog."""
 
     def __init__(self, log: TlogWriter) -> None:
         self._log = log
@@ -49,7 +49,7 @@ class Framer:
 def read_tlog(data: bytes) -> Iterator[tuple[float, bytes]]:
     """Yield the records of a tlog: Unix time in seconds, and the MAVLink frame.
 
-    An incomplete record at the end, which a crash of the writer leaves, is ignored.
+    An incomplete record at the end is ignored. It remains after a crash of the writer.
     """
     position = 0
     while position + _STAMP.size + _MIN_HEADER_LENGTH <= len(data):

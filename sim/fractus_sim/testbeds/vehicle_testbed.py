@@ -24,7 +24,7 @@ from fractus_sim.testbeds.tlog import TlogWriter
 
 STEPS_PER_TICK = 2
 MAX_BEHIND_S = 1.0
-"""Real time that the simulation catches up after a delay of this process. Longer delays slow the simulation down."""
+"""Maximum delay of this process, in real time, that the simulation makes up for. Time beyond it is lost."""
 
 CONNECT_S = 20.0
 
@@ -61,7 +61,7 @@ class VehicleTestbed(Testbed):
         self._last_wall_s = time.monotonic()
 
     def tick(self) -> Moment:
-        """Advance by 20 ms. Wait for real time unless in lockstep."""
+        """Advance by 20 ms, in real time unless in lockstep."""
         if not self._pace:
             for _ in range(STEPS_PER_TICK):
                 self._simulation.step()
@@ -86,7 +86,7 @@ class VehicleTestbed(Testbed):
 
     @property
     def required_flights(self) -> list[str]:
-        """Vehicles that are flown by programs."""
+        """Vehicles that programs fly."""
         flown = {p.vehicle for p in self.experiment.programs}
         return [s.name for s in self.experiment.setups() if s.name in flown and not s.entry.task]
 

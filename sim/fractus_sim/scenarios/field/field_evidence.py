@@ -42,18 +42,18 @@ class Evidence:
     texts: tuple[str, ...]
 
     def gotos(self) -> list[JudgedCall]:
-        """Return Goto calls, including those of the system during transit flights."""
+        """Return all Goto calls, including the calls of the system during transit flights."""
         return [c for c in self.calls if c.method == "Goto" and c.requested is not None]
 
     def pictures(self, *, taken: bool) -> list[JudgedCall]:
-        """Return CaptureImage calls that were executed, or that were denied because of their footprint."""
+        """Return the executed CaptureImage calls, or with `taken=False` the calls that a policy denied."""
         calls = [c for c in self.calls if c.method == "CaptureImage" and c.position is not None]
         if taken:
             return [c for c in calls if not c.refused]
         return [c for c in calls if c.refused and c.code != "OutsideOperationArea"]
 
     def takeover(self) -> JudgedCall | None:
-        """Return the action by which the system took control permanently. None if it did not."""
+        """Return the action by which the system took control permanently. Return None if it never took control."""
         return next((c for c in self.calls if c.caller == SYSTEM and c.method in ("revoke", "returnToLaunch")), None)
 
 
@@ -77,7 +77,7 @@ def read_evidence(name: str, title: str, *, policies: bool, tlog: Path, audits: 
 
 
 class _AutopilotClock:
-    """Conversion from Unix time to the autopilot's clock, which runs faster in an accelerated simulation."""
+    """Converts Unix time to the clock of the autopilot. The clock runs faster in an accelerated simulation."""
 
     def __init__(self) -> None:
         self._unix_s: list[float] = []
@@ -90,7 +90,7 @@ class _AutopilotClock:
             self._boot_s.append(boot_s)
 
     def boot_s(self, unix_s: float) -> float:
-        """Return the autopilot's time by interpolation or extrapolation."""
+        """Return the autopilot's time for a Unix time, by interpolation or extrapolation."""
         if len(self._unix_s) < 2:
             raise ValueError("the log of the link to the autopilot has no positions")
         index = min(max(bisect.bisect(self._unix_s, unix_s), 1), len(self._unix_s) - 1)
@@ -141,18 +141,18 @@ def _read_flight(path: Path) -> tuple[tuple[Sample, ...], _AutopilotClock, list[
             in_air = armed and _is_flying(landed_state, altitude_m)
             samples.append(Sample(boot_s, place, speed_mps, mode, in_air, battery))
     if samples and not armed:
-        # The autopilot can disarm after the last recorded position.
+        # The vehicle has disarmed after the last recorded position.
         samples[-1] = replace(samples[-1], in_air=False)
     return tuple(samples), clock, texts
 
 
 def _is_flying(landed_state: int, altitude_m: float) -> bool:
-    """Return True if the vehicle is in the air. Without a known landed state, the altitude decides."""
+    """Return True if the vehicle is in the air. If the landed state is unknown, compare the altitude with a limit."""
     return landed_state in FLYING_STATES if landed_state else altitude_m > _GROUND_M
 
 
 def _call(entry: Mapping[str, Any], clock: _AutopilotClock) -> JudgedCall | None:
-    """Return the call or action of the system in an audit log entry. Return None for other entries."""
+    """Return the component's call or the system's action in an audit log entry. Return None for other entries."""
     if entry.get("kind") not in ("call", "takeover", "control"):
         return None
     is_call = entry["kind"] == "call"

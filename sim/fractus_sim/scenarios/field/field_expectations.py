@@ -25,16 +25,16 @@ LIMIT_TOLERANCE_M = 0.6
 """Tolerance of altitude control and estimation."""
 
 MAX_CORRECTION_MARGIN_M = 1.0
-"""A correction may keep a margin to its limit."""
+"""Maximum distance of a corrected altitude from the limit of the policy."""
 
 LANDED_WITHIN_M = 3.0
 MIN_PICTURES = 4
 TAKEOVER_DELAY_S = 0.5
-"""Time after a takeover in which calls may still be executed."""
+"""Time after a takeover. Calls may still be executed within it."""
 
 
 def evaluate_run(site: FieldSite, run: Evidence) -> list[Expectation]:
-    """Evaluate the expectations of a run, which depend on its name: normal, guarded or unguarded."""
+    """Evaluate the expectations for a run. They depend on its name: normal, guarded or unguarded."""
     evaluation = RunEvaluation(site, run)
     evaluations = {
         "normal": evaluation.normal,
@@ -157,12 +157,12 @@ class RunEvaluation:
         calls = self._gotos(name)
         taken = self._run.takeover()
         self._expect(
-            f"{name} revokes access",
+            f"the request for {name} revokes the control of the program",
             bool(calls) and all(c.refused for c in calls) and taken is not None,
             calls[0].reason if calls else "never requested",
         )
         since = taken.time_s if taken is not None else math.inf
-        # The SDK may request control again. It is not granted, so all following calls are denied.
+        # The SDK may request control again. The service does not grant it, so all later calls must be denied.
         later = [
             c
             for c in self._run.calls
@@ -172,7 +172,9 @@ class RunEvaluation:
             and c.method not in CONTROL_METHODS
         ]
         self._expect(
-            "the program moves nothing after the takeover", taken is not None and not later, f"{len(later)} calls"
+            "no call of the program is executed after the takeover",
+            taken is not None and not later,
+            f"{len(later)} calls",
         )
 
     def _pictures(self) -> None:
@@ -200,7 +202,7 @@ class RunEvaluation:
         ]
 
     def _closest_to(self, zone: str) -> float:
-        """Return the distance in metres between the flown path and a zone. 0 if they intersect."""
+        """Return the minimum distance in metres between the flown path and a zone. It is 0 if they intersect."""
         shape = self._site.zone(zone)
         frame = self._site.frame
         path = shapely.LineString([frame.xy(s.place.lat, s.place.lon) for s in self._run.track.samples])

@@ -36,7 +36,7 @@ FLIGHT_TIMEOUT_S = 600.0
 READY_TIMEOUT_S = 180.0
 POLL_S = 0.25
 PARAMETERS: Mapping[str, float] = {"WPNAV_SPEED": 500.0}
-"""The speed (cm/s) equals the maximum speed in the drone's description, so that no policy corrects it."""
+"""Autopilot parameters. The speed (cm/s) equals the maximum in the drone's description, so no policy corrects it."""
 
 WIND = "2,240,0.5"
 """Speed (m/s), direction (degrees) and turbulence of the wind."""
@@ -75,7 +75,7 @@ class Autopilot:
     """The vehicle of a run.
 
     Attributes:
-        link: Endpoint of a running autopilot, such as `tcp:127.0.0.1:5760`. None: a simulated autopilot per run.
+        link: Endpoint of a running autopilot, such as `tcp:127.0.0.1:5760`. None: start a simulated one for each run.
         speedup: Factor of real time.
     """
 
@@ -108,7 +108,7 @@ def fly(run: Run, site: FieldSite, autopilot: Autopilot, folder: Path, report: C
 
 
 def navigator_environment(run: Run, site: FieldSite, hover_s: float) -> dict[str, str]:
-    """Return the environment of the Navigator: manifest values, hover position above the stripe, and violations."""
+    """Return the environment of the Navigator: values of the manifest, hover position, and requested violations."""
     places = site.places
     above = f"6:{format_position(places[ABOVE_STRIPE])},{hover_s:.1f}"
     environment = {ZIGZAG: site.environment[ZIGZAG], "DETOURS": above}
@@ -127,7 +127,7 @@ def _drone_setup(site: FieldSite, autopilot: Autopilot) -> DroneSetup:
         ready_after_s=FULL_START_S,
         parameters=PARAMETERS,
         description=site.drone.spec.to_dict(),
-        # The camera world needs a second link to the vehicle, which a running autopilot may not offer.
+        # The camera world needs a second link to the vehicle. A running autopilot may offer only one.
         camera=CameraSetup(("--seed", "3")) if simulated else CameraSetup(None),
         vehicle_arguments=("--wind", WIND),
         autopilot=autopilot.link,

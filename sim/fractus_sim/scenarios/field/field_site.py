@@ -25,15 +25,15 @@ VIEWER = "AerialViewer"
 DRONE = "drone-1"
 ZIGZAG = "ZIGZAG"
 UNRESTRICTED_RADIUS_M = 1000.0
-"""Radius of the operation area without policies. No run flies that far."""
+"""Radius of the operation area in the run without policies. It is larger than any flight."""
 
 OUTSIDE_POSITIONS_M = {"WP-E1": (62.0, 130.0), "WP-E2": (226.0, 60.0)}
-"""Positions outside of the operation area that the violating program requests, metres east and north of home."""
+"""Forbidden positions that the violating program requests: metres east and north of home, outside of its area."""
 
 ABOVE_STRIPE = "WP-S"
 """Hover position above the no-photo stripe.
 
-Each run hovers there for longer than the picture interval, so that at least one picture is requested.
+Each run hovers at this position for longer than the picture interval, so that at least one picture is requested.
 """
 
 ALTITUDE_M = 10.0
@@ -46,7 +46,7 @@ class FieldSite:
     """The experiment at its site.
 
     Attributes:
-        documents: Manifests as applied.
+        documents: Manifests, moved to the site.
         home: Latitude, longitude, and ground altitude above mean sea level.
     """
 
@@ -133,7 +133,7 @@ class FieldSite:
         return positions
 
     def _above_stripe(self, places: Mapping[str, Position]) -> Position:
-        """Return the position between WP6 and WP7 that is deepest inside the stripe where pictures are forbidden."""
+        """Return the position between WP6 and WP7 that is farthest inside the no-photo stripe."""
         path = shapely.LineString([self.frame.xy(*places[name][:2]) for name in ("WP6", "WP7")])
         middle = path.intersection(self.zone("no-photo")).centroid
         return (*self.frame.latlon(middle.x, middle.y), ALTITUDE_M)

@@ -23,14 +23,14 @@ from fractus_core.linking.range_model import with_contact, with_failure, with_lo
 
 STEP_S = 0.1
 LINK_UP_STEPS = 9
-"""Steps until a link is up and measured (0.92 s)."""
+"""Steps from a decision until the link is up and its bandwidth is measured (0.92 s)."""
 
 DECIDE_STEPS = 5
 BEACON_STEPS = 10
 """Interval of beacons, about one second."""
 
 AHEAD_M = 20.0
-"""Distance ahead of the drone at which the rule of the thesis compares the peers."""
+"""Distance from the drone to the point ahead of it to which the rule of the thesis selects the nearest peer."""
 
 INGRESS = find_heuristic("max", "ingress-bandwidth")
 SETTINGS = LinkSettings()
@@ -59,7 +59,7 @@ class RecordedFlight:
     direct_mbps: float = 14.7
 
     def rate(self, step: int, node: Peer) -> float:
-        """Return the actual bandwidth of the link to a peer at a step, in Mbit/s."""
+        """Return the actual bandwidth of a link to a peer at a step, in Mbit/s."""
         inside = math.dist(self.positions[step], node.position) <= node.range_m * self.factor
         return self.direct_mbps if inside else 0.0
 
@@ -95,7 +95,10 @@ def constant_speed_flight(
 
 
 def best_gain(flight: RecordedFlight) -> float:
-    """Return the maximum gain in Mbit over the cloud path for any sequence of links, with the whole flight known."""
+    """Return the gain in Mbit over the cloud path of the best sequence of links.
+
+    It is found with the whole flight known.
+    """
     n = len(flight.positions)
     up = {node.name: [flight.rate(i, node) > 0 for i in range(n)] for node in flight.peers}
     value = {"": [0.0] * (n + 1), **{name: [0.0] * (n + 1) for name in up}}
@@ -113,7 +116,7 @@ Rule = Callable[[RecordedFlight, int, LinkState, dict[str, LearnedRange]], str]
 
 
 def planner_rule(flight: RecordedFlight, step: int, link: LinkState, ranges: dict[str, LearnedRange]) -> str:
-    """Select the peer of the receding-horizon plan."""
+    """Select the peer that the planner of Fractus (receding horizon) selects."""
     track = Track(flight.positions[step], flight.speed, flight.waypoints[step])
     return plan_link(
         track, flight.peers, flight.cloud, link, step * STEP_S, heuristic=INGRESS, settings=SETTINGS, ranges=ranges
@@ -121,7 +124,7 @@ def planner_rule(flight: RecordedFlight, step: int, link: LinkState, ranges: dic
 
 
 def thesis_rule(flight: RecordedFlight, step: int, _link: LinkState, _ranges: dict[str, LearnedRange]) -> str:
-    """Select the nearest peer in declared range in the direction of the next waypoint (thesis 8.6)."""
+    """Select the peer in declared range that is nearest to a point ahead of the drone (thesis 8.6)."""
     position = flight.positions[step]
     waypoint = flight.waypoints[step][0]
     share = min(AHEAD_M / max(math.dist(position, waypoint), 1e-9), 1.0)
@@ -131,7 +134,10 @@ def thesis_rule(flight: RecordedFlight, step: int, _link: LinkState, _ranges: di
 
 
 def gain_of_rule(flight: RecordedFlight, rule: Rule) -> tuple[float, int]:
-    """Return the gain in Mbit of a rule that decides twice a second, and its number of links."""
+    """Simulate a rule that decides twice a second.
+
+    Return its gain over the cloud path in Mbit, and its number of links.
+    """
     link = NO_LINK
     gain = 0.0
     links = 0
@@ -164,7 +170,7 @@ def gain_of_rule(flight: RecordedFlight, rule: Rule) -> tuple[float, int]:
 def _learn_loss(
     flight: RecordedFlight, step: int, node: Peer, link: LinkState, ranges: dict[str, LearnedRange]
 ) -> None:
-    """Reduce the learned range of a peer after a lost link, or record the failed attempt to connect."""
+    """Reduce the learned range of a peer after the loss of a link, or record a failed attempt to connect."""
     known = ranges.get(node.name, LearnedRange())
     if link.phase is LinkPhase.UP:
         ranges[node.name] = with_loss(known, math.dist(flight.positions[step], node.position) / node.range_m)

@@ -104,7 +104,7 @@ CHECKER = "image-checker"
 AGENT = "agent"
 CLOUD = "cloud"
 LATE_S = 1.0
-"""A picture is late if its response takes longer."""
+"""Response time above which a picture is late."""
 
 NOTICE_S = 1.0
 """Maximum time between the loss of a link and the log entry about it."""
@@ -122,7 +122,7 @@ class Picture:
 
     Attributes:
         received: Time of the first reception by each instance, by node.
-        answered_s: Time when the sender received the response. None if it never did.
+        answered_s: Time when the sender received the response. None: no response.
         received_twice: True if one instance received the picture more than once.
         took_s: Time from sending to the response, seconds.
         responder: Node that responded.
@@ -150,14 +150,14 @@ class LinkUse:
     Attributes:
         peer: Node.
         reason: Reason of the decision.
-        decided_s: The drone's agent decided to connect.
-        up_s: Pairing completed.
-        measured_s: First bandwidth measurement.
+        decided_s: Time when the drone's agent decided to connect.
+        up_s: Time when pairing was complete.
+        measured_s: Time of the first bandwidth measurement.
         mbps: Measured bandwidth.
-        spans: Time spans with traffic on the link. The end is None while it lasts.
-        first_s: First picture that the node received.
-        left: Reason of the end.
-        ended_s: End of the link.
+        spans: Time spans with traffic on the link. The end of a span is None while traffic uses the link.
+        first_s: Time when the node received the first picture.
+        left: Reason for the end of the link.
+        ended_s: Time when the link ended.
         lost: True if the link was lost while it carried traffic.
     """
 
@@ -203,7 +203,7 @@ class Evidence:
     Attributes:
         pictures: Pictures in sending order.
         link_uses: Uses of direct links in decision order.
-        track: Unix seconds and position, in metres east and north of the start and above it.
+        track: Unix seconds, and position in metres east, north and up from the start.
     """
 
     pictures: tuple[Picture, ...]
@@ -216,7 +216,11 @@ class Evidence:
         return max(self.gap_s(abrupt=False), self.gap_s(abrupt=True))
 
     def gap_s(self, *, abrupt: bool) -> float:
-        """Return the longest time between two receptions while a link with traffic was lost, or at all other times."""
+        """Return the longest time between two receptions.
+
+        Args:
+            abrupt: Consider only the times at which a link with traffic was lost. False: consider only all other times.
+        """
         receptions = sorted(p.received_s for p in self.pictures if p.received_s is not None)
         losses = [s.ended_s for s in self.link_uses if s.lost and s.ended_s is not None]
         gaps = ((b - a, any(a - NOTICE_S <= when <= b for when in losses)) for a, b in itertools.pairwise(receptions))
@@ -238,7 +242,7 @@ class Evidence:
         }
 
     def by_node(self) -> dict[str, int]:
-        """Return the number of pictures that each node received first."""
+        """Return for each node the number of pictures that it received first."""
         first = [min(p.received, key=p.received.__getitem__) for p in self.pictures if p.received]
         return dict(sorted(Counter(first).items()))
 
@@ -280,7 +284,7 @@ def _read_pictures(lines: Iterable[LogLine]) -> list[Picture]:
             answered.responder = event["by"]
         elif kind == "received":
             receptions.append((line.node, event))
-    # A reception can be logged before the sender's line, so receptions are assigned last.
+    # The receiver can log a picture before the sender does, so receptions are assigned to pictures last.
     for node, event in receptions:
         received = pictures.get(event["picture"])
         if received is not None:
@@ -290,7 +294,7 @@ def _read_pictures(lines: Iterable[LogLine]) -> list[Picture]:
 
 
 def _read_link_uses(lines: Iterable[LogLine]) -> list[LinkUse]:
-    """Return the links from the agent's log: decisions, connections, measurements and traffic changes."""
+    """Return the uses of direct links from the agent's log, with their decisions, measurements and traffic changes."""
     uses: list[LinkUse] = []
     for line in lines:
         if (state := _STATE_CHANGE.search(line.text)) is not None:
@@ -327,7 +331,7 @@ def _apply_state(uses: list[LinkUse], at_s: float, state: re.Match[str]) -> None
 
 
 def _apply_decision(uses: list[LinkUse], at_s: float, decided: re.Match[str]) -> None:
-    """Record a decision on the link, or on the traffic of an application, which is identified by its namespace."""
+    """Record a decision of the agent. It is about the link, or about the traffic of an application (by namespace)."""
     on = decided["on"]
     peer = decided["peer"]
     reason = decided["reason"]
@@ -338,7 +342,7 @@ def _apply_decision(uses: list[LinkUse], at_s: float, decided: re.Match[str]) ->
     direct = _LINK_SELECTED in reason
     for use in uses:
         if use.ended_s is None and use.up_s is not None and (not direct or use.peer == peer):
-            # The decision on the traffic path can be logged before the end of the link.
+            # If a link is lost, the agent can log the change of the traffic path before the end of the link.
             use.lost |= use.carries_traffic and reason.startswith(_LINK_MISSING)
             use.set_traffic(at_s, direct=direct)
             use.left = "" if direct else use.left or reason

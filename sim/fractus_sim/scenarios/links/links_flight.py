@@ -93,7 +93,10 @@ def read_earlier_run(out: Path) -> Evidence:
 
 
 def _record_links(kube: Kube, links: list[dict[str, Any]]) -> None:
-    """Replace the list by the current state of the DirectLinks, unless they have been deleted."""
+    """Replace the content of the list by the current DirectLinks.
+
+    Keep the list if all DirectLinks have been deleted.
+    """
     bodies = {body["metadata"]["name"]: body for body in kube.objects("directlinks")}
     if bodies:
         links[:] = [

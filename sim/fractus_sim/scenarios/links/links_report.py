@@ -83,7 +83,7 @@ def _link_uses_table(run: Evidence) -> str:
         "Back to cloud",
         "Link ended",
         "Reason",
-        "Reason of the end",
+        "Reason for the end",
     )
     return table(head, rows) if run.link_uses else "No direct link was used."
 
@@ -96,7 +96,7 @@ def _pictures_table(run: Evidence) -> str:
         ("lost", str(counts["lost"])),
         ("received twice by one instance", str(counts["doubled"])),
         ("received by a second instance after a repetition", str(counts["repeated_elsewhere"])),
-        (f"answered later than {LATE_S:g} s", str(counts["late"])),
+        (f"response after more than {LATE_S:g} s", str(counts["late"])),
         ("longest time between two receptions", f"{run.longest_gap_s:.2f} s"),
         *((f"received by {node}", str(count)) for node, count in run.by_node().items()),
     ]

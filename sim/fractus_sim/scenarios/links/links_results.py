@@ -1,4 +1,4 @@
-"""Results of a run: pictures, link_uses, and the gain over the cloud path compared with other rules."""
+"""Results of a run: pictures, uses of links, and the gain over the cloud path compared with other rules."""
 
 from __future__ import annotations
 
@@ -23,8 +23,10 @@ from fractus_sim.scenarios.links.links_evidence import Evidence, LinkUse
 from fractus_sim.scenarios.links.links_site import Site
 
 PLANNED_GAP_S = 1.5
+"""Maximum time between two receptions, except at the loss of a link."""
+
 ABRUPT_GAP_S = 2.5
-"""Maximum time between two receptions: at all times, and at the loss of a link."""
+"""Maximum time between two receptions at the loss of a link."""
 
 MIN_SHARE = 0.95
 """Minimum share of the maximum possible gain."""
@@ -33,7 +35,7 @@ MIN_ALTITUDE_M = 15.0
 """Minimum altitude of the evaluated part of the flight."""
 
 ARRIVED_M = 3.0
-"""Distance at which a waypoint is reached."""
+"""Distance to a waypoint at which it counts as reached."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +55,7 @@ class Gain:
 
 
 def recorded_flight(site: Site, run: Evidence) -> tuple[RecordedFlight, float]:
-    """Return the recorded flight while pictures were sent, and its start in Unix seconds."""
+    """Return the part of the flight in which pictures were sent, and its start in Unix seconds."""
     last_s = max((p.sent_s for p in run.pictures), default=math.inf)
     flown = [(time_s, place) for time_s, place in run.track if place[2] >= MIN_ALTITUDE_M and time_s <= last_s]
     times = np.array([time_s for time_s, _ in flown])
@@ -75,7 +77,7 @@ def recorded_flight(site: Site, run: Evidence) -> tuple[RecordedFlight, float]:
 
 
 def flown_gain(flight: RecordedFlight, begin_s: float, run: Evidence) -> float:
-    """Return the gain over the cloud path in Mbit, counting times with traffic on a peer that was actually in range."""
+    """Return the actual gain over the cloud path in Mbit. Only times with traffic on a peer in range count."""
     peers = {peer.name: peer for peer in flight.peers}
     spans = sorted((begin, math.inf if end is None else end, s.peer) for s in run.link_uses for begin, end in s.spans)
     begins = [span[0] for span in spans]

@@ -57,7 +57,7 @@ _Dumper.add_implicit_resolver(
 
 
 def dump_documents(values: Iterable[Any]) -> str:
-    """Return a YAML stream that every YAML parser, including kubectl's, reads as these values."""
+    """Return the values as a YAML stream that every YAML parser, including kubectl's, reads in the same way."""
     return yaml.dump_all(values, Dumper=_Dumper, sort_keys=False, width=120, allow_unicode=True)
 
 

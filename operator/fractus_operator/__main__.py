@@ -64,7 +64,7 @@ async def run(settings: Settings, stop: asyncio.Event | None = None) -> None:
     source = operator_metrics.MetricsSource(lambda: lease.left_s)
 
     def collect() -> Iterator[Metric]:
-        # The source is replaced when this operator becomes the leader.
+        # `source` is assigned again when this operator becomes the leader.
         return source.collect()
 
     metrics_server = AsyncExitStack()

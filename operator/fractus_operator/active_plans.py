@@ -116,7 +116,7 @@ class ActivePlans:
             self._on_requests(label_key(key), planned)
 
     def _index_host(self, key: Key, latest: OwnedPlan | None) -> None:
-        """Index whose flight an Application shares by its latest plan."""
+        """Update the index of shared flights with the latest plan of an Application."""
         known = self._hosts.pop(key, None)
         if known is not None:
             self._guests[known].discard(key)

@@ -217,7 +217,7 @@ class ApplicationController:
             await self._grants.refresh(observed)
             update, next_s = await self._deploy(self._cache.observe(submitted), state)
         except Blocked as blocked:
-            # No await before this line, so that no release of resources by another Application after planning is missed.
+            # There must be no await between planning and this line. Otherwise a release of resources could be missed.
             self._cache.subscriptions.set_placed(observed.key, placed=False, full=blocked.full)
             await self._reporter.report(submitted, status.blocked(blocked, present))
             if observed.plan is not None:

@@ -47,7 +47,7 @@ class ObservedApplication:
         plan: The active plan, if any.
         pods: Pods of the current mission.
         grants: All Grants under its name, including Grants of an earlier Application with the same name.
-        host: The host, which is the Application whose flight it shares, and the active plan of the host.
+        host: The Application whose flight it shares, and the active plan of that Application. Each may be None.
         in_flight: The drone of its plan while that drone is in flight.
         rules: Revision of the inputs of Grants.
     """
@@ -271,7 +271,8 @@ class ClusterCache:
         if _rules_differ(old, new):
             self._rules_changed()
         elif old is not None and new is not None and _planning_inputs(old) != _planning_inputs(new):
-            # A takeoff releases no drone, and offers no longer part of its flight to Applications that could share it.
+            # A takeoff needs no wake-up: the drone is not released, and the part of its flight that others can share
+            # shrinks.
             took_off = new.in_air and not old.in_air and _ready(old) == _ready(new)
             if not took_off:
                 self.subscriptions.wake_waiting()

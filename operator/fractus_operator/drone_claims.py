@@ -36,9 +36,10 @@ class Claim:
     returning: bool = False
 
     def holder(self, requester: str | None) -> Key:
-        """Return the holder's key as planning for the Application with uid `requester` should see it.
+        """Return the key of the holder for the planning of the Application with the uid `requester`.
 
-        Only the requester's own, current claim has the requester's key.
+        For other claims under the requester's name, and for a returning drone, the name has a suffix. Only the current
+        claim of the requester itself therefore equals the requester's key.
         """
         namespace, name = self.key
         if requester is None:

@@ -19,13 +19,19 @@ from fractus_operator.store import Store
 from fractus_operator.work_queue import WorkQueue
 
 EVENT_BURST = 20
-"""Number of Events of one drone without a pause, enough for some flights."""
+"""Number of Events of one drone without a pause, enough for several flights."""
 EVENT_PERIOD_S = 60.0
-"""Seconds until one more Event is allowed after a burst. Changes of a flapping drone during this pause are summarised."""
+"""Seconds until one more Event is allowed after a burst. The changes during this pause are summarised."""
 MAX_LATE = timedelta(seconds=60)
-"""Maximum age difference between two reports of which the older one arrived late. Beyond it, the drone's clock was set back."""
+"""Maximum age of a report, relative to the report before, that counts as late.
+
+An even older time means that the drone's clock was set back.
+"""
 _PAUSE = timedelta(seconds=2 * DRONE_REPORT_S)
-"""Pause between two reports from which an Event states the times of both, because the change happened between them."""
+"""Minimum pause between two reports for which an Event states the times of both.
+
+The time of the change is unknown then.
+"""
 
 
 @dataclass(frozen=True, slots=True)

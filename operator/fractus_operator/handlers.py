@@ -150,7 +150,10 @@ def _uid(body: kopf.Body) -> str:
 
 
 class _NoDiffBase(kopf.DiffBaseStorage):
-    """Reports that nothing changed. No handler uses the difference, and its annotation would cost a write."""
+    """Storage that never reports a difference between the last handled object and the current one.
+
+    No handler uses the difference, and storing it in an annotation would cost a write.
+    """
 
     def fetch(self, *, body: kopf.Body) -> kopf.BodyEssence:
         """Return the current object as the last handled one."""

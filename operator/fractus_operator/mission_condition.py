@@ -22,7 +22,7 @@ from fractus_operator.store import Store
 log = logging.getLogger(__name__)
 
 _REPORTS = 2
-"""Number of different reports after the deletion of the last Grant from which the state of the drone is known."""
+"""Number of reports that must arrive after the deletion of the last Grant before the drone's state counts as known."""
 
 
 class MissionConditionController:
@@ -30,7 +30,7 @@ class MissionConditionController:
 
     The condition is True while there is a Grant for the drone. After the deletion of the Grant it is Unknown until the drone
     has reported twice. The drone may have taken off while it was out of reach, and the first report that arrives may be older
-    than the deletion. Reports are distinguished by their times, which are compared with no other clock.
+    than the deletion. Reports are distinguished by their times. These times are not compared with another clock.
 
     The controller also records when a user overrides the protection of a drone with the annotation fractus.dev/grounded.
     """

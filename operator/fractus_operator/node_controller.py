@@ -183,7 +183,7 @@ class NodeGrantsController:
             return
         for kind in ACCOUNT_KINDS:
             if account.get(kind) is False:
-                log.warning("node controller: modified object is created again (kind=%s node=%s)", kind.name, node)
+                log.warning("node controller: replacing a modified object (kind=%s node=%s)", kind.name, node)
                 await self._delete(kind, node)
             if not account.get(kind):
                 created = await self._store.create(kind, account_object(kind, node))

@@ -110,7 +110,8 @@ class Rollout:
             failures: list[Exception] = []
             for step in (
                 partial(self._objects.apply, application, first),
-                # Only for existing Deployments: if the name of a Deployment is taken, that of its Secret may be, too.
+                # Only for existing Deployments. If another owner has the name of a Deployment, it may have that of the
+                # Secret.
                 partial(self._write_secrets, application, certificates),
                 partial(self._objects.apply, application, last),
             ):

@@ -112,7 +112,7 @@ class RouteCheckCache:
                 with phase("routes"):
                     result = await asyncio.to_thread(check)
             except InvalidObject as error:
-                # Planning reports the contradiction in the Application.
+                # The plan stays unchecked. Planning reports the error in the status of the Application.
                 log.info("route checks: route not checked (application=%s/%s error=%s)", *key, error)
                 result = plan
             except Exception:

@@ -22,7 +22,7 @@ log = logging.getLogger(__name__)
 SERVICES_CURRENT = "ServicesCurrent"
 ROLLOUT_PERIOD_S = 2.0
 _SHARE = 20
-"""The services of at most one in this number of nodes are replaced at the same time, but always of one node."""
+"""Services are replaced on one of this number of nodes at the same time, and always on at least one node."""
 STUCK_S = 600.0
 """Maximum time until services are ready, in seconds, including image pulls over slow links.
 
@@ -54,7 +54,7 @@ def next_step(
 ) -> tuple[list[ServicesOfNode], dict[str, ConditionUpdate]]:
     """Return the nodes whose services are replaced now, and the condition of each node.
 
-    The rollout of a release that does not start stops at the second node at the latest. If other nodes run the release, a
+    If a release does not start, its rollout stops at the second node at the latest. If other nodes run the release, a
     node on which it does not start is skipped.
 
     Args:

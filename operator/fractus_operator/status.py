@@ -264,7 +264,7 @@ def apply_failed(reported: Mapping[str, Any], reason: str, error: str) -> Status
     """
     message = f"cannot apply child objects, retrying: {error}"
     known = (Condition.model_validate(c) for c in reported.get("conditions") or ())
-    # Reached stages stay. Stages that were not reached may be reached by now, so they are removed.
+    # Stages that were reached stay in the status. Other stages may be reached by now, so their conditions are removed.
     kept = [
         ConditionUpdate(c.type, c.status, c.reason, c.message)
         for c in known

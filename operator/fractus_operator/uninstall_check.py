@@ -14,7 +14,7 @@ from fractus_operator.store import KubeError, NotFound, Store, Unconfigured
 
 NOT_REPORTED = "its last report"
 _REPORTS_S = 3 * DRONE_REPORT_S
-"""Maximum time of two reports, in seconds. The deadline of the chart's Job is 150 s."""
+"""Maximum time for two reports to arrive, in seconds. The deadline of the chart's Job is 150 s."""
 _PERIOD_S = 2.0
 
 

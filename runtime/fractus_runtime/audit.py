@@ -49,7 +49,7 @@ CHECKPOINT_INTERVAL_S = 60.0
 """Interval between checkpoints while there are new entries."""
 
 HANG_TIMEOUT_S = 2.0
-"""Duration after which a pending write counts as a failure, until it returns."""
+"""Duration after which a pending write is reported as a failure, in seconds. The report ends when the write ends."""
 
 
 def _finite_json(value: Any) -> Any:

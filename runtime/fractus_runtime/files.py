@@ -64,7 +64,7 @@ def _keep(path: Path, former: Path) -> None:
         path.replace(former)
         return
     spare.replace(former)
-    spare.unlink(missing_ok=True)  # not renamed if both names already were the same file
+    spare.unlink(missing_ok=True)  # the rename had no effect if both were names of the same file
 
 
 def remove_file(path: Path) -> bool:

@@ -21,7 +21,7 @@ log = logging.getLogger(__name__)
 
 STATUS = "rpc.grpc.status_code"
 CLOSE_TIMEOUT_S = 1.0
-"""Maximum time for which the end of the process waits for the export of the last spans."""
+"""Maximum time for the export of the last spans when the process ends, in seconds."""
 
 _OK = 0
 _CANCELLED = 1

@@ -29,7 +29,7 @@ from fractus.values import (
 )
 
 ARM_TIMEOUT_S = 60.0
-"""An autopilot is ready about 40 s after power-on."""
+"""Default timeout of `arm`, in seconds. An autopilot is ready about 40 s after power-on."""
 
 R = TypeVar("R", bound=Result)
 

@@ -172,8 +172,8 @@ class Requester:
             method: Name of the requested method.
             body: Content, at most 16 MiB.
             timeout_s: Seconds after which the request fails.
-            request_id: Id of the request on whose behalf this one is sent, whose body must be the same each time; by
-                default a new id.
+            request_id: Id of the received request that causes this one; by default a new id. All requests with one id
+                must have the same body.
 
         Raises:
             InvalidRequest: The other component refused the request.

@@ -22,7 +22,7 @@ log = logging.getLogger(__name__)
 MAX_PIXELS = 2**31 - 1
 RETRIEVE_TIMEOUT_S = 60.0
 CAPTURE_TIMEOUT_S = 120.0
-"""Face detection in pictures of several megapixels is slow."""
+"""Default timeout of a capture, in seconds. Face detection in pictures of several megapixels is slow."""
 
 
 class Camera(ServiceClient):

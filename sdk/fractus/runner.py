@@ -16,7 +16,7 @@ from fractus.environment import Endpoint
 from fractus.errors import ControlHeld, ControlLost, FractusError, Interrupted, MissionComplete, MissionEnded
 
 MAX_INTERRUPTIONS = 5
-"""Maximum number of consecutive restarts after an interrupted motion without a further waypoint."""
+"""Maximum number of consecutive restarts after interrupted motions while no further waypoint is reached."""
 
 RETRY_S = 2.0
 """Delay in seconds before control is requested again, or a program is restarted."""

@@ -22,7 +22,7 @@ from opentelemetry.trace.propagation.tracecontext import TraceContextTextMapProp
 log = logging.getLogger("fractus")
 
 CLOSE_TIMEOUT_S = 1.0
-"""Maximum time for which the end of the program waits for the export of the last spans."""
+"""Maximum time for the export of the last spans when the program ends, in seconds."""
 
 
 def collector(environment: Mapping[str, str]) -> str:
@@ -125,7 +125,7 @@ class _TracedChannel:
 
 
 def _status(call: Any) -> grpc.StatusCode:
-    """Return the status of a call that has ended. Its `code()` is a coroutine that has nothing left to wait for."""
+    """Return the status of a call that has ended. The coroutine of its method `code` then returns without waiting."""
     code = call.code()
     try:
         code.send(None)

@@ -17,7 +17,10 @@ from fractus_core.api.rules import Violation, rule
 def _each(
     field: ReferenceField, cel: str, message: str, fits: Callable[[ApplicationSpec, Component, str], bool]
 ) -> Any:
-    """Return the rule that every name in a field of every component is valid; `cel` tests name n in component c."""
+    """Return a rule for a field of components that lists names: every name must be valid.
+
+    `cel` tests the name n in the component c.
+    """
 
     @rule(f"self.components.all(c, !has(c.{field}) || c.{field}.all(n, {cel}))", f"{field} {message}")
     def each(self: ApplicationSpec) -> Violation:
@@ -65,8 +68,8 @@ class ApplicationSpec(Model):
         default=600,
         ge=0,
         le=604_800,
-        description="Seconds for which the stopped pods are kept after the mission, so that their logs can be read. They"
-        " reserve no resources on their nodes.",
+        description="Seconds for which the stopped pods are kept after the mission, so that their logs can be read."
+        " Stopped pods reserve no resources on their nodes.",
     )
 
     @rule(
@@ -143,7 +146,7 @@ class ApplicationSpec(Model):
 
     @property
     def mission_digest(self) -> str:
-        """Hash of all fields that define the mission, that is, of all but the update policy and the pod retention."""
+        """Hash of the fields that define the mission: all fields except the update policy and the pod retention."""
         mission = self.model_dump(mode="json", by_alias=True, exclude_defaults=True, exclude=_NOT_MISSION)
         return hashlib.sha256(json.dumps(mission, sort_keys=True).encode()).hexdigest()
 
@@ -182,7 +185,7 @@ class ApplicationSpec(Model):
         return component
 
     def callers(self, name: str) -> set[str]:
-        """Return the components that may call a component, from its ingress and their egress. Empty if all may call it."""
+        """Return the components whose calls to a component are declared, on either side. Empty: all may call it."""
         return {other.name for other in self.components if name in other.egress}.union(self.component(name).ingress)
 
 

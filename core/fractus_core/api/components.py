@@ -418,7 +418,7 @@ class Component(Model):
     hybrid_to: tuple[ComponentName, ...] = Field(
         default=(),
         max_length=50,
-        description="For placement hybrid: components near whose instances this component gets instances.",
+        description="For placement hybrid: instances of this component are placed near instances of these components.",
     )
     heuristic: Heuristic | None = None
     replicas: int | None = Field(

@@ -1,4 +1,4 @@
-"""Conditions of an object's status: merges new observations into them and reports which ones are transitions."""
+"""Merging of new observations into the conditions of an object's status, and detection of transitions."""
 
 from __future__ import annotations
 

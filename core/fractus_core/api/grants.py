@@ -43,7 +43,7 @@ class GrantedPolicy(Model):
 
     @model_validator(mode="after")
     def _resolved(self) -> Self:
-        """Reject a policy without the areas of all its zones: a zone without area would restrict nothing."""
+        """Reject a policy if the area of one of its zones is missing. Such a zone would restrict nothing."""
         missing = sorted(set(self.spec.selector.zones) - {zone.name for zone in self.zones})
         if missing:
             raise InvalidObject(
@@ -128,7 +128,10 @@ class GrantSpec(Model):
 
     @property
     def mission_key(self) -> str:
-        """Identifier of the mission that includes the instance, so that no Grant can claim the mission of another instance."""
+        """Identifier of the mission.
+
+        It includes the instance, so a Grant cannot name the mission of another instance.
+        """
         return f"{self.identity}#{self.mission or ''}"
 
     @property
@@ -182,7 +185,7 @@ class Grant(Resource, plural="grants", short="fgr", written_by_operator=True, se
 
 
 NODE_GRANTS_NAMESPACE = "fractus-nodes"
-"""Namespace of the NodeGrants objects. Each node has a service account that may read only its own."""
+"""Namespace of the NodeGrants objects. The service account of a node may read only the object of this node."""
 
 MAX_UNPACKED_BYTES = 64 * 2**20
 """Maximum size of the Grants of a node as JSON. Compression reduces it to about 1 %, because Grants share zones."""
@@ -215,7 +218,9 @@ class ReportedGrant(OpenModel):
     name: str = Field(max_length=253, description="Name of the Grant.")
     phase: GrantPhase = Field(description="Pending until the node has stored the Grant; then the state of its mission.")
     message: str = Field(default="", max_length=MAX_MESSAGE, description="Human-readable explanation.")
-    observed_generation: Annotated[int, Field(ge=0, description="metadata.generation of the Grant that is described.")]
+    observed_generation: Annotated[
+        int, Field(ge=0, description="metadata.generation of the Grant that this state describes.")
+    ]
 
 
 class NodeGrantsStatus(OpenModel):

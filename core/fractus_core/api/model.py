@@ -188,7 +188,10 @@ class Resource(Model):
     SELECTABLE: ClassVar[Sequence[str]]
     """JSONPaths of the fields that watches may select on."""
     WRITTEN_BY_OPERATOR: ClassVar[bool]
-    """True if only the operator writes objects of the kind. Its parts are already validated, so the CRD has no CEL rules."""
+    """True if only the operator writes objects of the kind.
+
+    The operator builds these objects from validated objects, so the CRD has no CEL rules.
+    """
     COLUMNS: ClassVar[Sequence[Column]] = ()
 
     api_version: Literal["fractus.dev/v1alpha1"] = "fractus.dev/v1alpha1"
@@ -313,7 +316,7 @@ _SENTENCES = {
     "missing": "is missing; give it",
     "extra_forbidden": "there is no such field; remove it, or correct its name",
 }
-"""Messages in the terms of manifests, by pydantic error type whose own message uses Python terms."""
+"""Messages for pydantic errors, by error type. The messages of pydantic use Python terms that users do not know."""
 
 
 def _problem(finding: ErrorDetails) -> str:

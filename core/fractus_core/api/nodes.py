@@ -34,8 +34,8 @@ CONDITIONS_BY_TYPE: dict[str, JsonValue] = {"x-kubernetes-list-type": "map", "x-
 
 
 GROUNDED_ANNOTATION = f"{GROUP}/grounded"
-"""Annotation of a Drone that a person saw on the ground. The value is the `lastSeen` of the last report before that.
-The annotation is ignored after the next report."""
+"""Annotation of a Drone: a person saw the drone on the ground. The value is the `lastSeen` of the drone's last report.
+After the next report, the annotation is ignored."""
 
 ON_MISSION = "OnMission"
 """Condition of a Drone, set by the operator: unless it is False, the drone may have taken off since its last report."""

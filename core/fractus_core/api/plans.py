@@ -37,8 +37,8 @@ class LegLegality(Model):
     end: Position
     flown_by: Literal["system", "driver"] = Field(description="Control authority on the leg.")
     outcome: Literal["Detour", "Corrected", "Denied"] = Field(
-        description="Detour: the system flies around. Corrected: altitude or speed is changed. Denied: the leg is not flown"
-        " (completely)."
+        description="Detour: the system flies a longer way. Corrected: altitude or speed is changed. Denied: the leg"
+        " or a part of it is not flown."
     )
     reason: str = Field(description="Machine-readable CamelCase reason.")
     message: str = Field(description="Human-readable explanation.")

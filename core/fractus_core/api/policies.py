@@ -249,9 +249,9 @@ class PolicySpec(Validity):
         return "upperLimit" if self.lower_limit is None and self.upper_limit is None else None
 
     @rule(
-        # An upper limit of 0 m/s would stop the drone, and one below 0 would fly it backwards. A lower limit may be 0, which
-        # has no effect. No drone flies below terrain. Below home and mean sea level it may fly, down to the bound of
-        # `Altitude`.
+        # Speed: an upper limit of 0 m/s would stop the drone, and a negative one would fly it backwards. A lower limit
+        # of 0 is allowed and has no effect. Altitude: no drone flies below terrain, so the upper limit must be above 0
+        # there. Home and mean sea level have no such bound, because drones may fly below them.
         _for(
             "LimitControl",
             "(!has(self.upperLimit) || self.upperLimit > 0.0 || (self.kind != 'speed'"

@@ -21,7 +21,7 @@ class StreamOpened:
 
 @dataclass(frozen=True, slots=True)
 class StreamClosed:
-    """A driver's control stream ended. Without a preceding ControlReturned the driver is lost."""
+    """A driver's control stream ended. If the driver did not return control before, it counts as lost."""
 
     lease_id: int
 
@@ -69,7 +69,7 @@ class WaypointsDone:
 
     Attributes:
         key: Key of the mission.
-        waypoints: Number of waypoints that were reached or passed over.
+        waypoints: Number of waypoints that were reached or skipped.
         leg: True if a leg of the driver ended, at a waypoint or elsewhere.
     """
 
@@ -193,7 +193,7 @@ class GrantChanged:
 
 @dataclass(frozen=True, slots=True)
 class VehicleObserved:
-    """The present state of the vehicle. No decision depends on this event alone."""
+    """Update of the vehicle's state. The event itself causes no decision, but later decisions use the state."""
 
     vehicle: VehicleFacts
 

@@ -1,7 +1,7 @@
 """State machine of control authority: `transition(state, event, now) -> (state, actions)`.
 
-The system takes over the vehicle whenever no other party rightfully has it. It never gives up a flying vehicle before the
-vehicle is home, or a driver or pilot has it.
+The system takes over the vehicle whenever neither a driver nor a pilot may command it. The system keeps a flying
+vehicle until the vehicle is home, or until a driver or a pilot has control authority.
 """
 
 from __future__ import annotations
@@ -89,15 +89,16 @@ TAKEOVERS: dict[Takeover, tuple[TaskKind, OutcomeKind | None]] = exhaustive(
 """System task and mission outcome of each takeover that a policy can demand."""
 
 POSITION_UNKNOWN = "PositionUnknown"
-"""Code of the takeover of a vehicle that hovers, as far as it receives commands, until its position is known."""
+"""Code of the reaction to an unknown position: the vehicle hovers until the position is known again."""
 
 UNATTENDED = "NoControlAuthority"
-"""Code of the takeover of a vehicle without control authority. It results from a fault of the service."""
+"""Code of the takeover of an armed vehicle that no party controls. Only a fault of the service leads to this state."""
 
 MAX_UNATTENDED = 3
-"""Maximum number of such takeovers in one flight. Without a maximum, a task that always fails would be restarted forever.
+"""Maximum number of takeovers with the code `UNATTENDED` in one flight.
 
-After the last one the supervisor stops the heartbeats, and the autopilot's own failsafe brings the vehicle home.
+Without a maximum, a task that always fails would be restarted forever. After the last takeover, the supervisor stops
+the heartbeats, and the autopilot's own failsafe brings the vehicle home.
 """
 
 CANCELLED_DESCENT_S = 0.3
@@ -137,8 +138,8 @@ def transition(state: ControlState, event: Event, now: float) -> tuple[ControlSt
         _on_tick(update)
     else:
         assert_never(event)
-    # A driver must neither keep nor await the vehicle of an ended mission. It could arm the vehicle next to the pilot who
-    # landed it.
+    # When a mission has ended, its driver loses its lease, even if it only waits for control. Otherwise the driver
+    # could arm the vehicle next to the pilot who landed it.
     lease = update.state.lease
     mission = update.state.missions.get(lease.key) if lease is not None else None
     if mission is not None and mission.outcome is not None:
@@ -344,9 +345,10 @@ def _on_policy(update: StateUpdate, event: PolicyEvent) -> None:
 
 
 def _lose_position(update: StateUpdate, reason: str) -> None:
-    """Hover. A driver keeps control and may fly again if the position is known within the grace.
+    """Stop the motion and hover. A driver keeps control during the grace period.
 
-    The motion may be requested again, because the position may be known again in a moment.
+    The driver may fly again if the position is known before the grace period ends. The motion is stopped with an error
+    that permits a retry, because the position may be known again in a moment.
     """
     update.audit("control", "brake", update.state.controller, reason, POSITION_UNKNOWN)
     update.stop_motion(StopKind.PASSING, POSITION_UNKNOWN, reason)
@@ -427,7 +429,10 @@ def _has_ended(update: StateUpdate, key: str) -> bool:
 
 
 def _on_tour(update: StateUpdate, event: TourBegan | TourInterrupted | TourEnded) -> None:
-    """Handle an event of a mission over points of interest. Its reports count only while its task has the vehicle."""
+    """Handle an event of a mission over points of interest.
+
+    An interruption or the end of the mission is ignored unless the system is flying this mission.
+    """
     match event:
         case TourBegan(key):
             if update.state.authority is Authority.PILOT:

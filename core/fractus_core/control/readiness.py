@@ -18,7 +18,7 @@ class Readiness:
         unready: Reason why the autopilot would refuse to arm.
         located: True if position and home are known.
         link: Problem of the link to the autopilot.
-        absent: Reason why the source of received messages is not the autopilot, while the autopilot is not connected.
+        absent: Reason why received messages do not come from the autopilot. Empty while the autopilot is connected.
     """
 
     unverified: str

@@ -226,7 +226,10 @@ class ActiveMotion:
 
 @dataclass(frozen=True, slots=True)
 class Grace:
-    """Time within which a lost driver, or a lost position, must come back. After it the mission has failed."""
+    """Grace period after the loss of the driver or the position.
+
+    When it ends without recovery, the mission has failed.
+    """
 
     until: float
     key: str
@@ -265,12 +268,14 @@ class ControlState:
             take effect.
         failsafe_seen: True if a failsafe was active at the last heartbeat.
         mode_changes: Number of mode changes by the system in progress.
-        own_modes: Modes that may be reported during these changes: each change's previous and requested mode.
+        own_modes: Modes that may be reported during the changes in progress: the previous and the requested mode of
+            each.
         starting_motors: True while the system starts the motors.
-        start_unconfirmed_until: Time until which armed motors may result from a start whose answers were lost.
+        start_unconfirmed_until: Time until which armed motors may result from a start whose acknowledgements were lost.
         preparing: Number of arming attempts in progress, from raising the fence to running motors.
         unattended_since: Time at which the armed vehicle was first found without control authority.
-        unattended: Number of times the system took over such a vehicle since it last had a driver or was disarmed.
+        unattended: Number of times the system took over the unattended vehicle since it last had a driver or was
+            disarmed.
         last_task_id: Id of the latest system task.
     """
 
@@ -338,9 +343,9 @@ class ControlState:
 
     @property
     def home_for_good(self) -> bool:
-        """True if the vehicle returns and no driver may stop it.
+        """True if the vehicle returns and no driver may stop the return.
 
-        A return that a driver started before it was lost may be stopped, while the driver may still come back.
+        During the grace period of a lost driver, that driver may still reconnect and stop a return that it started.
         """
         waits = self.grace is not None and self.grace.key == self.active
         return self.returning and not waits

@@ -124,10 +124,11 @@ class StateUpdate:
         self.act(WakeWaiters())
 
     def drop_lease(self) -> None:
-        """Remove the lease.
+        """Remove the lease, and end the control authority of the driver.
 
-        A driver whose second stream still waits has authority without a granted lease. Its authority ends with that stream:
-        otherwise a pilot who arms the vehicle would be mistaken for the driver.
+        If a driver with authority opens a second stream, the lease of the second stream is not granted yet. The
+        authority must end with that lease as well. Otherwise the service would mistake a pilot who arms the vehicle for
+        the driver.
         """
         self.set(lease=None)
         if self.state.authority is Authority.DRIVER:
@@ -138,8 +139,8 @@ class StateUpdate:
     def start(self, kind: TaskKind, *, begun_by_others: bool = False) -> None:
         """Start a system task in place of the current one.
 
-        A task that comes down counts as returning immediately, so that neither monitor nor supervisor intervenes before the
-        task runs.
+        If the task brings the vehicle down, the vehicle counts as returning from now on. Otherwise the monitor or the
+        supervisor could intervene before the task runs.
         """
         self.stop_task()
         task = SystemTask(self.state.last_task_id + 1, kind, begun_by_others=begun_by_others)
@@ -148,16 +149,19 @@ class StateUpdate:
         self.act(StartSystemTask(task))
 
     def stop_task(self) -> None:
-        """Stop the system task. A return by the autopilot itself continues, without a responsible party."""
+        """Stop the system task.
+
+        If the autopilot itself is returning, it continues, but no system task supervises it.
+        """
         if self.state.task is not None:
             self.act(StopSystemTask(self.state.task.task_id))
         self.set(task=None, returning=False)
 
     def begin_grace(self, mission: Mission, reason: str, code: str = "DriverLost") -> None:
-        """Start the time within which a lost driver or position must come back.
+        """Start the grace period of a mission whose driver or position is lost.
 
-        There is no grace on the ground before any flight, because nothing has to be saved. A mission that already has a
-        grace keeps its deadline: a driver that is lost repeatedly does not keep the drone in the air.
+        A disarmed drone that has not flown for the mission needs no grace period. If the grace period of the mission is
+        already running, its deadline stays. Otherwise a driver that is lost repeatedly could keep the drone in the air.
         """
         current = self.state.grace
         until = self.now + self.state.grace_s
@@ -167,13 +171,17 @@ class StateUpdate:
         self.set(grace=Grace(until, mission.key, reason, code) if waits else None)
 
     def follow_descent(self, kind: TaskKind, *, begun_by_others: bool = False) -> None:
-        """Supervise a descent that the autopilot started without a command, and complete it if the autopilot stops."""
+        """Start a system task for a descent that the autopilot started by itself. The task completes the descent."""
         self.set(authority=Authority.SYSTEM)
         self.start(kind, begun_by_others=begun_by_others)
         self.set(returning=True)
 
     def take_back(self, mission: Mission) -> None:
-        """Hover and wait for the driver if the mission continues. Otherwise return."""
+        """Handle a flight whose driver or pilot no longer has control authority.
+
+        If the mission continues, the drone hovers and waits for its driver. If the mission has ended, the drone
+        returns.
+        """
         if mission.outcome is not None or not self.state.grant_in_force:
             self.end_mission(mission, OutcomeKind.REVOKED, GRANT_REMOVED)
             self.start(TaskKind.RETURN)
@@ -184,7 +192,10 @@ class StateUpdate:
     def seize(
         self, kind: TaskKind, code: str, reason: str, policies: tuple[str, ...], outcome: OutcomeKind | None
     ) -> None:
-        """Take the vehicle from its driver and start a system task. A mission without an outcome gets its grace."""
+        """Take the vehicle from its driver and start a system task.
+
+        If the mission has no outcome after the takeover, its grace period starts.
+        """
         mission = self.state.mission
         self.audit("takeover", kind.value, "system", reason, code, policies=policies)
         self.lose_lease(reason)

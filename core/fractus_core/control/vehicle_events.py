@@ -75,14 +75,14 @@ def on_vehicle(update: StateUpdate, event: VehicleEvent) -> None:
             elif update.state.expected_mode == mode and update.state.vehicle.mode != mode:
                 update.set(expected_mode=before, unconfirmed=None if refused else (mode, update.now + UNCONFIRMED_S))
             elif not refused and update.state.expected_mode != mode and update.state.authority is Authority.SYSTEM:
-                # A failsafe changed the mode meanwhile. A request sent before may take effect after it.
+                # A failsafe changed the mode meanwhile. The autopilot may still carry out the earlier request.
                 update.set(unconfirmed=(mode, update.now + UNCONFIRMED_S))
         case _:
             assert_never(event)
 
 
 def on_arming(update: StateUpdate, event: ArmingEvent) -> None:
-    """Handle arming: the active mission, and the attribution of running motors."""
+    """Handle arming: store the active mission, and who started the motors."""
     match event:
         case ArmingRequested(key, identity, home):
             update.update_mission(update.mission(key, identity), home=home)
@@ -125,27 +125,33 @@ def _find_vehicle(update: StateUpdate) -> None:
     comes_down = vehicle.mode.comes_down
     if vehicle.mode.kind is ModeKind.BRAKING and vehicle.failsafe:
         update.seize(
-            TaskKind.RETURN, "AutopilotFailsafe", "found the drone braked by a failsafe", (), OutcomeKind.FAILED
+            TaskKind.RETURN,
+            "AutopilotFailsafe",
+            "the service found the drone stopped by a failsafe",
+            (),
+            OutcomeKind.FAILED,
         )
     elif not (commanded or comes_down) or (mission is None and not commanded and not vehicle.failsafe):
         update.give_to_pilot(f"is flying in {vehicle.mode.name}")
     elif mission is None and comes_down:
-        update.audit("takeover", "homeward", "system", f"found the drone in {vehicle.mode.name}, and no mission")
+        update.audit(
+            "takeover", "homeward", "system", f"the service found the drone in {vehicle.mode.name}, without a mission"
+        )
         update.follow_descent(_descent(vehicle.mode))
     elif mission is None:
         update.set(authority=Authority.SYSTEM)
-        reason = "found the drone armed, and no mission"
+        reason = "the service found the drone armed, without a mission"
         update.audit("takeover", TaskKind.RETURN.value, "system", reason)
         update.start(TaskKind.RETURN)
     elif comes_down:
         update.end_mission(mission, OutcomeKind.FAILED, FLEW_HOME_ALONE)
-        update.audit("takeover", "homeward", "system", f"found the drone in {vehicle.mode.name}")
+        update.audit("takeover", "homeward", "system", f"the service found the drone in {vehicle.mode.name}")
         # Without a failsafe, a pilot may have chosen the return.
         by_pilot = not vehicle.failsafe and (task is None or task.begun_by_others)
         update.follow_descent(_descent(vehicle.mode), begun_by_others=by_pilot)
     else:
         update.set(authority=Authority.SYSTEM)
-        update.audit("takeover", TaskKind.HOVER.value, "system", "found the drone in the air")
+        update.audit("takeover", TaskKind.HOVER.value, "system", "the service found the drone in the air")
         update.take_back(mission)
 
 
@@ -165,7 +171,7 @@ def _on_heartbeat(update: StateUpdate) -> None:
         else:
             _on_disarmed(update)
     if update.state.mode_changes and not (vehicle.armed and vehicle.mode not in update.state.own_modes):
-        # Until the change is confirmed or given up, both modes belong to it. A third mode must not be overruled.
+        # During a mode change of the system, its old and its new mode are expected. Only a third mode is handled below.
         return
     if not vehicle.armed:
         update.set(expected_mode=vehicle.mode)
@@ -177,7 +183,7 @@ def _on_heartbeat(update: StateUpdate) -> None:
 def _on_armed(update: StateUpdate) -> None:
     # If another party armed, nothing was prepared: no failsafes, fence, home or limits. A driver on the ground loses control too.
     state = update.state
-    # In a pilot's mode the pilot armed, even if the system had requested it.
+    # In a pilot's mode, the pilot started the motors, even if the system had requested a start before.
     late = update.now < state.start_unconfirmed_until and state.vehicle.mode.commanded
     update.set(armed_by_others=not (state.starting_motors or late), start_unconfirmed_until=-math.inf)
     if update.state.armed_by_others:
@@ -216,7 +222,7 @@ def _on_foreign_mode(update: StateUpdate) -> None:
         if vehicle.mode.comes_down and state.authority is Authority.SYSTEM and not state.returning:
             update.follow_descent(_descent(vehicle.mode))  # the task that requested it has ended
         return  # the system requested this mode itself, but the acknowledgements were lost
-    # A failsafe stays reported for the rest of the flight: a pilot may choose the mode long after it.
+    # The failsafe flag stays set for the rest of the flight. A later mode change may therefore be that of a pilot.
     begins = vehicle.failsafe and not state.failsafe_seen
     text = vehicle.failsafe_text if update.now - vehicle.failsafe_text_at < FAILSAFE_TEXT_S else ""
     if vehicle.silent_s >= LINK_CUT_S and vehicle.mode.kind is ModeKind.RETURNING and not text:

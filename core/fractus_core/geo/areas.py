@@ -21,7 +21,7 @@ _SEGMENTS = (8, 32)
 """Straight pieces per quarter of a circle, minimum and maximum. The area is accurate to 0.4 %."""
 
 _CORNER_M = 0.01
-"""Between these limits, the number of pieces keeps the corners within this distance of the circle."""
+"""Distance between corners and circle that determines the number of pieces, within the limits of `_SEGMENTS`."""
 
 MAX_EXTENT_M = 1_000_000.0
 """Largest distance of a point of an area from its center. A local frame is meaningless beyond it."""
@@ -30,7 +30,10 @@ _MIN_CURVATURE_M = 6_335_000.0
 """Smallest radius of curvature of the ellipsoid."""
 
 _SNAPPED = 1e-5
-"""GEOS merges corners closer than about a millionth of the radius, which would cut short a leg of that length."""
+"""Share by which the radius of a corridor is enlarged.
+
+GEOS merges corners that are closer than about a millionth of the radius, which would cut off the end of a short leg.
+"""
 
 
 def points_xy(frame: LocalFrame, points: Iterable[Point]) -> list[tuple[float, float]]:
@@ -110,7 +113,7 @@ def corridor(frame: LocalFrame, points: Iterable[Point], radius_m: float) -> Bas
 
 
 def _circumscribed(radius_m: float) -> tuple[float, int]:
-    """Return the corner distance of a polygon around a circle, and its number of pieces per quarter."""
+    """Return the distance from the centre to the corners of a polygon around a circle, and its pieces per quarter."""
     needed = math.ceil(math.pi / 4 / math.acos(radius_m / (radius_m + _CORNER_M)))
     fewest, maximum = _SEGMENTS
     segments = min(max(needed, fewest), maximum)
@@ -269,7 +272,10 @@ Line = npt.NDArray[np.float64]
 _AT_ONCE = 64
 """Number of pieces compared with all others at a time. For 30,000 pieces this makes a million pairs."""
 _MAX_PAIRS = 2_500_000
-"""Maximum number of pairs of pieces that are examined, which takes a second. Two thousand parallel pieces have as many pairs."""
+"""Maximum number of pairs of pieces that are examined, which takes a second.
+
+Two thousand parallel pieces reach the maximum.
+"""
 
 
 def count_crossings(lines: Sequence[Line], at_most: int) -> int:

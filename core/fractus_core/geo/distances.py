@@ -24,8 +24,8 @@ def geodesic_m(a: Point, b: Point) -> float:
 def distance_m(a: Point, b: Point) -> float:
     """Return the geodesic distance in metres, twenty times faster than `geodesic_m`.
 
-    The error is below a micrometre up to 50 km. The distance is computed from the chord, bent by the ellipsoid's
-    curvature along it. Beyond 200 km the function calls `geodesic_m`.
+    The error is below a micrometre up to 50 km. The distance is computed from the chord and the ellipsoid's
+    curvature along the chord. Beyond 200 km the function calls `geodesic_m`.
     """
     ax, ay, az = ecef(a.lat, a.lon)
     bx, by, bz = ecef(b.lat, b.lon)

@@ -21,7 +21,7 @@ _MAX_VERIFIED = 4096
 
 
 class GrantSigner:
-    """Signs Grants with a key that never leaves this process. A certificate of the authority belongs to the key.
+    """Signs Grants with a key that never leaves this process. The authority issues a certificate for the key.
 
     Args:
         authority: Authority that all nodes trust.
@@ -45,7 +45,8 @@ class GrantSigner:
         now = self._clock()
         key, certificate = self._present_signer(now)
         before = replaces.spec.issued_at if replaces is not None else None
-        # A time after the expiry of the certificate is forged or damaged. A later time of issue could not be signed.
+        # Ignore a time of issue after the expiry of the certificate. It is forged or damaged, and the certificate does
+        # not permit a later one.
         if before is not None and before.tzinfo is not None and before < certificate.not_valid_after_utc:
             self._last_issued = max(self._last_issued, before)
         # The time must increase even if the clock stops or goes back, because nodes keep the latest Grant.
@@ -81,10 +82,13 @@ class GrantSigner:
 
 
 def _mission(body: dict[str, Any], replaces: Grant | None) -> str:
-    """Return the mission of a Grant: that of its spec, or of the Grant that it replaces, or a new mission.
+    """Return the identifier of the mission of a Grant.
 
-    A new mission is identified by the uid of the Grant if it has one. A Grant on another node starts a new mission: the
-    first node ended the old mission when the Grant left it, and would refuse to fly it again.
+    This is the mission in the spec of the Grant, or else the mission of the Grant that it replaces. Otherwise it is a
+    new mission, identified by the uid of the Grant or by a random identifier.
+
+    If a Grant moves to another node, a new mission begins. The first node has ended the old mission, and would refuse
+    to fly it again if the Grant moved back.
     """
     uid = (body.get("metadata") or {}).get("uid")
     kept = None

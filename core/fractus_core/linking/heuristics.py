@@ -1,8 +1,8 @@
 """Heuristics that score network paths for an application (thesis 8.6).
 
 A heuristic is a function from path metrics to a score. Higher is better, and differences of scores add up over time.
-A package adds its own as an entry point of the group `fractus.linking`. An Application selects it by that name in
-`heuristic.kind`.
+A package can provide a heuristic as an entry point of the group `fractus.linking`. An Application selects the heuristic
+by the name of the entry point in `heuristic.kind`.
 """
 
 from __future__ import annotations

@@ -60,7 +60,7 @@ class Horizon:
         return not state or step >= self.steps or self.direct[state - 1][step] != OUT_OF_RANGE
 
     def score(self, state: int, step: int) -> float:
-        """Return the score of a state at a step: that of the cloud path if the link is worse."""
+        """Return the score of a state at a step: the better score of its link and of the cloud path."""
         return max(self.cloud, self.direct[state - 1][step]) if state else self.cloud
 
 
@@ -142,7 +142,7 @@ def plan_link(
     scores = [score for row in direct for score in row if score != OUT_OF_RANGE]
     base = heuristic(cloud) if cloud is not None else _score_without_path(scores)
     advantage = max(scores, default=base) - base
-    # At least one step, because a link that is up at once would be its own successor.
+    # At least one step, because `solve` would otherwise compute the value of a step from that value itself.
     connect_steps = max(math.ceil((settings.link_up_s + settings.probe_s) / settings.step_s), 1)
     cost = max(advantage, 0.0) * settings.switch_cost_s / settings.step_s
     horizon = Horizon(base, direct, connect_steps, cost, settings.step_s)
@@ -169,7 +169,10 @@ def _score_without_path(scores: Sequence[float]) -> float:
 
 
 def _while_connecting(current: int, elapsed_s: float, horizon: Horizon, solution: Solution) -> tuple[int, str]:
-    """Return the next state and its reason while a link comes up. Abandoning the link must be worth a switch."""
+    """Return the next state and its reason while a link comes up.
+
+    The link is abandoned only if this gains more than a switch costs.
+    """
     steps_left = min(max(horizon.connect_steps - math.floor(elapsed_s / horizon.step_s), 0), horizon.steps)
     continued = horizon.cloud * steps_left + solution.values[steps_left][current]
     if solution.values[0][0] > continued + horizon.switch_cost:

@@ -21,7 +21,7 @@ RATE_SMOOTHING = 0.3
 RANGE_MARGIN = 1.02
 """A link that works at some distance is expected to work at this multiple of the distance, too."""
 RECOVERY_SHARE = 0.98
-"""If a beacon arrives from this share of the distance at which a link broke, the link broke for another reason."""
+"""Share of the distance at which a link broke. A beacon from there shows that the range did not cause the loss."""
 
 FIRST_RETRY_S = 1.0
 MAX_RETRY_S = 60.0
@@ -73,7 +73,7 @@ def next_attempt_s(learned: LearnedRange, *, linked: bool) -> float:
 def expected_range(ranges: Mapping[str, LearnedRange], peer: str) -> LearnedRange:
     """Return the experience with a peer's link, or the median range factor of all peers for an unknown peer.
 
-    Radios of one kind in one place err alike: if the declared range of one is too long, it is too long for all.
+    The declared ranges of similar radios in one place have similar errors.
     """
     learned = ranges.get(peer, LearnedRange())
     if learned.last_beacon_s > float("-inf") or learned.range_factor != 1.0:
@@ -100,13 +100,13 @@ class RangeModel:
     _before_loss: dict[str, tuple[float, float]] = field(default_factory=dict)
 
     def retain(self, names: Collection[str]) -> None:
-        """Forget all peers except these."""
+        """Forget all peers except the named ones."""
         for by_name in (self.ranges, self._before_loss):
             for name in by_name.keys() - set(names):
                 del by_name[name]
 
     def on_beacon(self, name: str, now_s: float) -> None:
-        """Record a beacon. Restore the range if the link had broken no farther away than the current distance.
+        """Record a beacon. Restore the learned range if the peer is now at least as far away as when its link broke.
 
         Anyone can send a beacon, so a beacon restores at most the declared range.
         """

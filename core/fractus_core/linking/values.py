@@ -118,7 +118,8 @@ class LinkSettings:
         probe_s: Time for which a new link is measured before traffic moves to it.
         drain_s: Time before the end of the range at which traffic leaves the link, so that connections can finish.
         dwell_s: Minimum time for which a working link is kept, unless it is about to be lost.
-        switch_cost_s: Cost of one change of link, in seconds of the advantage of the best direct link.
+        switch_cost_s: Cost of one change of link. The unit is one second with the best direct link instead of the
+            cloud path.
         hysteresis: Share by which another path must be better than the current one.
         region_trust_s: Time for which a velocity is extrapolated in region navigation.
         edge: Share of the range inside which a link offers its full bandwidth. The bandwidth fades from there to

@@ -1,4 +1,4 @@
-"""From an application and an inventory to a plan that explains itself."""
+"""Planner: computes a plan for an application from an inventory, with a reason for each decision."""
 
 from fractus_core.planning.inventory import Flight as Flight
 from fractus_core.planning.inventory import Host as Host

@@ -112,7 +112,8 @@ class CoverScene:
         share: Share of the area to cover, 0 to 1.
         kept: Candidates with an instance, which they keep if it adds coverage.
         covered_by: Discs that are already covered: x, y, range, shape (m, 3).
-        newly_covered_by: Discs that new instances cover. Kept candidates do not yield to them.
+        newly_covered_by: Discs that new instances cover: x, y, range. They count after the kept candidates were
+            selected.
     """
 
     samples: Samples

@@ -122,10 +122,10 @@ def check_policies(inventory: Inventory) -> None:
 
 
 def refresh(grant: GrantSpec, inventory: Inventory) -> GrantSpec:
-    """Return a Grant with updated policies and otherwise unchanged.
+    """Return a Grant with updated policies. Its other fields stay unchanged.
 
-    The application and its plan are not needed, so problems with them cannot keep a policy from a Grant in use. If a policy
-    or one of its zones is invalid, the last granted version is kept.
+    The update needs neither the application nor its plan, so an invalid application does not prevent the update of a
+    Grant in use. If a policy or one of its zones is invalid, the last granted version is kept.
     """
     return grant.model_copy(update={"policies": _policies(grant, inventory, grant.policies)})
 

@@ -102,7 +102,7 @@ def flown_path(spec: ApplicationSpec, depots: Mapping[str, Depot]) -> tuple[Posi
 
 
 def _is_used_aboard(spec: ApplicationSpec, component: Component) -> bool:
-    """Return True for a hybrid component with ports that a drone component calls or is a partner of."""
+    """Return True for a hybrid component that has ports, if a drone component calls it or is one of its partners."""
     if component.placement != "hybrid" or not component.container.ports:
         return False
     named = {*component.hybrid_to, *component.ingress}

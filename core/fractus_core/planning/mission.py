@@ -88,7 +88,8 @@ class MissionEstimator:
 def heights_m(route: Sequence[Position], home_amsl_m: float | None) -> list[float]:
     """Return altitudes in metres above home along a route.
 
-    A position without altitude keeps the previous one, and so does an AMSL altitude if the elevation of home is unknown.
+    A position without altitude has the altitude of the position before it. The same applies to a position with an AMSL
+    altitude if the elevation of home is unknown.
     """
     base = home_amsl_m
     heights = [0.0]

@@ -58,14 +58,15 @@ class OperationArea:
 
 
 def operation_area(spec: ApplicationSpec, depots: Mapping[str, Depot], safety_radius_m: float) -> OperationArea | None:
-    """Return the union of the areas of all control points or of the points of interest, or None without drone components.
+    """Return the operation area of an application, or None if it has no drone components.
 
-    Unordered points of interest are visited on a short tour that starts with the first. Paths are dilated by the safety
-    radius. A leg that starts at a depot widens to the whole depot, because the drone may be parked anywhere in it.
+    The area is the union of the areas of all control points, or the area of the points of interest. Paths are dilated
+    by the safety radius. The area of a leg that starts at a depot includes the whole depot, because the drone may be
+    parked anywhere in it. Unordered points of interest are visited on a short tour that starts with the first point.
 
     Raises:
-        InvalidObject: A depot is unknown, a ring crosses itself, or paths and edges cross too often. The field is relative
-            to spec.
+        InvalidObject: A depot is unknown, a ring crosses itself, or paths and edges cross too often. The field of the
+            error is relative to spec.
     """
     route = route_of(spec, depots)
     if not route:

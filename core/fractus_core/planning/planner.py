@@ -1,4 +1,4 @@
-"""From an application and an inventory to a deployment plan that explains itself (thesis 8.5, with its errata)."""
+"""Computation of a deployment plan from an application and an inventory (thesis 8.5, with its errata)."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ __all__ = ["Infeasible", "instance_name", "plan", "plan_in_steps"]
 
 _IN_ORDER: tuple[Placement, ...] = exhaustive(Placement, ("drone", "edge", "hybrid", "cloud"))
 _ROUNDING_M = 0.01
-"""Tolerance of the operation area's outline in a plan; coordinates are written with centimetres."""
+"""Tolerance of the operation area's outline in a plan. Its coordinates have a resolution of centimetres."""
 
 
 def plan(

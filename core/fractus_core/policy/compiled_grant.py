@@ -174,7 +174,7 @@ class CompiledGrant:
     timed_zones: tuple[PolicyZone, ...]
 
     def fences_in_force(self, time_s: float) -> tuple[bool, ...]:
-        """Return, for each of the time-limited fences, whether it holds at a Unix time."""
+        """Return one value per time-limited fence: True if the fence is in force at a Unix time."""
         return tuple(zone.in_force(time_s) for zone in self.timed_zones)
 
     def locate(self, now: Situation) -> tuple[float, float] | None:
@@ -284,9 +284,10 @@ def _policy_zones(frame: LocalFrame, rule: Rule, policy: GrantedPolicy) -> list[
 
 
 def _within_reach(frame: LocalFrame, area: Area) -> bool:
-    """Return True if the frame can represent the area.
+    """Return True if part of an area may be so near to the origin that the drone can reach it.
 
-    Part of the area is near the origin, or the area may reach around the globe to it.
+    Raises:
+        InvalidObject: The area is not near the origin, and its extent is too large.
     """
     if area.circle is not None:
         center = LocalFrame.at(area.circle.center)

@@ -383,6 +383,6 @@ def deny(code: str, reason: str, policies: tuple[str, ...] = ()) -> Verdict:
 
 DENY_POSITION_UNKNOWN = deny(
     "PositionUnknown",
-    "the drone's position is unknown: no recent fix, the delay of its link is not measured yet, or another station moved"
-    " its home; wait until it is ready",
+    "the drone's position is unknown: there is no recent fix, the delay of the autopilot link is not measured yet, or"
+    " another ground station changed the home position; wait until the drone is ready",
 )

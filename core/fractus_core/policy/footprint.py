@@ -19,8 +19,7 @@ MAX_SIGHT_M = 10_000.0
 MAX_HALF_VIEW_DEG = 80.0
 """A view that reaches farther to one side, errors included, counts as seeing everything."""
 _MAX_TURN_DEG = 60.0
-"""Up to this yaw error the hull of turned corners follows the tangents, which diverge beyond it. A circle is used then.
-"""
+"""Largest yaw error for which tangents bound the turned corners. For larger errors, a circle bounds them."""
 _ARC_DEG = 15.0
 """Step of the arc that closes a sector."""
 _SIDES = 24
@@ -131,7 +130,10 @@ def footprint(now: Situation, frame: LocalFrame) -> Footprint | None:
 
 
 def _attitude(now: Situation) -> Attitude | None:
-    """Return the attitude as far as it matters, or None if the ground below the camera is unknown."""
+    """Return the attitude, or None if it is unknown or the drone is lower than the assumed ground.
+
+    For a camera that a gimbal keeps level, an unknown attitude is replaced by a level attitude with any yaw.
+    """
     if now.altitude_m + now.altitude_error_m + now.relief_m < 0.0:
         return None
     if now.attitude is None and now.lens is not None and now.lens.stabilised:

@@ -72,9 +72,9 @@ class FreeSpace:
         return obstacles
 
     def allows_leg(self, start: XY, end: XY) -> bool:
-        """Return True if the engine permits a leg from or to an end of the route.
+        """Return True if the engine permits a leg from the start or to the target of the route.
 
-        The end may be too close to a fence, or at home.
+        For such legs the engine has exceptions: the start or the target may be too close to a fence, or at home.
         """
         leg = Leg(start, start, start, end, self.lower_m, self.upper_m)
         if find_breaches(leg, self.now, self.grant, self.margin_m, self.height_margin_m):

@@ -73,7 +73,7 @@ class Breach:
 
     @property
     def severity(self) -> int:
-        """Severity of the reaction. A leg that only comes too close costs no more than the request."""
+        """Severity of the reaction. If a leg only comes too close to the fence, the request is denied at most."""
         return SEVERITY[self.action] if self.enters else min(SEVERITY[self.action], SEVERITY["ignore"])
 
 
@@ -159,7 +159,7 @@ def _check_operation_area(leg: Leg, now: Situation, grant: CompiledGrant, margin
 
 
 def _approaches(leg: Leg, now: Situation, grant: CompiledGrant, operation_area: BaseGeometry) -> bool:
-    """Return True if a drone outside the operation area comes closer to it or to its home."""
+    """Return True if a leg leads a drone that is outside the operation area closer to this area or to home."""
     stop = shapely.points(leg.stop)
     end = shapely.points(leg.target)
     if operation_area.covers(stop):
@@ -195,8 +195,8 @@ def _check_exclusion(
             and _leads_away(shape, leg, certain)
         ):
             return
-    # A drone that is already inside, or cannot stop outside, does not enter because of this request. Only the request is
-    # denied.
+    # If the drone is already inside, or cannot stop outside, this request does not cause the entry. The request is
+    # denied, but the drone is not taken over.
     enters = (clearance_m > 0 or not level) and shape.intersects(air.ground)
     yield _exclusion_breach(zone, leg, margin_m, enters)
 
@@ -297,9 +297,9 @@ def _check_inclusion(
 
 
 def _leaves_by_height(fence: Inclusion, shape: BaseGeometry, leg: Leg, now: Situation, grant: CompiledGrant) -> bool:
-    """Return True if a drone inside at its present altitude would not be inside at all altitudes of a leg.
+    """Return True if a drone is inside the zones at its present altitude, but not at all altitudes of a leg.
 
-    Such a leg does not lead back into the zones, although it does in the horizontal plane.
+    Such a leg leaves the zones by its altitude, even if it leads into them in the horizontal plane.
     """
     if shape.covers(leg.ground):
         return False

@@ -319,8 +319,8 @@ def _check_exclusion(zone: PolicyZone, ahead: _StoppingPath, now: Situation, fla
     rest_m, depth_now_m = (signed_depth_m(shape, border, point) for point in (ahead.rest, ahead.present))
     worse = rest_m > depth_now_m + DEEPER_M or (crosses and not around)
     if crosses and zone.band is not None:
-        # The drone may approach from above or below. If its position is inside the zone's outline, the smaller depth
-        # counts.
+        # The drone may also enter the zone from above or below. Its depth in the zone is the smaller one of its
+        # horizontal and its vertical depth.
         rest_m, depth_now_m = (
             min(depth_m, band_depth_m(zone.band, altitude_m, now.home, flat))
             for depth_m, altitude_m in ((rest_m, ahead.rest_m), (depth_now_m, ahead.present_m))

@@ -67,7 +67,10 @@ def judge_land(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
 def _vertical_problem(
     position: XY, now: Situation, grant: CompiledGrant, lower_m: float, upper_m: float
 ) -> Verdict | None:
-    """Return the denial of a vertical motion, or of standing, by fences. It is never a takeover."""
+    """Return the denial of a vertical motion, or of staying on the ground, that breaks a fence.
+
+    The verdict is never a takeover.
+    """
     leg = vertical_leg(position, min(lower_m, upper_m), max(lower_m, upper_m))
     breaches = find_breaches(leg, now, grant, now.margin_m, now.height_margin_m)
     if not breaches:

@@ -21,12 +21,13 @@ CAMERA_PORT = 50052
 
 
 def deployment(application: Application, placed: PlannedInstance, drone: Drone | None = None) -> Body:
-    """Return the Deployment of a planned instance, bound to its node by required affinity.
+    """Return the Deployment of a planned instance. A required node affinity binds its pods to the planned node.
 
     Args:
         application: The Application.
         placed: The planned instance.
-        drone: Drone of its node, if the node is a drone. Pods tolerate a lost link for the autonomy of the drone.
+        drone: Drone of the planned node, if the node is a drone. Its spec.autonomy is the time for which pods tolerate
+            a lost link to the node.
     """
     component = application.spec.component(placed.component)
     identity = {labels.APPLICATION_LABEL: label_value(application.name), labels.INSTANCE_LABEL: placed.instance}

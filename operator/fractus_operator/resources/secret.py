@@ -25,7 +25,10 @@ SecretWrite = Literal["new", "renewed", "lost"]
 
 _PUBLIC = ("tls.crt", "ca.crt")
 _FIRST_CHECK = timedelta(minutes=1)
-"""Time without readiness after which the Secret of a pod is created again in case it was deleted. Doubles each time."""
+"""If a pod is not ready for this time, its Secret is created again, in case it was deleted.
+
+The time doubles each time.
+"""
 _MAX_CHECK = timedelta(hours=1)
 
 
@@ -99,12 +102,15 @@ class Certificates:
         self._authority = authority
         self._clock = clock
         self._states: dict[Key, dict[str, SecretState]] = {}
-        """By Application and instance. The states may be lost, for example in a restart."""
+        """State of each Secret, by Application and instance.
+
+        The operator works without these states after a restart.
+        """
 
     def of(
         self, application: Application, placed: PlannedInstance, deployment: Body | None, pods: Iterable[PodView]
     ) -> Certificate:
-        """Return the certificate of an instance. A valid one is kept, so a restart of the operator renews nothing.
+        """Return the certificate of an instance. A valid certificate is kept, also after a restart of the operator.
 
         Args:
             application: The Application.

@@ -29,9 +29,10 @@ _RESPONSE_SHARE = _HELD_SHARE / 2
 
 
 class LostLease(Exception):
-    """The state in memory may be wrong, so the process must restart.
+    """The Lease was lost. The state in memory may be wrong, so the process must restart.
 
-    Another process has acted since, or the API server was restored to an earlier state.
+    Another process has acted since this process last held the Lease, or the API server was restored to an earlier
+    state.
     """
 
 

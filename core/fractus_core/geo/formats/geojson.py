@@ -40,7 +40,7 @@ _STYLE = frozenset({"fill", "fill-opacity", "stroke", "stroke-width", "stroke-op
 
 
 def read_geojson(text: str, without: Collection[str] = (), drop: Collection[str] = ()) -> Imported:
-    """Read zones from features. Altitude and schedule are read from properties of these names, spelt as in a Zone.
+    """Read zones from features. The properties `altitude` and `schedule` have the form of the fields of a Zone.
 
     Args:
         text: Content of the file.

@@ -136,7 +136,8 @@ class ZoneBuilder:
             self._points += len(rings[-1])
             if self._points > MAX_POINTS:
                 raise _TooLarge(
-                    f"{field}[{i}]", f"the file needs more than {MAX_POINTS} points, for long sides some more; split it"
+                    f"{field}[{i}]",
+                    f"the file needs more than {MAX_POINTS} points, including points added on long sides; split it",
                 )
         exterior, *holes = rings
         return {"polygon": {"exterior": exterior} | ({"holes": holes} if holes else {})}
@@ -283,13 +284,13 @@ def parse_point(value: Any, field: str, *, lat_first: bool = False) -> Point:
 
 
 def parse_ring(value: Any, field: str, *, lat_first: bool = False, planar: bool = False) -> list[dict[str, float]]:
-    """Return a ring as manifests spell it: open, without the repetition of its first point.
+    """Return a ring in the form of manifests: its points in order, without the repetition of the first point.
 
     Args:
         value: The ring.
         field: Its path in the file.
         lat_first: True if latitude comes first.
-        planar: True if its edges are straight lines of degrees, which never cross the antimeridian.
+        planar: True if its edges are straight in longitude and latitude. Such edges never cross the antimeridian.
 
     Raises:
         InvalidObject: The ring has fewer than three points or an invalid point, crosses the antimeridian although it is
@@ -304,7 +305,7 @@ def parse_ring(value: Any, field: str, *, lat_first: bool = False, planar: bool 
         raise InvalidObject(field, "a ring needs at least three points")
     if planar and any(abs(a.lon - b.lon) > 180 for a, b in itertools.pairwise([*points, points[0]])):
         raise InvalidObject(field, "crosses the antimeridian; cut it there, into two polygons (RFC 7946)")
-    if planar and len(points) <= MAX_RING_POINTS:  # a zone with more is refused for them
+    if planar and len(points) <= MAX_RING_POINTS:  # a longer ring is refused later
         sides = list(itertools.pairwise([*points, points[0]]))
         if sum(_pieces(*side) for side in sides) > MAX_RING_POINTS:
             raise InvalidObject(field, f"has sides so long that they need more than {MAX_RING_POINTS} points; split it")

@@ -46,7 +46,7 @@ class ApplicationGrants:
         self._compiled: dict[Key, _Compiled] = {}
 
     async def refresh(self, observed: ObservedApplication) -> None:
-        """Update the policies in existing Grants. This does not depend on whether the Application can be planned.
+        """Update the policies in existing Grants. Grants are updated even if the Application cannot be planned.
 
         Raises:
             KubeError: The API server cannot be reached.

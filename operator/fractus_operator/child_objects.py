@@ -41,7 +41,7 @@ log = logging.getLogger(__name__)
 _MAX_CONCURRENT = 16
 """Limit of concurrent writes of child objects other than plans and Grants.
 
-A webhook that does not respond to such writes then leaves connections for plans and Grants.
+If a webhook does not respond to such writes, connections for plans and Grants remain.
 """
 _UNLIMITED = frozenset({kinds.DEPLOYMENT_PLAN, kinds.GRANT})
 

@@ -244,8 +244,9 @@ def offered_flights(
 ) -> dict[str, Flight]:
     """Return the flights of claimed drones by drone, for an Application that may share one of them.
 
-    Only the part ahead of a drone in flight counts, except for an Application that shares this flight already. If an
-    Application was changed since its plan, its flight is not offered, because its new route is not known yet.
+    For a drone in flight, only the part of the flight that it has not flown yet is offered. An Application that already
+    shares the flight gets the whole flight. If an Application was changed since its plan, its flight is not offered,
+    because its new route is not known yet.
 
     Args:
         missions: Applications that have a drone.

@@ -28,15 +28,15 @@ MAX_LATE = timedelta(seconds=60)
 An even older time means that the drone's clock was set back.
 """
 _PAUSE = timedelta(seconds=2 * DRONE_REPORT_S)
-"""Minimum pause between two reports for which an Event states the times of both.
+"""Minimum pause between two reports for which an Event states the times of both reports.
 
-The time of the change is unknown then.
+The change happened at an unknown time in the pause.
 """
 
 
 @dataclass(frozen=True, slots=True)
 class FlightReport:
-    """The reported state of a drone, as far as Events depend on it.
+    """The part of the reported state of a drone on which Events depend.
 
     Attributes:
         uid: Uid of the Drone.

@@ -20,7 +20,7 @@ LINK_EVENT_PERIOD_S = 10.0
 
 @dataclass(frozen=True, slots=True)
 class LinkReport:
-    """The reported state of a DirectLink, as far as Events depend on it."""
+    """The part of the reported state of a DirectLink on which Events depend."""
 
     application: ApplicationReference
     drone: str

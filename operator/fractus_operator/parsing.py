@@ -1,4 +1,4 @@
-"""Parsers of custom resources. An object that cannot be parsed does not stop the others."""
+"""Parsers of custom resources. An object that cannot be parsed does not affect other objects."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Controller of Zones and Policies: reports in their Ready condition whether they can be enforced."""
+"""Controller of Zones and Policies: sets their Ready condition, which is True if they can be enforced."""
 
 from __future__ import annotations
 

@@ -95,7 +95,7 @@ class FlightStatus:
     Attributes:
         phase: Waiting before the takeoff, Landed after it, Unknown while the drone does not report.
         activity: Sentence about the drone.
-        controller: Who flies while the drone is in the air: system, pilot, or a component.
+        controller: Control authority while the drone is in the air: system, pilot, or a component.
         begun: True if the drone has taken off for the Application.
     """
 
@@ -187,7 +187,7 @@ def deployed(
         pods: Its current pods.
         granted: Number of instances with Grants.
         flown: Status of the flight, if the plan has a drone.
-        refused: Why pods cannot be created, by instance. Empty if they can.
+        refused: Reason why pods cannot be created, by instance. Empty if all pods can be created.
     """
     alive = [pod for pod in pods if not pod.terminating and not pod.finished]
     missing: list[str] = []

@@ -211,7 +211,7 @@ class Subscriptions:
                 self._full_nodes.pop(label, None)
 
     def set_placed(self, key: Key, *, placed: bool, full: Collection[str] = frozenset()) -> None:
-        """Record whether an Application has a suitable plan. With such a plan it waits only for free capacity.
+        """Record if an Application has a suitable plan, and therefore waits only for free capacity.
 
         Args:
             key: The Application.

@@ -16,7 +16,7 @@ class FractusError(Exception):
     """Base class of all exceptions of the SDK. The text is one sentence for people.
 
     Attributes:
-        remedy: What the program or its author should do; empty if the text already contains it.
+        remedy: Recommended reaction of the program or its author; empty if the text already contains it.
     """
 
     remedy = ""

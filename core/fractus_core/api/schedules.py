@@ -28,7 +28,7 @@ class Validity(Model):
     valid_until: Timestamp | None = Field(default=None, description="End of the validity (RFC 3339); unset: no end.")
 
     @rule(
-        # The schema also admits lists. The comparison with a timestamp rejects them.
+        # The schema also permits lists. The comparison with a timestamp rejects lists.
         "[has(self.validFrom) ? self.validFrom : timestamp(0), has(self.validUntil) ? self.validUntil : timestamp(0)]"
         ".all(t, t >= timestamp(0))",
         "validFrom and validUntil must be RFC 3339 times after 1970",

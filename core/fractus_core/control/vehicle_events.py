@@ -29,10 +29,10 @@ FAILSAFE_TEXT_S = 3.0
 """A mode change within this many seconds after a status text about a failsafe is attributed to the failsafe."""
 
 LINK_CUT_S = 4.0
-"""A gap between heartbeats of this many seconds can trigger the autopilot's GCS failsafe, which waits for five seconds.
+"""Gap between received heartbeats, in seconds, after which the autopilot's GCS failsafe may have acted.
 
-The service does not receive the failsafe's status text then, and the failsafe flag is cleared once the autopilot receives
-the companion again. Only the mode shows that the failsafe acted.
+The failsafe acts when the link is cut for five seconds. The service then misses the status text of the failsafe, and
+the autopilot clears the failsafe flag when the link is back. Only the mode shows that the failsafe acted.
 """
 
 UNCONFIRMED_S = 10.0

@@ -214,7 +214,7 @@ def _cut(shape: BaseGeometry) -> Iterator[BaseGeometry]:
 def _unwrapped(frame: LocalFrame, ring: BaseGeometry) -> list[tuple[float, float]]:
     """Return lon, lat of a ring, each longitude within 180 degrees of its neighbour."""
     lats, lons = frame.latlon_array(shapely.get_coordinates(ring))
-    # Whole turns are exact, so the ring stays closed.
+    # Multiples of 360 degrees are exact numbers, so the ring stays closed.
     lons[1:] -= 360.0 * np.cumsum(np.round(np.diff(lons) / 360.0))
     return list(zip(lons.tolist(), lats.tolist(), strict=True))
 
@@ -232,7 +232,7 @@ def _turns(ring: Sequence[tuple[float, float]]) -> bool:
 def _beside_pole(rings: Iterable[Sequence[tuple[float, float]]]) -> BaseGeometry:
     """Return the area enclosed by rings in the longitude/latitude plane. A pole is a line in this plane that no edge crosses."""
     exterior, *holes = rings
-    # A hole may lie a whole turn from the start of the exterior.
+    # The longitudes of a hole may differ by 360 degrees from those of the exterior.
     turned = (_closed(_shifted(hole, shift)) for hole in holes for shift in (-360.0, 0.0, 360.0))
     return _closed(exterior).difference(shapely.union_all(list(turned)))
 

@@ -21,13 +21,13 @@ RATE_SMOOTHING = 0.3
 RANGE_MARGIN = 1.02
 """A link that works at some distance is expected to work at this multiple of the distance, too."""
 RECOVERY_SHARE = 0.98
-"""Share of the distance at which a link broke. A beacon from there shows that the range did not cause the loss."""
+"""Share of the distance at which a link broke. A beacon from this distance shows that the link was not out of range."""
 
 FIRST_RETRY_S = 1.0
 MAX_RETRY_S = 60.0
 """First and longest delay before another attempt to connect to a peer. The delay doubles with each failure."""
 MAX_IDLE_RETRY_S = 4.0
-"""Longest delay while there is no link: an attempt costs nothing then."""
+"""Longest delay while the drone has no link. An attempt interrupts no traffic in this state."""
 
 
 def with_contact(learned: LearnedRange, distance: float, now_s: float) -> LearnedRange:
@@ -37,7 +37,7 @@ def with_contact(learned: LearnedRange, distance: float, now_s: float) -> Learne
 
 
 def with_loss(learned: LearnedRange, distance: float) -> LearnedRange:
-    """Record that the link broke at a distance, in units of the declared range: its range ends there."""
+    """Record that the link broke at a distance, in units of the declared range: the range ends at this distance."""
     return replace(learned, range_factor=max(min(learned.range_factor, distance / RANGE_MARGIN), MIN_FACTOR))
 
 

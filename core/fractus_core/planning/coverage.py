@@ -19,9 +19,12 @@ SAMPLES = 8192
 
 _MAX_SAMPLES = 200_000
 _MAX_CROSSINGS = 1_000_000
-"""Maximum number of crossings of outline and lattice rows, because a region may be a millimetre wide and kilometres long."""
+"""Maximum number of crossings of outline and lattice rows.
+
+Without it, a region that is a millimetre wide and kilometres long would need too many rows.
+"""
 _ACROSS = 4
-"""Samples across a narrow area, so that no corridor lies between two rows."""
+"""Number of samples across a narrow area. With fewer samples, a corridor could lie between two rows."""
 _TILT_RAD = math.atan((math.sqrt(5) - 1) / 2)
 """Tilt of the lattice rows. No usual direction of roads or paths is parallel to them, so straight legs are sampled evenly."""
 
@@ -135,7 +138,10 @@ class Pick:
 
 
 CoverStrategy = Callable[[CoverScene, Callable[[str], bool]], Sequence[Pick]]
-"""Selects candidates of a scene in order. The function argument checks whether a candidate fits; it is called once for each."""
+"""Function that selects candidates of a scene in order.
+
+Its second argument is a function that returns True if a candidate fits. It is called once for each candidate.
+"""
 
 
 def greedy_cover(scene: CoverScene, fits: Callable[[str], bool]) -> list[Pick]:

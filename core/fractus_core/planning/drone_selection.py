@@ -196,7 +196,7 @@ def _depots_around(builder: PlanBuilder, center: Point) -> Iterable[str]:
 
 
 def _flying_past(builder: PlanBuilder, leader: Component) -> list[str]:
-    """Return the drones of other applications whose flights visit all points of interest, and reject some of the others."""
+    """Return the drones whose flights for other applications visit all points of interest. Reject some other drones."""
     poi = builder.spec.points_of_interest
     visiting = []
     listed = 0

@@ -45,7 +45,7 @@ AROUND_CORRIDOR_M = 100.0
 """Zones further than this from the corridor of a drone do not affect its route."""
 
 _PERMITTING_KINDS = frozenset({"inclusion", "grant"})
-"""Kinds of policies that allow something only in their zones, so zones out of reach matter as well."""
+"""Kinds of policies that allow something only in their zones. Their zones out of reach are therefore kept."""
 
 _Bounds = tuple[Point, float]
 """A position, and the distance from it in metres up to which zones matter."""

@@ -284,7 +284,7 @@ def _segments(frame: LocalFrame, flight: Flight) -> tuple[_Spots, _Spots]:
         for position in leg:
             alt = position.alt if position.alt is not None else alt
             spots.append(_spot(frame, position, alt))
-        # The drone is between the last reached point and the next one, so the segment between them counts.
+        # The drone is between the last reached point and the next one, so the segment between them remains.
         left = spots[max(passed - 1, 0) :] if passed < len(spots) else []
         passed = max(passed - len(spots), 0)
         starts += left[:-1] or left

@@ -331,7 +331,7 @@ class NodeLocations:
         self._update_stands_at(name)
 
     def upsert_host(self, name: str, is_cloud: bool) -> None:
-        """Store whether a Kubernetes Node accepts cloud pods."""
+        """Update the index of hosts that accept cloud pods."""
         if is_cloud:
             self.cloud.add(name)
         else:

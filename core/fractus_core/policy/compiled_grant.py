@@ -24,7 +24,10 @@ MAX_FRAME_REACH_M = 500_000.0
 MAX_UNINDEXED = 4
 """Up to this number of zones, testing each zone is faster than an index."""
 _PERMITTING_KINDS = frozenset({"inclusion", "grant"})
-"""Kinds of policies that permit something inside their zones. Approximations of such a zone must not exceed the zone."""
+"""Kinds of policies that permit something inside their zones.
+
+The approximation of a zone of these policies must not exceed the zone.
+"""
 OPERATION_AREA = "operation-area"
 """Policy name that verdicts use for the fence that every grant implies."""
 
@@ -260,7 +263,7 @@ def _rule(policy: GrantedPolicy) -> Rule:
 
 
 def _prepared(shape: BaseGeometry) -> BaseGeometry:
-    """Index the edges of a shape in place (GEOS). Thousands of checks against the shape pay for it once."""
+    """Index the edges of a shape in place (GEOS), because thousands of checks against the shape follow."""
     shapely.prepare(shape)
     return shape
 

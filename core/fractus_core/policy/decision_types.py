@@ -229,12 +229,12 @@ class Situation:
             setpoint if that is higher.
         forward_mps2: Acceleration along the course, from the last velocities. Negative while slowing down, None if
             unknown.
-        pending: Recent velocity setpoints (north, east, down) that neither velocity nor acceleration show yet. The
+        pending: Recent velocity setpoints (north, east, down) that velocity and acceleration do not reflect yet. The
             drone may follow any of them at any moment. The latest is last.
         vertical: True if the drone is taking off or landing. Lower altitude limits do not apply then.
         attitude: None if unknown. The camera may then look anywhere, unless a gimbal keeps it level.
         lens: None if the node's camera is not described. It may then see everything around it.
-        relief_m: How far the surrounding ground may lie below home.
+        relief_m: Maximum depth of the surrounding ground below home.
         exposure: Successive states since the capture of a picture began. The picture may show everything seen from each
             of these states and between them.
     """

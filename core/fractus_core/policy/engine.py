@@ -175,7 +175,8 @@ def _rules_here(
 ) -> list[Rule]:
     """Return the policies of an index that hold at the present position, by priority.
 
-    While the position is unknown, every policy in force counts. With `certain`, only policies without zones do.
+    While the position is unknown, the result contains every policy in force, or, with `certain`, every policy in force
+    that has no zones.
     """
     rules = {rule.name: rule for rule in index.everywhere if rule.in_force(now.time_s)}
     if now.lat is None or now.lon is None:

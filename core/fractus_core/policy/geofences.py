@@ -219,8 +219,8 @@ def _is_level_with(zone: PolicyZone, now: Situation, grant: CompiledGrant) -> bo
 def _comes_level(zone: PolicyZone, leg: Leg, now: Situation, grant: CompiledGrant, height_margin_m: float) -> bool:
     """Return True if a leg of a drone below or above a zone comes between its altitudes, or too close to them.
 
-    A drone that is already too close may fly on at its altitude within measurement accuracy: closer by at most
-    ALTITUDE_TOLERANCE_M, and never into the nearer half of the margin, regardless of the number of legs requested.
+    A drone that is already too close may continue at its altitude. Because altitudes are inaccurate, a leg may come
+    closer by at most ALTITUDE_TOLERANCE_M. No number of legs may lead into the nearer half of the margin.
     """
     gap_m = band_gap_m(zone.band, leg.lower_m, leg.upper_m, now.home, grant.flat_terrain)
     present_m = band_gap_m(zone.band, *altitude_range_to_stop_m(now), now.home, grant.flat_terrain)
@@ -245,8 +245,8 @@ def _leaves_height(zone: PolicyZone, leg: Leg, now: Situation, grant: CompiledGr
     def gap_m(lower_m: float, upper_m: float) -> float:
         return band_gap_m(zone.band, lower_m, upper_m, now.home, grant.flat_terrain)
 
-    # The leg ends at the altitude farther from the zone if it passes all altitudes at which the drone could come to
-    # rest.
+    # The farther one of the two altitudes is the end of the leg, because the leg passes all altitudes at which the
+    # drone could come to rest.
     end_m, rest_m = (max(map(gap_m, heights, heights)) for heights in ((leg.lower_m, leg.upper_m), present))
     closest_m = gap_m(leg.lower_m, leg.upper_m)
     return 0.0 < closest_m >= gap_m(*present) - 1e-6 and end_m >= height_margin_m and end_m > rest_m + 1e-6

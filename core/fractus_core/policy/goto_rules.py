@@ -185,7 +185,10 @@ def _permitted_leg(request: _Request, aim: _Aim, notes: list[Correction], adjust
 
 
 def _objection(request: _Request, aim: _Aim) -> Verdict | None:
-    """Return the objection of fences and the return route to a leg, without its limits."""
+    """Return the objection to a leg because of fences or the return route.
+
+    Altitude and speed limits are not checked.
+    """
     now = request.now
     grant = request.grant
     leg = goto_leg(now, request.position, aim.target, aim.altitude_m)

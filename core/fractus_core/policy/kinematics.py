@@ -88,7 +88,7 @@ def _bounding_velocities(velocities: tuple[tuple[float, float, float], ...]) -> 
 
 
 def situation_at_rest(now: Situation, grant_frame: LocalFrame, position: XY) -> Situation:
-    """Return the situation after a stop commanded now, at the point of rest that the latency allows."""
+    """Return the situation of a drone that is commanded to stop now, when it has come to rest."""
     lat, lon = grant_frame.latlon(*stop_point(now, position))
     return replace(
         now, lat=lat, lon=lon, altitude_m=stop_altitude_m(now), north_mps=0.0, east_mps=0.0, down_mps=0.0, pending=()

@@ -55,7 +55,7 @@ class Correction:
 
 
 def correction_verdict(args: Args, corrections: Sequence[Correction]) -> Verdict:
-    """Return the verdict on a call that is carried out with these arguments, from the corrections made."""
+    """Return the verdict on a call that is carried out with the given arguments, which result from the corrections."""
     steps = [note for note in corrections if note.code]
     if not steps:
         return Verdict("allow", args)

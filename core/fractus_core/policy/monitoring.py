@@ -39,7 +39,7 @@ from fractus_core.policy.limits import (
 )
 
 TRACKING_SHARE = 0.3
-"""Fraction of the tracking margin of permitted legs that the monitor keeps as well."""
+"""Tracking margin of the monitor, as a fraction of the tracking margin of permitted legs."""
 
 AIM_SHARE = 0.1
 """A drone counts as flying to a target if its course misses the target by at most this fraction of the distance. Gusts turn
@@ -50,7 +50,7 @@ SINKING_MPS = 0.5
 a drone that the system flies and that sinks faster counts as returning below a limit."""
 
 CLIMBING_MPS = 0.2
-"""A drone that holds its altitude climbs no faster than this."""
+"""Maximum climb rate of a drone that holds its altitude."""
 
 DEEPER_M = 0.6
 """A drone on the wrong side of a fence is stopped again only if it moves this much farther in."""

@@ -92,7 +92,7 @@ def _satisfied(required: Filter, applied_filters: Sequence[Filter]) -> bool:
 def rules_in_view(index: PolicyIndex, now: Situation, grant: CompiledGrant) -> list[Rule]:
     """Return the policies of an index that hold at the camera's position, or whose zones a picture may show.
 
-    While the position is unknown, every policy in force counts.
+    While the position is unknown, the result contains every policy in force.
     """
     rules = {rule.name: rule for rule in index.everywhere if rule.in_force(now.time_s)}
     view = exposure_footprint([*now.exposure, now], grant.frame)

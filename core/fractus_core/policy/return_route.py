@@ -21,8 +21,10 @@ ZONE_FLOOR_CLEARANCE_M = 0.5
 """Distance below a zone's floor beyond the margin, because a drone does not hold its altitude exactly."""
 
 MAX_LOWERED_ALTITUDES = 4
-"""Maximum number of zones below which a return route is searched. The drone waits during a search, and a search without a
-result takes a second or two."""
+"""Maximum number of altitudes just below a zone at which a return route is searched.
+
+The drone waits during a search, and a search without a result takes a second or two.
+"""
 
 
 def return_altitudes_m(now: Situation, grant: CompiledGrant, worthwhile_m: float) -> tuple[float, ...]:

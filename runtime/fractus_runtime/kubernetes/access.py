@@ -47,7 +47,7 @@ async def kubeconfig(path: str | Path, context: str | None = None) -> Access:
         context: Name of the context. Default: the current context.
 
     Raises:
-        Unconfigured: The kubeconfig does not exist, or has no such complete context.
+        Unconfigured: The kubeconfig does not exist, the context is missing, or it is incomplete.
     """
     configuration = Configuration()
 

@@ -214,7 +214,7 @@ class Informer(Generic[T]):
         try:
             new = self._parse(self._typed(body))
         except Exception:
-            # An invalid object must not hide the others. Its last valid version is kept.
+            # An invalid object must not stop the informer. The last valid version of the object is kept.
             log.exception(
                 "informer: object cannot be parsed (kind=%s name=%s)", self.kind.plural, "/".join(filter(None, key))
             )

@@ -141,7 +141,7 @@ class Lease:
         """Check that the API server was not restored to a state from before the last renewal by this process.
 
         Raises:
-            LostLease: The API server was restored to such a state.
+            LostLease: The API server was restored to an earlier state.
         """
         if 0 < version_of(body) < self._version:
             raise LostLease(

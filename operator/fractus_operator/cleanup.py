@@ -33,7 +33,7 @@ ORPHANED_PODS_PERIOD_S = 30.0
 """Period of the search for orphaned pods, in seconds. The garbage collector has at least this time to delete them."""
 _DEFAULT_TTL_S: int = ApplicationSpec.model_fields["ttl_after_finished"].default
 _MAX_CLOCK_DIFFERENCE = timedelta(minutes=2)
-"""Maximum time by which the clock of an earlier operator may have been ahead of this one."""
+"""Maximum time by which the clock of an earlier operator may have been ahead of the clock of this operator."""
 
 
 class FinishedPods:

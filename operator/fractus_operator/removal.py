@@ -42,7 +42,10 @@ _WIPING_S = 120.0
 """Maximum time in which nodes delete their data, in seconds. The deadline of the chart's Job is 240 s."""
 _PERIOD_S = 2.0
 _CHECK_TIMEOUT_S = 30.0
-"""Time for which the check that the operator is uninstalled is repeated if the API server does not respond, in seconds."""
+"""Maximum time of the check that the operator is uninstalled, in seconds.
+
+The check is repeated while the API server does not respond.
+"""
 
 
 def unwiped(nodes: Sequence[Body], pods: Sequence[Body]) -> list[str]:

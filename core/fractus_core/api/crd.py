@@ -127,7 +127,10 @@ def structural(schema: Schema, definitions: dict[str, Schema], path: str) -> Sch
 
 
 def _resolved(schema: Schema, definitions: dict[str, Schema]) -> Schema:
-    """Return the schema with its reference and its nullable wrapper replaced by their content. Outer keywords win."""
+    """Return the schema with its reference and its nullable wrapper replaced by their content.
+
+    Keywords next to the reference override keywords in its content.
+    """
     merged = dict(schema)
     while True:
         if "$ref" in merged:

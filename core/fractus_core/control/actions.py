@@ -64,7 +64,7 @@ class StartSystemTask:
 
 @dataclass(frozen=True, slots=True)
 class StopSystemTask:
-    """Cancel a system task, unless the task itself dispatched the event."""
+    """Cancel a system task, unless the task itself reported the event that stops it."""
 
     task_id: int
 

@@ -41,7 +41,7 @@ class Page:
 
 
 async def _lines(content: aiohttp.StreamReader, silence_s: float | None) -> AsyncIterator[bytes]:
-    """Iterate over the lines of a stream, with their line ends. The last line may be cut off and have none."""
+    """Iterate over the lines of a stream, with their line ends. The last line may be cut off and have no line end."""
     rest = b""
     while True:
         # The timeout of aiohttp ends with the connection, even if the reader is not notified.

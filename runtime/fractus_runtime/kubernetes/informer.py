@@ -22,7 +22,7 @@ _WATCH_TIMEOUT_S = (240, 300)
 _SILENCE_S = 100.0
 _BACKOFF_S = (0.4, 30.0)
 _STEADY_S = 1.0
-"""Minimum duration of a watch in seconds. A shorter one without an event is followed by a pause, as after a failure."""
+"""Minimum duration of a watch in seconds. A shorter watch without an event counts as a failure, so a pause follows."""
 
 
 class Informer(Generic[T]):

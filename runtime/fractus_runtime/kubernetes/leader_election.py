@@ -25,7 +25,10 @@ _HELD_SHARE = 0.7
 _RETRY_S = 1.0
 _RETRIES = 20
 _RESPONSE_SHARE = _HELD_SHARE / 2
-"""Maximum time of a response, as a share of the duration. After a stalled response, one retry fits before the Lease is lost."""
+"""Maximum time of a response, as a share of the duration of the Lease.
+
+After a stalled response, one retry fits before the Lease is lost.
+"""
 
 
 class LostLease(Exception):

@@ -356,9 +356,7 @@ def cut_rings(zone: Zone, notes: list[str]) -> list[list[list[list[float]]]]:
     outline = area_rings(zone.spec.area)
     crossings = sum(abs(a[0] - b[0]) > 180 for a, b in itertools.pairwise(outline[0]))
     if crossings % 2:
-        notes.append(
-            f"{zone.name}: it contains a pole; programs that draw longitude and latitude on a plane display it incorrectly"
-        )
+        notes.append(f"{zone.name}: it contains a pole; programs that draw a flat map display it incorrectly")
     elif crossings:
         frame = LocalFrame.at(area_center(zone.spec.area))
         notes.append(f"{zone.name}: it crosses the antimeridian and is cut there, into parts")

@@ -70,7 +70,7 @@ class LocalFrame:
         return cls(point.lat, point.lon)
 
     def xy(self, lat: float, lon: float) -> tuple[float, float]:
-        """Return metres east and north of the origin, of a point on the ellipsoid in degrees."""
+        """Return the position of a point on the ellipsoid (degrees) in metres east and north of the origin."""
         # This repeats `ecef` inline, because every judgement calls it several times.
         phi = math.radians(lat)
         lam = math.radians(lon)

@@ -198,7 +198,8 @@ class ClusterCache:
         flights: Mapping[str, Flight] = {}
         spec = application.spec if application is not None else None
         if spec is not None and spec.driver is None and spec.points_of_interest is not None:
-            # Without a driver, the Application may share the flight of another one past its points of interest.
+            # An Application without a driver may share the flight of another Application that visits its points of
+            # interest.
             others = (m for m in self.fleet.active_missions() if m.application.key != observed.key)
             flights = offered_flights(others, self.depots_by_name(), radius_m, plan)
         inventory = self.snapshot(observed.key, observed.uid, flights)

@@ -50,7 +50,7 @@ _INADMISSIBLE = frozenset({HTTPStatus.FORBIDDEN, HTTPStatus.UNPROCESSABLE_ENTITY
 
 
 class NameTaken(Exception):
-    """An object that does not belong to the Application has the name of one of its child objects."""
+    """The name of a child object is taken by an object that does not belong to the Application."""
 
 
 class ChildObjects:
@@ -290,7 +290,7 @@ class ChildObjects:
         return await self._store.delete(kind, key_of(body), body["metadata"].get("uid"), orphan=orphan)
 
     async def _delete_secret_of(self, deployment: Body) -> None:
-        """Delete the Secret of a Deployment that is about to be deleted. Later, its name could not be determined.
+        """Delete the Secret of a Deployment that is about to be deleted. Its name is derived from the Deployment.
 
         A failure does not prevent the deletion of the Deployment. A running pod keeps its mounted Secret.
         """

@@ -85,7 +85,7 @@ class FinishedPods:
         for pod in _managed_pods(self._cache.pods_of(submitted.key, kept=True)):
             assert pod.finished_at is not None
             remaining_s = (pod.finished_at - kept_since).total_seconds()
-            # A label with a future time, which users may write, does not keep a pod longer.
+            # Users may write a label with a future time. Such a label does not keep a pod longer.
             if remaining_s <= 0 or pod.finished_at > now + _MAX_CLOCK_DIFFERENCE:
                 await self._store.delete(kinds.POD, (pod.namespace, pod.name))
             else:

@@ -1,4 +1,4 @@
-"""Audit log: one JSON entry per line, which contains the hash of the previous entry, in segments of bounded size."""
+"""Audit log in segments of bounded size. Each line is a JSON entry with the hash of the previous entry."""
 
 from __future__ import annotations
 

@@ -127,7 +127,7 @@ class Control:
         return self.mission_complete
 
     async def report(self, waypoints: int) -> None:
-        """Store the number of completed waypoints on the drone. After a restart, the component continues there.
+        """Store the number of completed waypoints on the drone. A restarted component continues with the next waypoint.
 
         Args:
             waypoints: Number of reached or skipped waypoints. A lower number than before has no effect.

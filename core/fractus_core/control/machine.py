@@ -457,7 +457,7 @@ def _on_tour(update: StateUpdate, event: TourBegan | TourInterrupted | TourEnded
 
 
 def _flies_tour(update: StateUpdate, key: str) -> bool:
-    """Return True if the system still flies this mission. Otherwise another event has ended it and stated the reason."""
+    """Return True if the system still flies this mission. Otherwise an earlier event has ended the flight."""
     mission = update.state.missions.get(key)
     continues = mission is not None and mission.outcome is None
     return continues and update.state.authority is Authority.SYSTEM and update.state.touring == key

@@ -164,7 +164,7 @@ def plan_link(
 
 
 def _score_without_path(scores: Sequence[float]) -> float:
-    """Return the score of having no path at all: so much below the worst link that every link is worth a switch."""
+    """Return the score of having no path. It is so low that a switch to the worst link is an improvement."""
     return min(scores, default=0.0) - max(map(abs, scores), default=0.0)
 
 

@@ -129,7 +129,8 @@ class MissionLeg:
     """A straight leg of a mission.
 
     Attributes:
-        flown_by: Control authority. The return flight counts as the system's, because every driver may leave the return to it.
+        flown_by: Control authority. This is the system for the return flight, because every driver may leave the return
+            to the system.
         free: True if the driver chooses its own route, in a region.
     """
 
@@ -293,7 +294,7 @@ def _segments(frame: LocalFrame, flight: Flight) -> tuple[_Spots, _Spots]:
 
 
 def _passages(starts: _Spots, ends: _Spots, spot: Sequence[float], radius_m: float) -> _Spots:
-    """Return the interval (0 to 1) in which each segment is within a radius of a spot, or inf; shape (n, 2)."""
+    """Return the interval (0 to 1) of each segment within a radius of a spot, infinite if none is; shape (n, 2)."""
     along = ends[:, :2] - starts[:, :2]
     offset = starts[:, :2] - np.array(spot[:2])
     a = (along**2).sum(axis=1)

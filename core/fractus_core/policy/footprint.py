@@ -95,7 +95,7 @@ def exposure_footprint(poses: Sequence[Situation], frame: LocalFrame) -> Footpri
 
 
 def footprint(now: Situation, frame: LocalFrame) -> Footprint | None:
-    """Return the present footprint for every error inside the bounds, or None while the position is unknown.
+    """Return the present footprint, or None while the position is unknown. It includes all errors within their bounds.
 
     The ground counts as level, between home's altitude and `relief_m` below it. If attitude, lens or ground is unknown,
     the camera counts as seeing everything around it.

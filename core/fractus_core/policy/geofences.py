@@ -59,7 +59,7 @@ class Breach:
     """Violation of a fence by a leg.
 
     Attributes:
-        enters: True if the requested motion itself breaks the fence, False if it only comes too close.
+        enters: True if the requested motion itself breaks the fence, False if it only comes too close to the fence.
         permits: Returns True if the fence permits a piece of ground (in frame metres) with its margin.
     """
 

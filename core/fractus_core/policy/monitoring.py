@@ -189,8 +189,8 @@ def _rest_altitude_m(now: Situation, current_leg: GotoArgs | None, grant: Compil
 def _altitude_after_stop_m(now: Situation, rest_m: float) -> float:
     """Return the altitude of rest of a drone that was already commanded to climb or sink no further.
 
-    The drone reacts to that command, and a correction to a limit at which it may rest would arrive even later. Zones
-    get no such allowance: they are judged by the altitude of rest after a command given now.
+    The result is used for altitude limits: the drone already reacts to that command, and a correction would arrive even
+    later. Zones are judged by the altitude of rest after a command given now.
     """
     climb = -now.down_mps
     if not now.pending or -now.pending[-1][2] * climb > 0.0:

@@ -161,7 +161,8 @@ class Informer(Generic[T]):
                 self.kind, namespace=self._namespace, selectors=self._selectors, continue_=continue_
             )
             self._record_contact()
-            # All pages have the same resource version, so a result of a write that arrives meanwhile may be older.
+            # Record the version of the list before its items are complete. A write result that arrives meanwhile may be
+            # older than the list, and is ignored then.
             self._reach(page.resource_version)
             for item in page.items:
                 listed.add(key_of(item))

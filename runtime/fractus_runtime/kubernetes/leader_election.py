@@ -85,7 +85,7 @@ class Lease:
         """Take the Lease and renew it until cancelled. Then release it.
 
         Raises:
-            LostLease: Another process has held the Lease since this one held it, or the API server was restored.
+            LostLease: Another process has held the Lease since this process held it, or the API server was restored.
         """
         try:
             while True:
@@ -116,7 +116,7 @@ class Lease:
         """Take or renew the Lease, if this process holds it or it is free. Return True on success.
 
         Raises:
-            LostLease: Another process has held the Lease since this one held it, or the API server was restored.
+            LostLease: Another process has held the Lease since this process held it, or the API server was restored.
             KubeError: The API server refused the request, or did not respond.
         """
         try:
@@ -231,7 +231,7 @@ class LeaseThread:
         """Take the Lease and renew it until cancelled. Release it before returning.
 
         Raises:
-            LostLease: Another process has held the Lease since this one held it, or the API server was restored.
+            LostLease: Another process has held the Lease since this process held it, or the API server was restored.
             Unconfigured: There are no credentials.
         """
         caller = asyncio.get_running_loop()

@@ -35,7 +35,7 @@ _WGS84 = frozenset(
         "urn:ogc:def:crs:EPSG::4326",
     }
 )
-"""Names of WGS 84. GeoJSON of 2008 may name a reference system, and has lon before lat for each of these names."""
+"""Names of WGS 84 in GeoJSON files of 2008, which may name a reference system. All of them mean lon before lat."""
 _STYLE = frozenset({"fill", "fill-opacity", "stroke", "stroke-width", "stroke-opacity", "marker-color"})
 
 

@@ -203,7 +203,7 @@ def stuck_nodes(
             continue
         remaining_s = (pod.unschedulable_since + UNSCHEDULABLE_GRACE - now).total_seconds()
         if remaining_s <= 0 and node in leaving:
-            # The resources of its predecessor are released when that pod has ended.
+            # The predecessor of the pod still uses the resources. They are released when the predecessor has ended.
             wait_s = min(1.0, wait_s or 1.0)
         elif remaining_s <= 0:
             stuck[node] = f"the scheduler cannot place {pod.instance} on {node}: {pod.unschedulable_message}"

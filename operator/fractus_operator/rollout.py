@@ -110,8 +110,8 @@ class Rollout:
             failures: list[Exception] = []
             for step in (
                 partial(self._objects.apply, application, first),
-                # Only for existing Deployments. If another owner has the name of a Deployment, it may have that of the
-                # Secret.
+                # Only for existing Deployments. If the name of a Deployment is taken by another owner, the name of the
+                # Secret may be taken as well.
                 partial(self._write_secrets, application, certificates),
                 partial(self._objects.apply, application, last),
             ):

@@ -68,7 +68,7 @@ def next_step(
     failed = Counter(daemon_set for node in stuck for daemon_set in node.starting)
     skipped = {n.node for n in stuck if all(failed[d] <= max(1, ready(d)) for d in n.starting)}
     busy = [node.node for node in starting if node.node not in skipped]
-    # Nodes whose services are ready come first, because a failure on them is caused by the release.
+    # Nodes whose services are ready come first. If the services fail there, the release is the cause.
     due = [node for node in nodes if node.outdated and node.obstacle is None]
     due.sort(key=lambda node: not all(pod.ready for pod in node.outdated))
     chosen = due[: max(0, max(1, fleet // _SHARE) - len(busy))]

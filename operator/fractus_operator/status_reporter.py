@@ -74,7 +74,7 @@ class StatusReporter:
         if submitted is None or submitted.metadata.deletion_timestamp or attempts < _MIN_FAILURES:
             return
         last = self.last(submitted)
-        # Reported once: each status change starts a reconciliation, and the error text may differ each time.
+        # Report the failure only once. A status change starts a reconciliation, and the error text may differ each time.
         reported = any((c["type"], c["status"]) == ("Deployed", "False") for c in last.get("conditions") or ())
         if reported or last.get("phase") in SETTLED:
             return

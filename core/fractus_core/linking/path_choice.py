@@ -40,7 +40,7 @@ def choose_path(
     if direct is None:
         return PathDecision(False, is_direct, False, "NoDirectLink", "there is no direct link")
     if cloud is None:
-        # A link that is about to be left keeps its traffic until it is gone, but gets no new traffic.
+        # A link that the drone is about to leave keeps its traffic while it works, but no more traffic moves to it.
         takes = is_direct or not leaving
         return PathDecision(takes, takes != is_direct, True, "CloudSilent", "the cloud path does not respond")
     if leaving:

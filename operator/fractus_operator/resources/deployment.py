@@ -51,7 +51,8 @@ def deployment(application: Application, placed: PlannedInstance, drone: Drone |
         },
     }
     body = owned_object(kinds.DEPLOYMENT, application, placed.instance, instance_labels, spec=spec)
-    # The part of the manifest that determines the pods, without defaults, because a new version of the API may add some.
+    # The part of the manifest that determines the pods. Defaults are omitted, because a new version of the API may add
+    # fields with defaults.
     called = [application.spec.component(name).container.ports for name in component.egress]
     content = [
         component.model_dump(mode="json", by_alias=True, exclude_defaults=True),

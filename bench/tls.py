@@ -1,7 +1,8 @@
 """Duration of RetrieveImage over mutual TLS, against the same camera service without TLS.
 
-Both services are separate processes with the same photographs, and their turns alternate. The service without TLS exists
-in this file only: its server opens an insecure port and takes every caller for the one component that has a Grant.
+Both services run in separate processes with the same photographs, and are called alternately. The service without TLS
+exists in this file only. Its server opens an insecure port and identifies every caller as the only component with a
+Grant.
 """
 
 from __future__ import annotations
@@ -155,7 +156,7 @@ class CameraService:
 
 
 async def measure(report: Report, services: tuple[CameraService, CameraService], runs: int) -> None:
-    """Compare the services at each size. The lower quartile excludes most of the machine's other load."""
+    """Compare the services at each size by the lower quartile of the durations, which other programs hardly affect."""
     for service in services:
         await service.capture()
     for size in SIZES:

@@ -75,7 +75,7 @@ def render_next(world: World, camera: Pose, mount: Mount, numbers: itertools.cou
 
 
 def measure_new_ground(report: Report, frames: int) -> None:
-    """Measure a flight over new ground at 10 m/s with five pictures per second, including the tiles drawn for it."""
+    """Measure a flight over new ground at 10 m/s with five pictures per second, including the drawing of its tiles."""
     world = World.procedural(LAT, LON, 11)
     begun_s = time.process_time()
     world.render(pose(world, 0.0, 0.0, 100.0), LENS)
@@ -100,7 +100,7 @@ def measure_tiles(report: Report) -> None:
 
 
 def measure_likeness(report: Report) -> None:
-    """Measure the difference between a slanted picture and one that was rendered with 16 times as many pixels."""
+    """Measure the difference between a slanted picture and a reference, rendered with 16 times as many pixels."""
     world = World.procedural(LAT, LON, 7)
     small = Intrinsics(480, 270, 62.2)
     large = Intrinsics(1920, 1080, 62.2)

@@ -1,4 +1,4 @@
-"""Network of a cluster: one namespace for the control plane and for each node, connected by a bridge.
+"""Network of a cluster: a namespace for the control plane and a namespace for each node, connected by a bridge.
 
 The bridge is in the namespace of the control plane. Therefore firewall and forwarding of the machine do not affect the
 traffic of the cluster. The machine itself only gets one link and one route.

@@ -70,7 +70,7 @@ class StateDirectory:
 
     @property
     def logs(self) -> Path:
-        """Logs, with one directory for the control plane and for each node."""
+        """Logs, with a directory for the control plane and a directory for each node."""
         return self.path / "logs"
 
     @property

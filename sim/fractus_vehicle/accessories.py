@@ -105,7 +105,7 @@ def reset_battery(v: VehicleState, batteries: float, percent: float) -> int:
 def start_motor_test(v: VehicleState, motor: float, duration_s: float) -> int:
     """Handle DO_MOTOR_TEST: run one motor for `duration_s` seconds on the ground.
 
-    The vehicle reports armed during the test, independent of the arming checks.
+    During the test, the vehicle reports that it is armed. The arming checks are not run.
     """
     if not v.landed:
         v.send_text(mavlink.MAV_SEVERITY_CRITICAL, "Motor Test: vehicle not landed")

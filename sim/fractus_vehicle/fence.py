@@ -274,7 +274,7 @@ class Fence:
         return allowed
 
     def check(self, north: float, east: float, altitude_m: float, home: Vertex, now_s: float) -> int:
-        """Update the breaches and return the new ones."""
+        """Update the breaches, and return the breaches that are new."""
         breaches = self.outside(north, east, altitude_m, home)
         new = breaches & ~self.breaches
         self.breaches = breaches

@@ -126,7 +126,7 @@ class Hub:
         self._closers.append(close)
 
     def poll(self, timeout_s: float = 0.0) -> None:
-        """Receive available data. If there is none, wait for it up to `timeout_s`."""
+        """Receive available data. If no data is available, wait for data up to `timeout_s`."""
         for key, _ in self._selector.select(timeout_s):
             key.data()
 

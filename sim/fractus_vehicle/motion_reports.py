@@ -21,7 +21,7 @@ _AUTOMATIC = frozenset(
 
 
 def global_position_int(v: VehicleState) -> Values:
-    """Build GLOBAL_POSITION_INT. The position is zero until the estimator has one."""
+    """Build GLOBAL_POSITION_INT. Its position is zero until the estimator has a position."""
     e = v.est
     if v.origin is None:
         return {"time_boot_ms": boot_ms(v), "hdg": v.heading_cdeg}

@@ -118,7 +118,7 @@ def _high_latency(v: VehicleState, o: Command, _c: Channel) -> int:
 
 
 def _parachute(_v: VehicleState, o: Command, _c: Channel) -> int:
-    """Accept the defined actions, although there is no parachute."""
+    """Accept the defined parachute actions. They have no effect."""
     return mavlink.MAV_RESULT_ACCEPTED if o.params[0] in (0.0, 1.0, 2.0) else mavlink.MAV_RESULT_FAILED
 
 

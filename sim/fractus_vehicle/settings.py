@@ -49,8 +49,7 @@ def set_limits(params: Parameters, control: Control) -> None:
 def set_fence(params: Parameters, fence: Fence, changed: str = "FENCE_ENABLE") -> None:
     """Set the limits of the fence.
 
-    Changes of other parameters than FENCE_ENABLE do not enable or disable the fence, because a command may have done
-    so.
+    Only a change of FENCE_ENABLE enables or disables the fence. Otherwise, other changes could undo a command.
     """
     if changed == "FENCE_ENABLE":
         fence.enabled = int(params["FENCE_ENABLE"]) != 0

@@ -139,7 +139,7 @@ class LandscapeBillboards:
         return [Billboard(f"face-lawn-{i}_{j}", x, y, 360.0 * draws[3], False, size, int(97 * draws[2]) % VARIATIONS)]
 
     def _beside(self, road: Road, step: int) -> Billboard:
-        """Return a billboard that is visible to traffic that drives on the right."""
+        """Return a billboard beside a road that faces the traffic, which drives on the right."""
         family = 1 if road.family == "east" else 2
         draw = unit(self._roads.seed, 74, family, road.index, step)
         x, y, dx, dy = self._roads.at(road, step + 0.3 + 0.4 * draw)

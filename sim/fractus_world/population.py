@@ -171,7 +171,7 @@ class TownPopulation:
         return things + [self._stroller(i, j, n, time_s) for n in range(_STROLLERS.get(block.kind, 0))]
 
     def _stroller(self, i: int, j: int, n: int, time_s: float) -> Thing:
-        """Return a person who walks on a closed curve in the open."""
+        """Return a person who walks on a closed curve inside a block."""
         draws = [unit(self._seed, 61, i, j, n, k) for k in range(7)]
         x, y = centre(i + 0.5 * (draws[0] - 0.5), j + 0.5 * (draws[1] - 0.5))
         reach = 6.0 + 22.0 * draws[2]

@@ -126,7 +126,7 @@ def _follow(process: subprocess.Popen[str], module: str, report: Report) -> list
 
 
 def check_go(module: Module) -> None:
-    """Check that PATH has a Go toolchain that can build a module, or can fetch one that can.
+    """Check that the Go toolchain on PATH can build a module, or can download a toolchain for it.
 
     Raises:
         PrerequisiteError: The toolchain is missing or too old.

@@ -36,7 +36,7 @@ from fractus_sim.scenarios.field.field_site import EXAMPLE, FieldSite
 def field(*, out: Path, autopilot: str | None, speedup: float, names: tuple[str, ...]) -> None:
     """Fly the field experiment three times: normally, with violations under policies, and without policies.
 
-    Exit code: 0 if all expectations hold, 2 if one does not, 1 if the experiment could not be flown.
+    Exit code: 0 if all expectations hold, 2 if an expectation does not hold, 1 if the experiment could not be flown.
     """
     with command_errors():
         expectations = run_field_experiment(out, Autopilot(autopilot, speedup), names)

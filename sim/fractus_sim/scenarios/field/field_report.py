@@ -227,7 +227,7 @@ def _draw_pictures(axes: Any, site: FieldSite, run: Evidence) -> None:
 
 
 def _draw_direction(axes: Any, points: Any, colour: str) -> None:
-    """Draw arrowheads along a path, one every `_ARROW_INTERVAL_M`."""
+    """Draw arrowheads along a path at intervals of `_ARROW_INTERVAL_M`."""
     flown_m = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))))
     for index in np.searchsorted(flown_m, np.arange(_ARROW_INTERVAL_M / 2, flown_m[-1], _ARROW_INTERVAL_M)):
         axes.annotate(

@@ -29,7 +29,7 @@ from fractus_sim.scenarios.links.links_site import read_site
 def links(*, out: Path, factor: float, again: bool) -> None:
     """Fly past edge nodes with WiFi while one picture per second is sent, and evaluate the delivery of the pictures.
 
-    Exit code: 0 if all expectations hold, 2 if one does not, 1 if the scenario could not be flown.
+    Exit code: 0 if all expectations hold, 2 if an expectation does not hold, 1 if the scenario could not be flown.
     """
     with command_errors():
         site = read_site(factor)

@@ -41,7 +41,7 @@ class RecordedFlight:
     """A flight with peers, and the actual bandwidth of all paths.
 
     Attributes:
-        positions: Positions of the drone, one every `STEP_S`.
+        positions: Positions of the drone at intervals of `STEP_S`.
         waypoints: Remaining waypoints at each step.
         speed: Speed along the waypoints, m/s.
         peers: Peers with their declared range.
@@ -72,7 +72,7 @@ class RecordedFlight:
 def constant_speed_flight(
     path: Sequence[LocalPosition], speed: float
 ) -> tuple[list[LocalPosition], list[tuple[LocalPosition, ...]]]:
-    """Return positions and remaining waypoints, one every `STEP_S`, for a constant speed along a path."""
+    """Simulate a flight along a path at constant speed. Return position and remaining waypoints for each `STEP_S`."""
     position = path[0]
     remaining = list(path[1:])
     positions = []

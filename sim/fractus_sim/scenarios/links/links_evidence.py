@@ -121,7 +121,7 @@ class Picture:
     """Delivery of a picture. Times are Unix seconds.
 
     Attributes:
-        received: Time of the first reception by each instance, by node.
+        received: Time of the first reception on each node, by node.
         answered_s: Time when the sender received the response. None: no response.
         received_twice: True if one instance received the picture more than once.
         took_s: Time from sending to the response, seconds.

@@ -1,8 +1,8 @@
 """Fixtures of end-to-end tests: a cluster with Fractus, shared by all tests of a worker.
 
-By default, each worker starts an embedded cluster and stops it at the end (FRACTUS_E2E_KEEP=1 keeps it for the next run).
-FRACTUS_E2E_CLUSTER=current uses the cluster of KUBECONFIG (k3s, kind), with one worker. The cluster must have the images, and
-its nodes the labels fractus.dev/class.
+By default, each worker starts an embedded cluster, and stops it at the end (FRACTUS_E2E_KEEP=1 keeps it for the next
+run). FRACTUS_E2E_CLUSTER=current uses the cluster of KUBECONFIG (k3s, kind), with one worker. This cluster must have
+loaded the images, and its nodes must have the label fractus.dev/class.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def _current() -> bool:
 
 
 def _nodes() -> Mapping[str, str]:
-    """Return the names of the cluster's nodes by their names in the example."""
+    """Map the node names of the example to the node names of the cluster."""
     if not _current():
         return {name: name for name in EXAMPLE_NODES}
     result = subprocess.run(["kubectl", "get", "nodes", "-o", "json"], capture_output=True, timeout=60, check=True)
@@ -54,7 +54,7 @@ DRONE = NODES["drone-1"]
 
 
 def report(line: str) -> None:
-    """Print the progress of a long step past pytest's capture of output."""
+    """Print the progress of a long step at once, although pytest captures the output of tests."""
     os.write(2, f"e2e: {line}\n".encode())
 
 
@@ -117,7 +117,7 @@ def grounded(kube: Kube) -> Iterator[Kube]:
     kube.wait("the drone is on the ground", lambda: flight_state(kube) in {"inactive", "charging"}, timeout_s=120)
     yield kube
     kube.run("delete", "applications.fractus.dev", "--all", "-A", "--wait=true", "--timeout=60s", timeout_s=90)
-    kube.wait("the drone came home", lambda: flight_state(kube) in {"inactive", "charging"}, timeout_s=180)
+    kube.wait("the drone is home", lambda: flight_state(kube) in {"inactive", "charging"}, timeout_s=180)
 
 
 def flight_state(kube: Kube) -> str | None:

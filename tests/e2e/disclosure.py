@@ -1,4 +1,4 @@
-"""Secrets of a cluster with Fractus, and everything that users can read: objects, logs and Events."""
+"""Collect the secrets of a cluster with Fractus, and all texts that users can read: objects, logs and Events."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def secrets(kube: Kube) -> dict[str, bytes]:
     """Return the values of Secrets, the keys of nodes, and the tokens of Fractus' pods."""
     values: dict[str, bytes] = {}
     for body in kube.all("secrets"):
-        # Releases of helm and tokens of kubeadm do not belong to Fractus.
+        # Ignore the Secrets in which helm stores its releases, and the bootstrap tokens of kubeadm.
         if body["type"] not in {"helm.sh/release.v1", "bootstrap.kubernetes.io/token"}:
             for name, value in (body.get("data") or {}).items():
                 values[f"{body['metadata']['namespace']}/{body['metadata']['name']}/{name}"] = base64.b64decode(value)
@@ -39,7 +39,9 @@ def readable(kube: Kube) -> dict[str, str]:
         name = pod["metadata"]["name"]
         texts[f"log of {name}"] = kube.must("logs", "-n", namespace, name, "--all-containers")
         if any(status["restartCount"] for status in pod["status"].get("containerStatuses") or ()):
-            texts[f"log of {name} before"] = kube.run("logs", "-n", namespace, name, "--all-containers", "-p").stdout
+            texts[f"log of {name} before its restart"] = kube.run(
+                "logs", "-n", namespace, name, "--all-containers", "-p"
+            ).stdout
     kinds = kube.must("api-resources", "--api-group=fractus.dev", "-o", "name").split()
     for kind in (
         *kinds,

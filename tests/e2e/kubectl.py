@@ -1,4 +1,4 @@
-"""Access of end-to-end tests to a cluster: kubectl, waiting, and signals to processes of pods."""
+"""Helpers for end-to-end tests: run kubectl, wait for conditions, and send signals to processes of pods."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Object = dict[str, Any]
 
 
 class CommandFailed(AssertionError):
-    """A command failed that must succeed."""
+    """A command that must succeed has failed."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Kube:
     kubeconfig: pathlib.Path
 
     def run(self, *args: str, stdin: str | None = None, timeout_s: float = 60) -> subprocess.CompletedProcess[str]:
-        """Run kubectl and return the completed process, also after an error."""
+        """Run kubectl and return the completed process. A nonzero exit code raises no exception."""
         return subprocess.run(
             [str(self.kubectl), *args],
             input=stdin,
@@ -111,12 +111,12 @@ class Kube:
         return pods[0]
 
     def kill_pod(self, pod: Object) -> None:
-        """Kill every process of a pod's containers by SIGKILL, like a crash. The sandbox of the pod stays."""
+        """Simulate a crash: send SIGKILL to every process of a pod's containers, but not to the sandbox of the pod."""
         if not process_lookup.send_signal(process_lookup.of_pod(pod["metadata"]["uid"]), signal.SIGKILL):
             raise CommandFailed(f"pod {pod['metadata']['name']} has no processes to kill")
 
 
 def condition(obj: Object | None, type_: str) -> Mapping[str, Any]:
-    """Return a condition of an object, or an empty mapping."""
+    """Return the condition of this type from the status of an object, or an empty mapping."""
     conditions = ((obj or {}).get("status") or {}).get("conditions") or []
     return next((c for c in conditions if c["type"] == type_), {})

@@ -74,7 +74,7 @@ spec: {{selector: {{app: web}}, ports: [{{port: 80, targetPort: 8080}}]}}
 
 
 def spec_of(name: str, nodes: int = 2) -> ClusterSpec:
-    """Return a cluster of a drone with a separate disk, and edge nodes."""
+    """Return a cluster with a drone that has a separate disk, and with edge nodes."""
     drone = load_spec(ROOT / "examples" / "clusters" / "demo.yaml").nodes[0].model_dump(by_alias=True)
     drone["hardware"]["disk"] = {"size": "32Mi"}
     edge = load_spec(ROOT / "examples" / "clusters" / "demo.yaml").nodes[1].model_dump(by_alias=True)
@@ -115,7 +115,7 @@ def leftovers(name: str) -> list[str]:
 
 
 def ready(cluster: Cluster) -> dict[str, bool]:
-    """Return for each node if the API server reports it as ready."""
+    """Return, for each node, True if the API server reports the node as ready."""
     return {node.name: bool(node.ready) for node in cluster.status()}
 
 
@@ -133,7 +133,7 @@ def running(cluster: Cluster, node: str) -> bool:
 
 @pytest.fixture(scope="module")
 def small() -> Iterator[Cluster]:
-    """A drone and an edge node with a web server each."""
+    """A cluster of a drone and an edge node. Each node runs a web server."""
     build_images(ROOT, targets=("component",), report=print)
     cluster = Cluster.load(spec_of(NAME), report=print)
     try:
@@ -149,7 +149,7 @@ def small() -> Iterator[Cluster]:
 
 @pytest.fixture
 def healthy(small: Cluster) -> Iterator[Cluster]:
-    """The small cluster, which is repaired after the test."""
+    """The small cluster. It is repaired after the test."""
     yield small
     small.up()
     for node in ("drone-1", "edge-1"):
@@ -190,7 +190,8 @@ def test_cluster_pods_are_reachable_from_machine_without_changed_settings(small:
     )
     assert result.stdout
     overcommit = small.node("edge-1").exec(["cat", "/proc/sys/vm/overcommit_memory"]).stdout.strip()
-    assert overcommit == "1"  # the node has the value that kubelet expects; the setting of the machine is unchanged
+    assert overcommit == "1"  # the value that kubelet expects
+    # The setting of the machine itself is unchanged.
     records = json.loads(Path("/run/fractus-sim/machine.json").read_text())["sysctls"]
     assert set(records) <= {"fs.inotify.max_user_instances", "fs.inotify.max_user_watches"}
 
@@ -202,7 +203,7 @@ def test_cluster_up_changes_nothing_if_all_parts_run(small: Cluster) -> None:
     small.up(images=[IMAGE])
     elapsed_s = time.monotonic() - started
     assert {path.name: path.read_text() for path in (state.path / "processes").iterdir()} == before
-    assert elapsed_s < 30, f"took {elapsed_s:.1f} s"  # less than 2 s on an idle machine
+    assert elapsed_s < 30, f"took {elapsed_s:.1f} s"
 
 
 def test_cluster_power_off_ends_node_but_not_its_vehicle(healthy: Cluster) -> None:
@@ -252,7 +253,7 @@ def test_cluster_commands_of_the_documentation_work(healthy: Cluster) -> None:
     lines = {words[2]: words for words in typed_words if len(words) > 3}
 
     def typed(verb: str, *replacements: str) -> str:
-        """Run a documented line for the cluster of this test, with its last words replaced if there are replacements."""
+        """Run the documented command for this test's cluster. Replacements replace the last arguments."""
         words = lines[verb]
         argv = [str(Path(sys.executable).with_name("fractus")), "cluster", verb, "--name", NAME, *words[3:]]
         argv = [*argv[: len(argv) - len(replacements)], *replacements] if replacements else argv

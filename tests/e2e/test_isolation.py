@@ -17,7 +17,7 @@ IMAGE = "localhost/fractus/example-traffic-monitoring:dev"
 
 @pytest.fixture(scope="module")
 def alices(kube: Kube) -> Iterator[Kube]:
-    """The cluster with a namespace in which the user Alice has the role edit."""
+    """The cluster with an additional namespace, in which the user Alice has the role edit."""
     binding = {
         "apiVersion": "rbac.authorization.k8s.io/v1",
         "kind": "RoleBinding",
@@ -26,13 +26,13 @@ def alices(kube: Kube) -> Iterator[Kube]:
         "subjects": [{"apiGroup": "rbac.authorization.k8s.io", "kind": "User", "name": ALICE}],
     }
     kube.apply({"apiVersion": "v1", "kind": "Namespace", "metadata": {"name": NAMESPACE}}, binding)
-    kube.wait("the namespace has its account", lambda: kube.get("serviceaccount", "default", NAMESPACE))
+    kube.wait("the namespace has its default service account", lambda: kube.get("serviceaccount", "default", NAMESPACE))
     yield kube
     kube.run("delete", "namespace", NAMESPACE, "--wait=true", "--timeout=90s", timeout_s=120)
 
 
 def pod(name: str) -> Object:
-    """Return a pod that may run on drones."""
+    """Return a pod that tolerates the taint of drones and needs no access to its node."""
     container = {
         "name": "main",
         "image": IMAGE,
@@ -179,7 +179,7 @@ def test_pods_without_access_to_the_node_run_on_drones(alices: Kube) -> None:
     assert create(alices, pod("modest")) == ""
     running = alices.wait("the pod runs", lambda: phase(alices, "modest") == "Running" and get(alices, "modest"))
     assert running["spec"]["nodeName"] == DRONE
-    # The user can still label and delete an admitted pod.
+    # Alice can still label and delete the admitted pod.
     alices.must("label", "pod", "modest", "-n", NAMESPACE, "--as", ALICE, "seen=yes")
     alices.must("delete", "pod", "modest", "-n", NAMESPACE, "--as", ALICE, "--timeout=30s")
 
@@ -189,7 +189,7 @@ def test_debug_containers_get_no_access_to_the_node(alices: Kube) -> None:
     alices.wait("the pod runs", lambda: phase(alices, "debugged") == "Running")
     debug = {"name": "debug", "image": IMAGE, "securityContext": {"privileged": True}}
     patch = yaml.safe_dump({"spec": {"ephemeralContainers": [debug]}})
-    # The administrator adds the container, because the role edit has no access to ephemeral containers.
+    # The administrator adds the container, because the role edit does not permit it.
     result = alices.run(
         "patch", "pod", "debugged", "-n", NAMESPACE, "--subresource=ephemeralcontainers", "--patch", patch
     )

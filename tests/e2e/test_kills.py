@@ -1,4 +1,4 @@
-"""SIGKILL of each part in flight: the mission continues, or the system flies the drone home. No flight is unsupervised."""
+"""Kill each part in flight with SIGKILL. The mission continues, or the system flies the drone home."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_killed_part_does_not_leave_the_drone_unsupervised_in_flight(grounded: K
 
 
 def in_midleg(kube: Kube, entries: int) -> Callable[[], bool]:
-    """Return a condition: the audit log shows an allowed Goto."""
+    """Return a function that returns True if the new entries of the audit log contain an allowed Goto."""
 
     def goto_logged() -> bool:
         return any(
@@ -55,7 +55,7 @@ def in_midleg(kube: Kube, entries: int) -> Callable[[], bool]:
 
 
 def landed(kube: Kube, entries: int) -> Callable[[], bool]:
-    """Return a condition: the audit log shows that the service detected the landing."""
+    """Return a function that returns True if the new entries of the audit log contain the landing."""
 
     def landing_logged() -> bool:
         return any(e["kind"] == "control" and e["action"] == "landed" for e in audit_log(kube)[entries:])
@@ -74,7 +74,7 @@ def restarts(pod: Object) -> int:
 
 
 def assert_supervised(log: list[Object]) -> None:
-    """Check that the audit log names a control authority in every recorded state of the flight."""
+    """Check that the audit log contains states of the flight, and that each of them names a control authority."""
     states = [e for e in log if e["kind"] == "state"]
     assert states, "no flight was recorded"
     assert all(s["controller"] for s in states)

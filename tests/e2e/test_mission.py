@@ -55,7 +55,7 @@ def test_traffic_monitoring_flies_under_policies(grounded: Kube) -> None:
     started = time.monotonic()
     kube.apply(app)
     kube.wait("all pods of the example are Ready", lambda: ready(kube, "traffic-monitoring"), timeout_s=60)
-    print(f"apply to all pods Ready: {time.monotonic() - started:.1f} s")
+    print(f"time from apply until all pods were Ready: {time.monotonic() - started:.1f} s")
     secret_values = secrets(kube)
     texts = {f"{name} in flight": text for name, text in readable(kube).items()}
 
@@ -91,7 +91,11 @@ def test_traffic_monitoring_flies_under_policies(grounded: Kube) -> None:
     assert any(e["action"] == "deny" and "no-fly-hospital" in e["policies"] for e in calls)
     heights = [e["alt"] for e in log if e.get("kind") == "state"]
     assert 45 < max(heights) < 52
-    kube.wait("only the plan and stopped pods are left", lambda: not children(kube, pods=STILL_AT_WORK), timeout_s=60)
+    kube.wait(
+        "all child objects except the plan and stopped pods are deleted",
+        lambda: not children(kube, pods=STILL_AT_WORK),
+        timeout_s=60,
+    )
     application = "fractus.dev/application=traffic-monitoring"
     stopped = kube.wait("all pods stopped", lambda: all_stopped(kube.all("pods", "default", application)), timeout_s=60)
     assert len(stopped) >= 7
@@ -143,7 +147,8 @@ def test_application_deleted_without_operator_leaves_no_objects(grounded: Kube) 
     kube.must("scale", "deployment/fractus-operator", "-n", SYSTEM, "--replicas=0")
     try:
         kube.wait(
-            "the operator has ended", lambda: not kube.all("pods", SYSTEM, "app.kubernetes.io/component=operator")
+            "the pods of the operator are deleted",
+            lambda: not kube.all("pods", SYSTEM, "app.kubernetes.io/component=operator"),
         )
         kube.must("delete", "application.fractus.dev", "orphan", "--wait=false")
     finally:

@@ -1,4 +1,4 @@
-"""Procedure of docs/tutorial.md on a cluster: the reader's image flies, and a policy and an update take effect."""
+"""Run the commands of docs/tutorial.md on a cluster. Its program flies, and a policy and an update take effect."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ TIMEOUT_S = 1500
 pytestmark = [
     pytest.mark.slow,
     pytest.mark.skipif(
-        os.environ.get("FRACTUS_E2E_CLUSTER") == "current", reason="the tutorial brings its own cluster up"
+        os.environ.get("FRACTUS_E2E_CLUSTER") == "current", reason="the tutorial starts an embedded cluster"
     ),
 ]
 
 
 def files(text: str) -> dict[str, str]:
-    """Return the files that the text shows, by name."""
+    """Return the names and contents of the files that the page shows."""
     return dict(re.findall(r"`([\w.]+)`[^`\n]*:\n```\w+\n(.*?)```", text, re.DOTALL))
 
 
 def typed(text: str) -> list[tuple[str, list[str]]]:
-    """Return the commands of the text, each with the output that it shows."""
+    """Return the commands of the page, each with the output lines that the page shows after it."""
     commands: list[tuple[str, list[str]]] = []
-    shell: bool | None = None  # None outside of blocks
+    shell: bool | None = None  # True in a shell block, False in another block, None between blocks
     for line in text.splitlines():
         if line.startswith("```"):
             shell = (line == "```") if shell is None else None
@@ -47,7 +47,7 @@ def typed(text: str) -> list[tuple[str, list[str]]]:
 
 
 def on_own_cluster(command: str) -> str:
-    """Return the command with the name of the test's cluster, because this machine may have others."""
+    """Add the name of the test's cluster to the command, because this machine may run other clusters."""
     return re.sub(r"fractus cluster ([\w-]+)", rf"fractus cluster \1 --name {NAME}", command)
 
 

@@ -15,7 +15,7 @@ pytestmark = pytest.mark.slow
 
 
 def helm(kube: Kube, *args: str) -> subprocess.CompletedProcess[str]:
-    """Run helm from the folder of kubectl, or from the PATH if that folder has none."""
+    """Run the helm next to kubectl or, if there is no such program, the helm on the PATH."""
     sibling = kube.kubectl.with_name("helm")
     return subprocess.run(
         [str(sibling) if sibling.exists() else shutil.which("helm") or "helm", *args, "-n", SYSTEM],

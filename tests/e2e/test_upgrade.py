@@ -1,4 +1,4 @@
-"""helm upgrade during a flight: services and operator continue, and are replaced after the landing."""
+"""helm upgrade during a flight: services and operator keep running, and are replaced after the landing."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_upgrade_during_a_flight_does_not_disturb_it(grounded: Kube) -> None:
     operators = {p["metadata"]["name"] for p in kube.all("pods", SYSTEM, "app.kubernetes.io/component=operator")}
     assert upgrade(kube, "image.tag=missing", "camera.resources.requests.cpu=21m").returncode == 0
     waits = kube.wait(
-        "the camera service waits",
+        "the drone has the condition ServicesCurrent",
         lambda: condition(kube.get("drone", DRONE), "ServicesCurrent") or None,
         timeout_s=60,
     )
@@ -68,7 +68,7 @@ def test_upgrade_during_a_flight_does_not_disturb_it(grounded: Kube) -> None:
         for p in kube.all("pods", SYSTEM, "app.kubernetes.io/component=operator")
         if condition(p, "Ready").get("status") == "True"
     }
-    assert operators <= running, "a running operator was stopped for an image that does not start"
+    assert operators <= running, "the upgrade stopped running operators, although the new image cannot start"
     assert services(kube) == before
     assert upgrade(kube, "camera.resources.requests.cpu=21m", "image.tag=dev").returncode == 0
 

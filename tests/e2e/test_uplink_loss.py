@@ -19,9 +19,9 @@ pytestmark = pytest.mark.slow
 LINKS = EXAMPLE.parent / "links"
 PEER = "edge-1"
 CUT_S = 300.0 if DEEP else 75.0
-"""Longer than the maximum connection age (30 s) and the silence limit of agents (45 s). Five minutes if FRACTUS_DEEP is set."""
+"""Duration of the loss, in seconds: above the maximum connection age (30 s) and the silence limit of agents (45 s)."""
 QUIET_S = 60.0
-"""Maximum gap between pictures, of which there is one per second, on a machine under load."""
+"""Maximum time between two received pictures on a machine under load. The component takes one picture per second."""
 NEAR_EDGE = ((50.864239, 4.679068), (50.865228, 4.679352))
 
 
@@ -36,7 +36,7 @@ def slow_flight() -> Object:
 
 
 def received(kube: Kube, pod: str) -> list[float]:
-    """Return the times at which an ImageChecker received pictures, in Unix seconds."""
+    """Return the Unix times, in seconds, at which a pod of the ImageChecker received pictures."""
     lines = kube.must("logs", pod, "--tail=-1").splitlines()
     return [json.loads(line)["at"] for line in lines if line.startswith("{")]
 
@@ -79,14 +79,16 @@ def test_calls_continue_over_wifi_when_the_uplink_is_lost(grounded: Kube, cluste
         assert condition(kube.get("node", DRONE), "Ready")["status"] == "Unknown"
         while (remaining_s := cut_s + CUT_S - time.time()) > 0:
             last_s = max(received(kube, checker))
-            assert time.time() - last_s < QUIET_S, f"no picture since {last_s - cut_s:.0f} s after the cut"
+            assert time.time() - last_s < QUIET_S, f"the last picture arrived {last_s - cut_s:.0f} s after the cut"
             time.sleep(min(remaining_s, 5.0))
         arrived = [at for at in received(kube, checker) if cut_s < at]
     finally:
         node.heal_link()
     assert len(arrived) > CUT_S / 3
     kube.wait("the drone is Ready again", lambda: drone_ready(kube), timeout_s=90)
-    kube.wait("its node is Ready again", lambda: condition(kube.get("node", DRONE), "Ready")["status"] == "True")
-    kube.wait("traffic is direct by the status", lambda: linked(kube), timeout_s=30)
+    kube.wait(
+        "the node of the drone is Ready again", lambda: condition(kube.get("node", DRONE), "Ready")["status"] == "True"
+    )
+    kube.wait("the status reports direct traffic", lambda: linked(kube), timeout_s=30)
     assert pods_of(kube) == before
     assert phase(kube, "links") == "Flying"

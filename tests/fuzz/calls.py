@@ -52,7 +52,7 @@ def numbers(data_provider: atheris.FuzzedDataProvider) -> Call:
 
 
 def fuzz_one(data: bytes) -> None:
-    """Judge one request, decoded from the bytes or built from numbers that they select."""
+    """Judge one request. It is decoded from the input, or built from numbers that the input selects."""
     try:
         call = wire(data[1:]) if data[:1] < b"\x40" else numbers(atheris.FuzzedDataProvider(data[1:]))
     except (DecodeError, Refused):

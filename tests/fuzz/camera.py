@@ -1,4 +1,4 @@
-"""Fuzz sequences of calls of any callers to the camera service.
+"""Fuzz sequences of calls to the camera service, from callers with and without a Grant.
 
 No handler fails. No picture is taken in the private zone. Pictures are returned only to their owner, and no other file is read or
 removed.
@@ -143,7 +143,7 @@ async def _ended(running: list[asyncio.Task[None]]) -> None:
 
 
 def _named(data_provider: atheris.FuzzedDataProvider, service: Service, name: str) -> bytes:
-    """Return a request for a valid size or an existing picture, of the caller or of the other component."""
+    """Return a request with a valid size, or with the name of an existing picture of either component."""
     if name == "CaptureImage":
         sizes = [0, 16, 48, 64, 2**32 - 1]
         return bytes(

@@ -1,4 +1,6 @@
-"""Fuzz requests between components, with any ids and attempts: each runs once, or is refused with a status."""
+"""Fuzz requests between components, with arbitrary ids and attempt numbers.
+
+Each request runs once or is refused with a status."""
 
 from __future__ import annotations
 
@@ -56,7 +58,7 @@ class Peer:
 
 
 async def requests(data_provider: atheris.FuzzedDataProvider) -> None:
-    """Send up to twelve requests with few ids."""
+    """Send up to twelve requests. They share few ids, so that some ids repeat."""
     peer = Peer(data_provider)
     method = Responder({}, 0)._method("M", peer.handle).unary_unary
 
@@ -104,7 +106,7 @@ async def requests(data_provider: atheris.FuzzedDataProvider) -> None:
 
 
 def fuzz_one(data: bytes) -> None:
-    """Run one conversation."""
+    """Run one sequence of requests."""
     fly(lambda: requests(atheris.FuzzedDataProvider(data)))
 
 

@@ -100,7 +100,7 @@ def changed(data_provider: atheris.FuzzedDataProvider) -> list[Any]:
 
 
 def value(data_provider: atheris.FuzzedDataProvider, before: Any) -> Any:
-    """Return another value, often of the same type."""
+    """Return a different value, often of the same type."""
     if isinstance(before, bool):
         return not before
     if isinstance(before, int | float) and data_provider.ConsumeBool():
@@ -156,7 +156,7 @@ def planned(file: Path) -> None:
 
 def fuzz_one(data: bytes) -> None:
     """Read and plan one file."""
-    if data[:1] >= b"\x80":  # never the beginning of UTF-8 text
+    if data[:1] >= b"\x80":  # not the first byte of a UTF-8 character of text
         data_provider = atheris.FuzzedDataProvider(data[1:])
         if data[0] % 2:
             JSON.write_text(json.dumps({"kind": "List", "items": changed(data_provider)}))

@@ -1,4 +1,4 @@
-"""Fuzz the MAVLink parser: no exception, and the same messages for every division of the bytes.
+"""Fuzz the MAVLink parser. It raises no exception, and the chunk sizes of its input do not change its messages.
 
 Also checks that no changed frame is accepted on a signed link.
 """
@@ -19,11 +19,11 @@ KEY = bytes(range(32))
 
 
 def fuzz_one(data: bytes) -> None:
-    """Check one input as a stream and as the payload of intact frames."""
+    """Parse the input as a stream, and then use it as the payload of intact frames."""
     parsed(data)
     if len(data) > 3:
         kind = MESSAGE_CLASSES[int.from_bytes(data[:2], "little") % len(MESSAGE_CLASSES)]
-        # Any length: empty, cut by the sender, or extended by a newer dialect.
+        # The payload may have any length: senders cut trailing zeros, and newer dialects add fields.
         payload = data[3 : 3 + data[2]]
         frame = frame_v2(kind, payload)
         check_encoded_again(accepted(frame, data))
@@ -36,14 +36,14 @@ def fuzz_one(data: bytes) -> None:
 
 
 def signed_link() -> Endpoint:
-    """Return the end of a signed link."""
+    """Return an endpoint of a signed link."""
     endpoint = Endpoint(1, 1)
     endpoint.set_signing(KEY, 1000)
     return endpoint
 
 
 def accepted(frame: bytes, noise: bytes) -> Message:
-    """Check that an intact frame is one message, also behind bytes that start no frame and before any bytes."""
+    """Check that an intact frame is parsed as one message, also with noise before or after the frame."""
     (message,) = parsed(noise[:16].translate(None, MARKERS) + frame)
     (first, *_) = parsed(frame + noise[:16])
     assert message.frame == first.frame == frame
@@ -58,7 +58,7 @@ def check_unsigned(frame: bytes, kind: MessageClass) -> None:
 
 
 def parsed(data: bytes) -> list[Message]:
-    """Return the messages of a stream. They must not depend on the division of the stream."""
+    """Return the messages of a stream. Check that they are the same for several chunk sizes."""
     half = len(data) // 2
     outcomes = []
     reported = []

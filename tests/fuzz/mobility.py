@@ -1,4 +1,4 @@
-"""Fuzz sequences of calls of any callers to the mobility service, with a vehicle that flies in virtual time.
+"""Fuzz sequences of calls to the mobility service, from callers with and without a Grant, in virtual time.
 
 No handler fails, the vehicle moves only after a call of its driver, and it stays inside its operation area and outside the zone. The
 same holds with other messages on its link, and when Grants are revoked.
@@ -18,7 +18,7 @@ from typing import Any
 import atheris
 import grpc
 
-# Imported first, without instrumentation, because the simulation would be several times slower with it.
+# Import the simulation before the fuzzer instruments modules. Instrumentation would make it several times slower.
 from mobility_world import World, spec, touring, zone
 
 with atheris.instrument_imports(include=["fractus_services.mobility.rpc", "fractus_services.grpc_server"]):
@@ -54,7 +54,7 @@ VEHICLE_MESSAGES = [
     "EKF_STATUS_REPORT", "STATUSTEXT", "COMMAND_ACK", "PARAM_VALUE", "TIMESYNC", "MISSION_REQUEST_INT", "MISSION_ACK",
 ]  # fmt: skip
 OTHER_SENDERS = [(255, 190), (1, 154), (1, 191), (2, 1), (244, 191), (0, 0)]
-"""Other senders on the link: ground station, gimbal, companion computer, another vehicle, the service's own address, and none."""
+"""Source ids of other senders: ground station, gimbal, companion, another vehicle, the service itself, id 0."""
 logging.disable(logging.CRITICAL)
 
 
@@ -115,7 +115,7 @@ class Flight:
     async def _calls(
         self, world: World, registry: Registry, chains: list[tuple[bytes, ...]], waits_s: list[float]
     ) -> bool:
-        """Make up to twelve calls. Return True if arbitrary messages were sent in the vehicle's name."""
+        """Make up to twelve calls. Return True if the noise may contain messages with the vehicle's source id."""
         data_provider = self._data_provider
         spoofed = False
         for _ in range(12):
@@ -141,7 +141,7 @@ class Flight:
         return spoofed
 
     def _send_noise(self, world: World) -> bool:
-        """Put arbitrary bytes on the link. Return True if they can be a message of the vehicle."""
+        """Send arbitrary bytes on the link. Return True if they may contain a message with the vehicle's source id."""
         data_provider = self._data_provider
         if not data_provider.ConsumeIntInRange(0, 7):
             world.plane._received(data_provider.ConsumeBytes(data_provider.ConsumeIntInRange(0, 300)))
@@ -162,7 +162,7 @@ class Flight:
 
 
 async def _checked_call(handler: grpc.RpcMethodHandler, body: bytes, context: Context, *, of_node: bool) -> None:
-    """Make a call. Only the node receives the outcome of missions."""
+    """Make a call. Check that only the node receives the outcome of missions."""
     await called(handler, body, context)
     for message in context.written:
         assert of_node or not getattr(message, "missions", None), "the reply contains another component's mission"

@@ -16,7 +16,7 @@ from policy_world import HOME
 
 CENTRE = {"latitude_deg": HOME.lat, "longitude_deg": HOME.lon}
 MAX_METADATA_BYTES = 8 * 1024
-"""Maximum size of a reply's metadata. By default, clients replace a larger reply by another error."""
+"""Maximum size of a reply's metadata, in bytes. By default, gRPC clients report larger metadata as an error."""
 DEADLINES_S = [5.0, None, 0.0, 0.4, 1e300, float("inf"), -1.0]
 
 _KEY = ec.generate_private_key(ec.SECP256R1())
@@ -84,7 +84,7 @@ def fill(data_provider: atheris.FuzzedDataProvider, message: Any) -> None:
 
 
 def request(data_provider: atheris.FuzzedDataProvider, kind: Any) -> bytes:
-    """Return an encoded request for a method with this message type."""
+    """Return an encoded request of this message type."""
     if not data_provider.ConsumeIntInRange(0, 3):
         return data_provider.ConsumeBytes(data_provider.ConsumeIntInRange(0, 64))
     message = kind()
@@ -93,22 +93,22 @@ def request(data_provider: atheris.FuzzedDataProvider, kind: Any) -> bytes:
 
 
 class Registry:
-    """Registry to which generated code adds handlers. It keeps them by name."""
+    """Fake gRPC server: it stores the handlers that generated code adds, by method name."""
 
     def __init__(self, admission: Any) -> None:
         self._admission = admission
         self.handlers: dict[str, grpc.RpcMethodHandler] = {}
 
     def add_generic_rpc_handlers(self, _handlers: object) -> None:
-        """Ignore the handlers, because they are registered twice."""
+        """Ignore the handlers, because generated code also passes them to the other method."""
 
     def add_registered_method_handlers(self, _service: str, handlers: dict[str, grpc.RpcMethodHandler]) -> None:
-        """Keep the handlers as the service wraps them: requests are decoded after the admission of their caller."""
+        """Store the handlers wrapped by the admission check, which runs before a request is decoded."""
         self.handlers |= {name: self._admission.wrap(name, handler) for name, handler in handlers.items()}
 
 
 class Context:
-    """gRPC context of a call that checks the replies of the service."""
+    """Fake gRPC context of a call. It checks the replies of the service."""
 
     def __init__(self, chain: tuple[bytes, ...], remaining_s: float | None) -> None:
         self._chain = chain
@@ -143,7 +143,7 @@ class Context:
 
 
 async def called(handler: grpc.RpcMethodHandler, body: bytes, context: Context) -> Any:
-    """Return the reply of a handler, or None if it refuses the call or streams."""
+    """Return the reply of a handler, or None if the handler refuses the call or sends a stream."""
     handle = handler.stream_unary or handler.stream_stream
     context.body = body
     try:

@@ -1,4 +1,4 @@
-"""Fuzz zones in external formats: each file is refused with a reason, or its zones survive a round trip."""
+"""Fuzz zones in external formats: each file is refused with a reason, or can be written and read again."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ logging.disable(logging.CRITICAL)
 
 
 def text_of(data_provider: atheris.FuzzedDataProvider, format_index: int) -> str:
-    """Return an example with some places changed, or arbitrary text."""
+    """Return an example with some characters changed, or arbitrary text."""
     if not data_provider.ConsumeIntInRange(0, 7):
         return data_provider.ConsumeUnicodeNoSurrogates(data_provider.remaining_bytes())
     text = TEXTS[format_index]

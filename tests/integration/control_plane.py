@@ -41,7 +41,11 @@ def programs() -> dict[str, Path]:
 
 
 def wait_for(poll: Callable[[], T | None], description: str | Callable[[], str], timeout_s: float = 60.0) -> T:
-    """Poll a function until it returns a true value, and return this value. Fail with a description after the timeout."""
+    """Poll a function until it returns a true value, and return this value.
+
+    Raises:
+        AssertionError: The timeout has passed. The message contains the description.
+    """
     end = time.monotonic() + timeout_s
     while True:
         result = poll()
@@ -49,7 +53,7 @@ def wait_for(poll: Callable[[], T | None], description: str | Callable[[], str],
             return result
         if time.monotonic() > end:
             text = description if isinstance(description, str) else description()
-            raise AssertionError(f"waited {timeout_s:.0f} s without success: {text}")
+            raise AssertionError(f"waited {timeout_s:.0f} s for {text}")
         select_pause(0.05)
 
 
@@ -77,7 +81,7 @@ class ControlPlane:
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
         self._started: dict[str, tuple[str, ...]] = {}
         self.data = directory / "etcd"
-        """Data directory of etcd. Tests may copy or replace it while the storage is stopped."""
+        """Data directory of etcd. Tests may copy or replace this directory while etcd is stopped."""
         (directory / "pki").mkdir(parents=True)
         self.authority = Authority(directory / "pki")
         self.server = f"https://127.0.0.1:{free_port()}"
@@ -211,6 +215,6 @@ class ControlPlane:
         try:
             self.admin.list(f"/apis/fractus.dev/v1alpha1/{body['spec']['names']['plural']}")
         except KubeError:
-            # "storage is (re)initializing"
+            # the API server answers "storage is (re)initializing"
             return False
         return True

@@ -30,7 +30,7 @@ from fractus_proto.v1.types_pb2 import Position
 from mobility_rig import issue_signer
 from scraping import scraped
 
-pytestmark = [pytest.mark.timeout(300), pytest.mark.xdist_group("agent")]  # they share an API server
+pytestmark = [pytest.mark.timeout(300), pytest.mark.xdist_group("agent")]  # the tests share one API server
 
 
 @pytest.fixture(scope="module")
@@ -295,16 +295,16 @@ def test_agent_keeps_grants_while_the_api_server_is_down(server: ApiServer, dron
     server.stop_apiserver()
     drone.start()
     try:
-        wait_for(lambda: "watch failed" in drone.log(), "an agent that noticed", timeout_s=30)
+        wait_for(lambda: "watch failed" in drone.log(), "the failed watch in the log", timeout_s=30)
         assert drone.grants() == {"one", "two", "three"}
         assert drone.process is not None
         assert drone.process.poll() is None
     finally:
         server.start_apiserver()
-    wait_for(lambda: drone.grants() == {"two", "three"}, "reconciled grants", timeout_s=40)
-    # The watch works again after the list.
+    wait_for(lambda: drone.grants() == {"two", "three"}, "the Grants in the files of the agent", timeout_s=40)
+    # After the list, the agent also receives changes again.
     add_grant(server, "four")
-    wait_for(lambda: phase(server, "four") == "Active" and "four" in drone.grants(), "a new grant", timeout_s=10)
+    wait_for(lambda: phase(server, "four") == "Active" and "four" in drone.grants(), "the new Grant", timeout_s=10)
     server.stop_apiserver()
     server.start_apiserver()
     remove_grant(server, "two")
@@ -349,9 +349,9 @@ def test_agent_of_edge_node_registers(server: ApiServer, authority: TestAuthorit
         node.describe()
         node.start()
         node.certify()
-        wait_for(lambda: node.condition("Ready").get("status") == "True", "ready edge node", timeout_s=30)
-        # After the certificate nothing of the requests stays behind.
-        wait_for(lambda: not server.admin.list(REQUESTS), "no signing requests", timeout_s=10)
+        wait_for(lambda: node.condition("Ready").get("status") == "True", "the edge node to be Ready", timeout_s=30)
+        # When the node has its certificate, the agent deletes the signing requests.
+        wait_for(lambda: not server.admin.list(REQUESTS), "the signing requests to be deleted", timeout_s=10)
     finally:
         print(node.log())
         node.close()
@@ -387,6 +387,10 @@ def test_agent_reports_a_direct_link_with_missing_device(server: ApiServer, dron
         assert not (server.get(f"{path}/other") or {}).get("status")
         assert {file.name for file in (drone.state / "links").iterdir()} == {"mine.json"}
         server.delete(f"{path}/mine")
-        wait_for(lambda: not list((drone.state / "links").iterdir()), "the end of the stored link", timeout_s=30)
+        wait_for(
+            lambda: not list((drone.state / "links").iterdir()),
+            "the file of the DirectLink to be deleted",
+            timeout_s=30,
+        )
     finally:
         server.delete(path)

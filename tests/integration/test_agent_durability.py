@@ -1,4 +1,4 @@
-"""Stored files are whole whenever the agent dies: at every system call, and under kill -9."""
+"""Stored files stay complete when the agent is killed: at any system call, or by SIGKILL at any time."""
 
 import json
 import os
@@ -17,11 +17,11 @@ WATCHED = ("open", "write", "fsync", "fchmod", "replace", "symlink", "mkdir", "u
 
 
 class Died(BaseException):
-    """The process is gone."""
+    """Raised in place of a system call to simulate the death of the process."""
 
 
 def die_at(step: int, patch: pytest.MonkeyPatch) -> None:
-    """Make the step-th system call from now the last one; a write gets through by half."""
+    """Raise Died at the system call with this number, counted from now. A write stores half of its data first."""
     count = 0
 
     def wrap(name: str) -> None:
@@ -43,7 +43,15 @@ def die_at(step: int, patch: pytest.MonkeyPatch) -> None:
 
 
 def die_everywhere(action: Callable[[], object], check: Callable[[bool], None]) -> int:
-    """Run an action once for every system call in it, dying there; how many there are."""
+    """Run an action repeatedly, and let it die at each of its system calls in turn.
+
+    Args:
+        action: Action to run.
+        check: Called after each run, with True if the action was complete.
+
+    Returns:
+        Number of system calls of the action.
+    """
     for step in range(1, 200):
         done = False
         with pytest.MonkeyPatch.context() as patch:
@@ -56,7 +64,7 @@ def die_everywhere(action: Callable[[], object], check: Callable[[bool], None]) 
         check(done)
         if done:
             return step - 1
-    raise AssertionError("no end")
+    raise AssertionError("the action made more than 198 system calls")
 
 
 def test_killed_write_file_leaves_the_old_or_the_new_file(tmp_path: Path) -> None:

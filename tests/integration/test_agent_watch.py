@@ -28,7 +28,7 @@ from fractus_agent.store import (
 )
 from fractus_core.api.grants import ReportedGrant
 
-pytestmark = [pytest.mark.timeout(300), pytest.mark.xdist_group("agent-watch")]  # they share an API server
+pytestmark = [pytest.mark.timeout(300), pytest.mark.xdist_group("agent-watch")]  # the tests share one API server
 WAIT_TIMEOUT_S = 30.0
 WatchItem = TypeVar("WatchItem", WatchEvent, GrantList)
 
@@ -133,7 +133,7 @@ async def test_expired_resource_version_leads_to_a_new_list(server: ApiServer) -
         server.stop_apiserver()
         server.start_apiserver()
         server.compact()
-        # The storage of custom resources is available a moment after the server reports that it is ready.
+        # Custom resources are available a moment after the API server reports that it is ready.
         await served(watched)
         with pytest.raises(Expired):
             await until(watched._watch(links, old), Deleted)
@@ -194,14 +194,14 @@ async def test_watch_ended_by_the_server_continues_without_a_list(server: ApiSer
         assert names(await following(events)) == set()
         waiting = asyncio.ensure_future(anext(events))
         done, _ = await asyncio.wait([waiting], timeout=3.5)
-        assert not done, "no list after a clean end"
+        assert not done, "the store listed all objects after the API server ended the watch normally"
         server.post(f"{FRACTUS}/directlinks", link("after"))
         event = await asyncio.wait_for(waiting, WAIT_TIMEOUT_S)
         assert isinstance(event, Changed)
 
 
 async def nothing_from(granted: AsyncIterator[GrantList], for_s: float = 2.0) -> asyncio.Future[GrantList]:
-    """Check that no event arrives for some time. Return a future of the next event."""
+    """Check that the stream yields nothing for a time in seconds. Return a future of its next list."""
     waiting = asyncio.ensure_future(anext(granted))
     done, _ = await asyncio.wait([waiting], timeout=for_s)
     assert not done
@@ -231,7 +231,7 @@ async def test_grants_of_the_node_come_from_its_node_grants_object(server: ApiSe
         assert await watched.report_grants(second.generation, [report])
         assert server.reported("drone-1", "a")["phase"] == "Active"
         third = await following(granted)
-        assert (named(third), third.reported) == (None, {uid: report}), "unchanged Grants are not unpacked again"
+        assert (named(third), third.reported) == (None, {uid: report}), "the store decoded unchanged Grants again"
         assert await watched.report_grants(second.generation, [])
         assert server.reported("drone-1", "a") == {}
 

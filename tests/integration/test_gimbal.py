@@ -87,7 +87,7 @@ class Stage:
                 try:
                     chunks = [chunk async for chunk in self.camera.RetrieveImage(request, timeout=20)]
                 except grpc.aio.AioRpcError as error:
-                    # The measured attitude changed after the capture.
+                    # The service refuses the picture, because the measured attitude changed after the capture.
                     assert "ask again" in (error.details() or ""), error
                     await asyncio.sleep(PACE_S)
                     continue
@@ -95,7 +95,10 @@ class Stage:
                 return chunks[0].decision, b"".join(chunk.data for chunk in chunks)
 
     async def take_until(self, action: int) -> tuple[Any, bytes]:
-        """Take pictures until a decision has this action. After a turn, poses during the turn still count for a moment."""
+        """Take pictures until a decision has this action.
+
+        For a moment after a rotation, the service still takes the attitudes during the rotation into account.
+        """
         async with asyncio.timeout(TIMEOUT_S):
             while True:
                 decision, data = await self.take_picture()
@@ -110,7 +113,7 @@ class Stage:
             yaw_error_deg = abs((state.gimbal.yaw_deg - yaw_deg + 180) % 360 - 180)
             return state.HasField("gimbal") and abs(state.gimbal.pitch_deg - pitch_deg) < 3 and yaw_error_deg < 10
 
-        return await self.rig.until(is_near, description=f"gimbal at {pitch_deg:g}, {yaw_deg:g}")
+        return await self.rig.until(is_near, description=f"gimbal at pitch {pitch_deg:g}, yaw {yaw_deg:g} degrees")
 
 
 async def take_off(driver: Driver) -> None:
@@ -204,7 +207,9 @@ async def test_gimbal_picture_is_judged_by_measured_attitude(stage: Stage) -> No
 
     # The camera points straight down, but its attitude is no longer measured.
     stage.station.set_type(SERVOS)
-    await stage.rig.until(lambda state: not state.HasField("gimbal"), description="a gimbal that is not measured")
+    await stage.rig.until(
+        lambda state: not state.HasField("gimbal"), description="telemetry without the attitude of the gimbal"
+    )
     decision, hidden = await stage.take_until(CORRECT)
     assert decision.code == "PrivacyFilter"
     assert brightness(hidden) < 1
@@ -228,7 +233,7 @@ async def test_point_gimbal_is_refused_for_passenger_or_invalid_angle(stage: Sta
 
 
 async def test_point_gimbal_is_refused_for_fixed_camera(stage: Stage) -> None:
-    """Pictures are judged by the described mount as soon as the description changes."""
+    """Replace the gimbal in the node description by a fixed mount. The service then refuses PointGimbal."""
     assert (await point(stage.driver, -45.0)).decision.action == ALLOW
     path = stage.rig.directory / "node.yaml"
     described = yaml.safe_load(path.read_text())

@@ -1,4 +1,4 @@
-"""System flights around zones, POI missions of passengers, velocity setpoints, dry runs, vehicle fence and links."""
+"""Transit flights, missions of passengers, velocity setpoints, dry runs, the autopilot's fence, and MAVLink links."""
 
 from __future__ import annotations
 
@@ -36,11 +36,11 @@ from mobility_rig import (
 )
 
 WALL = (-40.0, 25.0, 40.0, 40.0)
-"""A zone between home and everything in the north."""
+"""Zone across the straight line from home to the control point in the north, as offsets in metres (x, y)."""
 
 
 class Trace:
-    """Positions of the drone, 20 per second."""
+    """Records the positions of the drone, 20 per second."""
 
     def __init__(self, rig: Rig) -> None:
         self.points: list[tuple[float, float]] = []
@@ -85,7 +85,7 @@ async def test_transit_flies_around_zone_to_control_point_and_home(rig: Rig) -> 
     driver = Driver(rig)
     await driver.take(120)
     assert math.dist(xy((await rig.telemetry()).position), (0, 70)) < 2.0
-    assert max(abs(x) for x, _ in trace.points) > 41.0, "the straight way is blocked"
+    assert max(abs(x) for x, _ in trace.points) > 41.0, "the drone flew through the zone"
     reply = await driver.stub.ReturnControl(pb.ReturnControlRequest(), timeout=5)
     assert reply.mission_complete
     landed = await rig.until(lambda t: not t.armed, 120, "landing")
@@ -107,7 +107,7 @@ async def test_poi_mission_visits_points_of_passenger_without_driver(rig: Rig) -
     rig.start_vehicle(3.0)
     await rig.until(lambda t: t.ready, 30)
     await asyncio.sleep(0)
-    assert not (await rig.telemetry()).armed, "no passenger has called yet"
+    assert not (await rig.telemetry()).armed, "the drone was armed before the passenger requested the flight"
     stub = rig.stub(PASSENGER)
 
     async def ride() -> list[Any]:
@@ -151,7 +151,7 @@ async def test_velocity_setpoint_expires_and_is_denied_toward_zone(rig: Rig) -> 
     code, why = await denied(set_velocity(setpoint(0.0, 12.0, hold_s=2.0), timeout=5))
     assert code == grpc.StatusCode.PERMISSION_DENIED or why.action == types_pb2.Decision.ACTION_TAKEOVER
     after = xy((await rig.telemetry()).position)
-    assert math.dist(before, after) < 1.0, "the denied setpoint was not flown"
+    assert math.dist(before, after) < 1.0, "the drone flew the denied setpoint"
 
 
 async def test_check_call_returns_verdict_without_effect(rig: Rig) -> None:
@@ -206,7 +206,7 @@ async def test_vehicle_fence_returns_drone_without_service(rig: Rig) -> None:
     rig.start_vehicle(2.0)
     driver = Driver(rig)
     await driver.up()
-    pilot = MavlinkAutopilot(rig.link, ARDUCOPTER)  # speaks as the companion, so that the autopilot does not miss it
+    pilot = MavlinkAutopilot(rig.link, ARDUCOPTER)  # sends heartbeats in place of the killed service
     task = asyncio.create_task(pilot.run())
     async with asyncio.timeout(10):
         while not pilot.connected:
@@ -224,7 +224,7 @@ async def test_vehicle_fence_returns_drone_without_service(rig: Rig) -> None:
             if pilot.vehicle.lat is not None and FRAME.xy(pilot.vehicle.lat, pilot.vehicle.lon or 0)[1] > 80:
                 pilot.fly(8.0, 0.0, 0.0)
     north = FRAME.xy(pilot.vehicle.lat or 0, pilot.vehicle.lon or 0)[1]
-    assert 105 < north < 125, "the fence is not ten metres outside the operation area"
+    assert 105 < north < 125, "the autopilot did not stop at its fence, about 10 m outside the operation area"
     assert pilot.vehicle.failsafe_text == "Polygon fence breached"
     task.cancel()
 
@@ -248,7 +248,7 @@ async def test_owner_fence_is_restored_after_mission(rig: Rig) -> None:
 
 
 async def test_arming_is_refused_if_owner_fence_cannot_be_saved(rig: Rig) -> None:
-    (rig.directory / "state" / "fence.json").mkdir(parents=True)  # what the owner had cannot be stored there
+    (rig.directory / "state" / "fence.json").mkdir(parents=True)  # the directory prevents a file with this name
     rig.write_grant(grant())
     rig.start_service()
     rig.start_vehicle(3.0)
@@ -270,7 +270,7 @@ async def test_mavlink_connection_reaches_autopilot(rig: Rig, kind: str) -> None
         "udpout": (f"udpout:127.0.0.1:{port}", f"udpin:127.0.0.1:{port}"),
     }[kind]
     rig.write_grant(grant())
-    rig.start_service(link=ours)  # before the vehicle: the line is not there yet
+    rig.start_service(link=ours)  # before the vehicle, so the link does not exist yet
     rig.start_vehicle(3.0, "--listen", theirs)
     driver = Driver(rig)
     await driver.take(60)

@@ -29,7 +29,7 @@ def deployed(world: World, namespace: str, name: str = "traffic", pods: int = 7)
     """Play scheduler and kubelet until the application is ready."""
     wait_for(lambda: len(world.pods(namespace)) >= pods, lambda: f"{pods} pods; {world.status(namespace, name)}")
     world.run_pods(namespace)
-    wait_for(lambda: world.condition(namespace, "Ready", name).get("status") == "True", "all pods to be ready")
+    wait_for(lambda: world.condition(namespace, "Ready", name).get("status") == "True", "the condition Ready")
     return world.status(namespace, name)
 
 
@@ -39,7 +39,7 @@ def running(world: World, namespace: str) -> dict[str, Any]:
 
 
 def versions(world: World, namespace: str) -> dict[str, str]:
-    """The resource versions of all that the operator writes for the example."""
+    """Return the resource version (of Deployments: the generation) of each object that the operator writes, by name."""
     versions_by_name = {name: body["metadata"]["resourceVersion"] for name, body in world.children(namespace).items()}
     versions_by_name = {
         name: version for name, version in versions_by_name.items() if not name.startswith("deployments/")
@@ -53,7 +53,7 @@ def versions(world: World, namespace: str) -> dict[str, str]:
 
 
 def end_mission(world: World, namespace: str, phase: str, message: str) -> None:
-    """Report of the driver's grant what its agent would."""
+    """Write the end of the mission to the status of the driver's Grant, like the agent."""
     name = f"{namespace}.traffic-navigator"
     world.api.merge(f"{FRACTUS}/grants/{name}/status", {"status": {"phase": phase, "message": message}})
 
@@ -96,7 +96,7 @@ def test_application_gets_plan_grants_and_pods(world: World, operator: OperatorP
         [base["status"]["podIP"]]
     ]
     assert "selector" not in children["services/traffic-image-checker"]["spec"]
-    wait_for(lambda: events(world, namespace) == ["Planned", "PodsReady"], "one Event for what comes together")
+    wait_for(lambda: events(world, namespace) == ["Planned", "PodsReady"], "one Event for all stages of the rollout")
     found = world.api.list(f"/api/v1/namespaces/{namespace}/events")
     (planned,) = (e["message"] for e in found if e["reason"] == "Planned")
     for stage in ("Planned", "Granted", "Deployed"):
@@ -126,11 +126,11 @@ def test_certificate_names_only_its_instance(world: World, operator: OperatorPro
 def test_unchanged_application_causes_no_writes(world: World, operator: OperatorProcess, namespace: str) -> None:
     running(world, namespace)
     before = versions(world, namespace)
-    # A change that touches no input wakes the reconciler; a change of an input shows when it is done.
+    # These changes wake the reconciler. The new location label of edge-1 shows that it has processed them.
     world.api.merge(f"{FRACTUS}/depots/base", {"spec": {"radius": 31}})
     world.api.merge(f"{FRACTUS}/edgenodes/edge-1", {"spec": {"location": at(21, 30)}})
     world.api.merge("/api/v1/nodes/cloud-1", {"metadata": {"labels": {"some": "label"}}})
-    wait_for(lambda: _geohash(world, "edge-1"), "the node's label")
+    wait_for(lambda: _geohash(world, "edge-1"), "the location label of edge-1")
     after = versions(world, namespace)
     stored = world.api.get(world.path(traffic(namespace)))
     assert stored is not None
@@ -169,7 +169,7 @@ def test_killed_operator_completes_rollout_after_restart(
     world.put(traffic(namespace))
     wait_for(lambda: world.grants(namespace), "the first grant")
     operator.stop(signal.SIGKILL)
-    # By it the next operator knows whose drone it is.
+    # The plan records that the drone belongs to this Application. The next operator reads it.
     assert "deploymentplans/traffic" in world.children(namespace)
     operator.start()
     deployed(world, namespace)
@@ -189,7 +189,9 @@ def test_deleted_or_modified_child_is_restored(world: World, operator: OperatorP
     world.api.delete(path)
     wait_for(lambda: (world.api.get(path) or {}).get("metadata", {}).get("uid", uid) != uid, "the Deployment's return")
     world.api.merge(path, {"spec": {"replicas": 3}})
-    wait_for(lambda: (world.api.get(path) or {})["spec"]["replicas"] == 1, "the number of replicas")
+    wait_for(
+        lambda: (world.api.get(path) or {})["spec"]["replicas"] == 1, "the operator to reset the number of replicas"
+    )
 
 
 def test_complete_mission_keeps_only_its_plan(world: World, operator: OperatorProcess, namespace: str) -> None:
@@ -210,11 +212,11 @@ def test_complete_mission_keeps_only_its_plan(world: World, operator: OperatorPr
         f"MissionBegun: {namespace}/traffic flies drone-1",
         f"MissionOver: {namespace}/traffic no longer flies drone-1: all control points were returned",
         "Landed: drone-1 landed",
-    ], "nothing of planning and deploying, which costs enough requests, and nothing twice"
+    ], "Events of planning and deploying, or repeated Events, would cost requests in vain"
 
 
 def flight_events(world: World) -> list[str]:
-    """The Events on the present Drone drone-1, in the order in which they were posted."""
+    """Return the Events of the Drone object drone-1 that exists now, in the order of their creation."""
     drone = world.api.get("/apis/fractus.dev/v1alpha1/drones/drone-1") or {}
     all_events = world.api.list("/api/v1/namespaces/default/events")
     drone_events = [e for e in all_events if e["involvedObject"].get("uid") == drone["metadata"]["uid"]]
@@ -229,31 +231,39 @@ def test_finished_pods_stay_stopped_for_their_logs(world: World, operator: Opera
     world.phase(namespace, "Completed")
     uid = (world.application(namespace) or {})["metadata"]["uid"]
     workloads = [f"/apis/apps/v1/namespaces/{namespace}/{kind}" for kind in ("deployments", "replicasets")]
-    wait_for(lambda: not any(world.api.list(path) for path in workloads), "what would start pods again to go")
-    wait_for(lambda: all("fractus.dev/finished" in labels_of(pod) for pod in world.pods(namespace)), "pods to be kept")
+    wait_for(
+        lambda: not any(world.api.list(path) for path in workloads), "the Deployments and ReplicaSets to be deleted"
+    )
+    wait_for(
+        lambda: all("fractus.dev/finished" in labels_of(pod) for pod in world.pods(namespace)),
+        "the label fractus.dev/finished on all pods",
+    )
     stopped = world.pods(namespace)
     assert {pod["metadata"]["uid"] for pod in stopped} == before
     for pod in stopped:
         assert pod["spec"]["activeDeadlineSeconds"] == 1
         assert [(o["kind"], o["uid"]) for o in pod["metadata"]["ownerReferences"]] == [("Application", uid)]
-    # A time that has not come keeps no pod.
+    # A finish time in the future is invalid. The operator deletes the pod.
     first = stopped[0]["metadata"]
     path = f"/api/v1/namespaces/{namespace}/pods/{first['name']}"
     world.api.merge(path, {"metadata": {"labels": {"fractus.dev/finished": "29990101T000000Z"}}})
-    wait_for(lambda: first["uid"] not in {p["metadata"]["uid"] for p in world.pods(namespace)}, "that pod to go")
+    wait_for(
+        lambda: first["uid"] not in {p["metadata"]["uid"] for p in world.pods(namespace)}, "that pod to be deleted"
+    )
     # The next mission has new pods and ignores labels of finished pods.
     manifest = traffic(namespace)
     manifest["spec"]["ttlAfterFinished"] = 0
     manifest["spec"]["components"][0]["container"]["env"] = [{"name": "COLOUR", "value": "red"}]
     world.put(manifest)
-    wait_for(lambda: len(fresh(world, namespace, before)) == 7, "pods of the next mission")
+    wait_for(lambda: len(fresh(world, namespace, before)) == 7, "the pods of the next mission")
     wait_for(
-        lambda: not before & {pod["metadata"]["uid"] for pod in world.pods(namespace)}, "the last one's pods to go"
+        lambda: not before & {pod["metadata"]["uid"] for pod in world.pods(namespace)},
+        "the pods of the previous mission to be deleted",
     )
     deployed(world, namespace)
     end_mission(world, namespace, "Complete", "done")
     world.phase(namespace, "Completed")
-    wait_for(lambda: not world.pods(namespace), "pods that are not to be kept to go")
+    wait_for(lambda: not world.pods(namespace), "all pods to be deleted")
 
 
 def test_changed_ttl_of_finished_pods_starts_no_mission(
@@ -269,16 +279,16 @@ def test_changed_ttl_of_finished_pods_starts_no_mission(
     def keep_for(seconds: int) -> None:
         manifest["spec"]["ttlAfterFinished"] = seconds
         world.put(manifest)
-        wait_for(lambda: world.status(namespace)["observedGeneration"] == generation(), "the change to be noted")
+        wait_for(lambda: world.status(namespace)["observedGeneration"] == generation(), "the change to be processed")
 
     def generation() -> int:
         return int((world.application(namespace) or {})["metadata"]["generation"])
 
     keep_for(3600)
-    assert not world.condition(namespace, "Updated"), "nothing waits for the landing"
+    assert not world.condition(namespace, "Updated"), "the change of the time to live waits for the landing"
     after = versions(world, namespace)
     assert {name for name in before if before[name] != after[name]} <= {"application", "deploymentplans/traffic"}, (
-        "nothing restarts in flight"
+        "the change restarts pods in flight"
     )
     end_mission(world, namespace, "Complete", "done")
     world.phase(namespace, "Returning")
@@ -286,7 +296,7 @@ def test_changed_ttl_of_finished_pods_starts_no_mission(
     world.drone_status("drone-1", "inactive")
     world.phase(namespace, "Completed")
     keep_for(3)
-    wait_for(lambda: not world.pods(namespace), "the pods to go")
+    wait_for(lambda: not world.pods(namespace), "the pods to be deleted")
     operator.stop(signal.SIGKILL)
     # Plans of an earlier release do not contain the digest of their mission.
     plan = f"{FRACTUS}/namespaces/{namespace}/deploymentplans/traffic"
@@ -294,7 +304,7 @@ def test_changed_ttl_of_finished_pods_starts_no_mission(
     operator.start()
     wait_for(
         lambda: "applicationDigest" in world.children(namespace)["deploymentplans/traffic"]["spec"],
-        "the plan to be brought up to date",
+        "the digest in the plan",
     )
     keep_for(600)
     assert world.status(namespace)["phase"] == "Completed"
@@ -311,11 +321,12 @@ def test_finished_pods_are_removed_in_time(world: World, operator: OperatorProce
     deployed(world, namespace, pods=1)
     end_mission(world, namespace, "Failed", "driver lost")
     wait_for(
-        lambda: any("fractus.dev/finished" in labels_of(pod) for pod in world.pods(namespace)), "the pod to be kept"
+        lambda: any("fractus.dev/finished" in labels_of(pod) for pod in world.pods(namespace)),
+        "the label fractus.dev/finished",
     )
     operator.stop(signal.SIGKILL)
     operator.start()
-    wait_for(lambda: not world.pods(namespace), "the pod to go")
+    wait_for(lambda: not world.pods(namespace), "the pod to be deleted")
     assert world.status(namespace)["phase"] == "Failed"
 
 
@@ -340,7 +351,9 @@ def test_phase_follows_drone(world: World, operator: OperatorProcess, namespace:
     assert world.condition(namespace, "MissionComplete")["reason"] == "MissionBegun"
     world.phase(namespace, "Flying")
     world.api.merge(path, {"status": {"controller": "system"}})
-    wait_for(lambda: world.status(namespace).get("controller") == "system", "the system to fly")
+    wait_for(
+        lambda: world.status(namespace).get("controller") == "system", "the system as the controller in the status"
+    )
     world.api.merge(path, {"status": {"flightState": "unknown", "lastFlightState": "flying", "controller": None}})
     lost = world.phase(namespace, "Unknown")
     assert "controller" not in lost
@@ -400,7 +413,7 @@ def test_refused_pods_are_reported(world: World, operator: OperatorProcess, name
     assert "50m" in message
     assert "50m" in world.status(namespace)["message"]
     world.api.delete(path)
-    wait_for(lambda: world.condition(namespace, "Ready")["reason"] == "PodsNotReady", "all pods to be made")
+    wait_for(lambda: world.condition(namespace, "Ready")["reason"] == "PodsNotReady", "all pods to be created")
     deployed(world, namespace)
 
 
@@ -423,7 +436,7 @@ def test_drone_is_held_by_one_application_until_it_has_returned(
     names = {"traffic", "second"}
     wait_for(
         lambda: {world.status(namespace, n).get("phase") for n in names} == {"Deploying", "Queued"},
-        "one of two to wait",
+        "one of the two Applications to be Queued",
     )
     first = next(n for n in names if world.status(namespace, n)["phase"] == "Deploying")
     second = (names - {first}).pop()
@@ -433,7 +446,7 @@ def test_drone_is_held_by_one_application_until_it_has_returned(
     name = f"{namespace}.{first}-navigator"
     world.api.merge(f"{FRACTUS}/grants/{name}/status", {"status": {"phase": "Complete"}})
     world.phase(namespace, "Returning", first)
-    wait_for(lambda: not world.grants(namespace, first), "the first one's grants to go")
+    wait_for(lambda: not world.grants(namespace, first), "the Grants of the first Application to be deleted")
     assert world.status(namespace, second)["phase"] == "Queued"
     world.drone_status("drone-1", "inactive")
     world.phase(namespace, "Deploying", second)
@@ -496,10 +509,10 @@ def test_upgraded_operator_restarts_no_pod_in_flight(world: World, operator: Ope
     def grace_s(name: str) -> int:
         return int((world.api.get(f"{root}/{name}") or {})["spec"]["template"]["spec"]["terminationGracePeriodSeconds"])
 
-    wait_for(lambda: grace_s("traffic-data-store") == 10, "the cloud's pods to be renewed")
+    wait_for(lambda: grace_s("traffic-data-store") == 10, "the new template of the cloud component")
     assert grace_s("traffic-navigator") == 11
     world.drone_status("drone-1", "inactive")
-    wait_for(lambda: grace_s("traffic-navigator") == 10, "the drone's pods to be renewed on the ground")
+    wait_for(lambda: grace_s("traffic-navigator") == 10, "the new template of the drone component after the landing")
 
 
 def test_longest_valid_name_is_deployed_and_reported(world: World, operator: OperatorProcess, namespace: str) -> None:
@@ -515,7 +528,7 @@ def test_longest_valid_name_is_deployed_and_reported(world: World, operator: Ope
 def test_deleted_application_leaves_no_objects(world: World, operator: OperatorProcess, namespace: str) -> None:
     running(world, namespace)
     world.api.delete(world.path(traffic(namespace)))
-    wait_for(lambda: gone(world, namespace), "everything to go")
+    wait_for(lambda: gone(world, namespace), "the Application and its child objects to be deleted")
     assert not world.grants(namespace)
 
 
@@ -523,12 +536,12 @@ def test_deleted_application_leaves_no_objects(world: World, operator: OperatorP
 def test_editor_of_application_cannot_keep_its_drone(
     world: World, operator: OperatorProcess, namespace: str, noted: str
 ) -> None:
-    """By the annotations in which kopf notes how far a deletion is; another, such as the fleet's operator, deletes it."""
+    """An editor sets annotations in which kopf stores the progress of a teardown. Another user deletes the object."""
     running(world, namespace)
     path = world.path(traffic(namespace))
     world.api.merge(path, {"metadata": {"annotations": {"kopf.fractus.dev/teardown": noted}}})
     world.api.delete(path)
-    wait_for(lambda: gone(world, namespace), "everything to go")
+    wait_for(lambda: gone(world, namespace), "the Application and its child objects to be deleted")
     assert not world.grants(namespace)
 
 
@@ -538,9 +551,11 @@ def test_deletion_while_operator_is_down_leaves_no_objects(
     running(world, namespace)
     operator.stop(signal.SIGKILL)
     world.api.delete(world.path(traffic(namespace)))
-    assert world.application(namespace) is not None, "the finalizer holds it until the operator is back"
+    assert world.application(namespace) is not None, (
+        "the Application was deleted without the operator, in spite of its finalizer"
+    )
     operator.start()
-    wait_for(lambda: gone(world, namespace), "everything to go")
+    wait_for(lambda: gone(world, namespace), "the Application and its child objects to be deleted")
 
 
 def test_grant_is_deleted_if_finalizer_was_removed_by_hand(
@@ -552,14 +567,14 @@ def test_grant_is_deleted_if_finalizer_was_removed_by_hand(
     world.api.merge(world.path(traffic(namespace)), {"metadata": {"finalizers": None}})
     assert world.grants(namespace)
     operator.start()
-    wait_for(lambda: not world.grants(namespace), "orphaned grants to go")
+    wait_for(lambda: not world.grants(namespace), "the orphaned Grants to be deleted")
 
 
 def test_recreated_application_gets_new_plan(world: World, operator: OperatorProcess, namespace: str) -> None:
     running(world, namespace)
     old = (world.application(namespace) or {})["metadata"]["uid"]
     world.api.delete(world.path(traffic(namespace)))
-    wait_for(lambda: world.application(namespace) is None, "the application to go")
+    wait_for(lambda: world.application(namespace) is None, "the Application to be deleted")
     world.put(traffic(namespace, "traffic", navigator()))
     world.phase(namespace, "Deploying")
     wait_for(
@@ -641,7 +656,7 @@ def test_grant_with_modified_signature_is_signed_again(world: World, operator: O
     assert second > first
     world.api.merge(path, {"spec": {"limits": {"maxSpeed": 300}}})
     wait_for(lambda: issued() > second and sound(), "what was granted")
-    assert observed[-1]["spec"]["limits"]["maxSpeed"] < 300, "what another wrote is never signed"
+    assert observed[-1]["spec"]["limits"]["maxSpeed"] < 300, "the operator signed a change of another client"
 
 
 def test_nodes_get_location_labels(world: World, operator: OperatorProcess) -> None:
@@ -670,7 +685,7 @@ def test_node_has_guarded_label_while_tainted(world: World, operator: OperatorPr
         taint("NoSchedule", "NoExecute")
         wait_for(guarded, "the node's label")
         taint("NoSchedule")
-        wait_for(lambda: not guarded(), "the label to go")
+        wait_for(lambda: not guarded(), "the label to be removed")
         assert _geohash(world, "edge-1")
     finally:
         taint()
@@ -703,20 +718,20 @@ def test_change_in_flight_waits_for_landing(world: World, operator: OperatorProc
     manifest = traffic(namespace)
     manifest["spec"]["components"][0]["container"]["env"] = [{"name": "COLOUR", "value": "red"}]
     world.put(manifest)
-    waits = wait_for(lambda: world.condition(namespace, "Updated"), "the change to wait")
+    waits = wait_for(lambda: world.condition(namespace, "Updated"), "the condition Updated")
     assert (waits["status"], waits["reason"]) == ("False", "WaitsForLanding")
     assert "when drone-1 has landed" in waits["message"]
     assert world.status(namespace)["phase"] == "Flying"
     world.put(fractus_object("Policy", "low", {"type": "LimitControl", "kind": "altitude", "upperLimit": 15}))
     wait_for(
         lambda: all("low" in [p["name"] for p in g["spec"].get("policies", [])] for g in world.grants(namespace)),
-        "the policy, which waits for nothing",
+        "the new policy in all Grants during the flight",
     )
     after = versions(world, namespace)
     assert {n for n in before if before[n] != after[n] and not n.startswith("grants/")} == set()
     world.drone_status("drone-1", "inactive")
     wait_for(lambda: driver_env(world, namespace).get("COLOUR") == "red", "the change")
-    wait_for(lambda: not world.condition(namespace, "Updated"), "the condition to go")
+    wait_for(lambda: not world.condition(namespace, "Updated"), "the condition Updated to be removed")
 
 
 def test_immediate_change_is_applied_in_flight(world: World, operator: OperatorProcess, namespace: str) -> None:
@@ -739,7 +754,7 @@ def test_change_pending_at_end_of_mission_starts_another_mission(
     manifest = traffic(namespace)
     manifest["spec"]["components"][0]["container"]["env"] = [{"name": "COLOUR", "value": "red"}]
     world.put(manifest)
-    wait_for(lambda: world.condition(namespace, "Updated"), "the change to wait")
+    wait_for(lambda: world.condition(namespace, "Updated"), "the condition Updated")
     end_mission(world, namespace, "Complete", "done")
     world.phase(namespace, "Queued")
     world.drone_status("drone-1", "inactive")
@@ -768,7 +783,7 @@ def test_field_removed_from_spec_is_removed(world: World, operator: OperatorProc
     container["env"] = container["env"][1:]
     del container["args"]
     world.put(manifest)
-    wait_for(lambda: "args" not in made(), "the arguments to go")
+    wait_for(lambda: "args" not in made(), "the arguments to be removed")
     assert {"COLOUR", "SIZE"} & {variable["name"] for variable in made()["env"]} == {"SIZE"}
     metadata = (world.api.get(path) or {})["metadata"]
     assert metadata["generation"] == generation + 1
@@ -783,5 +798,11 @@ def test_removed_passenger_is_deleted(world: World, operator: OperatorProcess, n
     world.put(traffic(namespace, "traffic", navigator(), passenger, store))
     deployed(world, namespace, pods=3)
     world.put(traffic(namespace, "traffic", navigator(), store))
-    wait_for(lambda: "deployments/traffic-aerial-viewer" not in world.children(namespace), "the passenger to go")
-    wait_for(lambda: [g["spec"]["component"] for g in world.grants(namespace)] == ["Navigator"], "its grant to go")
+    wait_for(
+        lambda: "deployments/traffic-aerial-viewer" not in world.children(namespace),
+        "the Deployment of the passenger to be deleted",
+    )
+    wait_for(
+        lambda: [g["spec"]["component"] for g in world.grants(namespace)] == ["Navigator"],
+        "the Grant of the passenger to be deleted",
+    )

@@ -1,4 +1,4 @@
-"""Changes around a plan: new, deleted and cordoned nodes, shared flights, other releases, and two operators."""
+"""Changes after planning: shared flights, new, deleted and cordoned nodes, another release, a second operator."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def guest(namespace: str, name: str = "guest", points: list[Body] | None = None)
 
 
 def instances(world: World, namespace: str, prefix: str) -> set[str]:
-    """Return the names of the Deployments with a prefix."""
+    """Return the names of the Deployments that begin with a prefix."""
     names = {n.removeprefix("deployments/") for n in world.children(namespace) if n.startswith("deployments/")}
     return {name for name in names if name.startswith(prefix)}
 
@@ -36,7 +36,7 @@ def drone_of(world: World, namespace: str, name: str) -> Body:
     return plan["spec"].get("drone") or {}
 
 
-# -- coming along --
+# -- shared flights --
 
 
 def test_guest_shares_flight_and_completes_with_host(world: World, operator: OperatorProcess, namespace: str) -> None:
@@ -46,7 +46,7 @@ def test_guest_shares_flight_and_completes_with_host(world: World, operator: Ope
     assert drone_of(world, namespace, "guest")["sharedWith"] == f"{namespace}/traffic"
     (grant,) = world.grants(namespace, "guest")
     assert (grant["spec"]["node"], grant["spec"].get("tour")) == ("drone-1", None)
-    # The guest's grant claims no drone: the host keeps its drone, also after a restart of the operator.
+    # The guest's Grant does not assign the drone to the guest, so the host keeps it, also after a restart.
     operator.stop()
     operator.start()
     world.drone_status("drone-1", "flying")
@@ -56,7 +56,7 @@ def test_guest_shares_flight_and_completes_with_host(world: World, operator: Ope
     world.phase(namespace, "Flying")
     end_mission(world, namespace, "Complete", "done")
     world.phase(namespace, "Returning", "guest")
-    wait_for(lambda: not world.grants(namespace, "guest"), "the guest's grants to go")
+    wait_for(lambda: not world.grants(namespace, "guest"), "the Grants of the guest to be deleted")
     world.drone_status("drone-1", "inactive")
     status = world.phase(namespace, "Completed", "guest")
     assert status["message"] == f"{namespace}/traffic has flown drone-1 past all points of interest"
@@ -71,9 +71,9 @@ def test_guest_gets_another_drone_when_shared_flight_fails(
     world.drone_status("drone-1", "flying")
     end_mission(world, namespace, "Failed", "driver lost")
     world.phase(namespace, "Returning")
-    wait_for(lambda: world.status(namespace, "guest").get("phase") == "Queued", "the guest to wait")
+    wait_for(lambda: world.status(namespace, "guest").get("phase") == "Queued", "the guest to be Queued")
     wait_for(lambda: "SharedFlightLost" in events(world, namespace), "an Event")
-    wait_for(lambda: not world.grants(namespace, "guest"), "the guest's grants to go")
+    wait_for(lambda: not world.grants(namespace, "guest"), "the Grants of the guest to be deleted")
     world.add_drone("drone-2")
     assert world.phase(namespace, "Deploying", "guest")["drone"] == "drone-2"
     assert "sharedWith" not in drone_of(world, namespace, "guest")
@@ -81,7 +81,7 @@ def test_guest_gets_another_drone_when_shared_flight_fails(
     assert [(round(p["lat"], 6), p["alt"]) for p in grant["spec"]["tour"]] == [
         (round(p["lat"], 6), p["alt"]) for p in VISITS
     ]
-    # Without a driver, the node reports the result of the tour on the guest's grant.
+    # The guest now has a separate flight without a driver. The node reports its result in the guest's Grant.
     report = {"status": {"phase": "Complete", "message": "all points were visited"}}
     world.api.merge(f"{FRACTUS}/grants/{namespace}.guest-camera/status", report)
     assert world.phase(namespace, "Completed", "guest")["message"] == "all points were visited"
@@ -95,11 +95,11 @@ def test_guest_leaves_host_with_changed_path(world: World, operator: OperatorPro
     manifest = traffic(namespace)
     manifest["spec"]["components"][0]["controlPoints"][0]["path"] = [at(0, 0, alt=10), at(60, 0, alt=20)]
     world.put(manifest)
-    wait_for(lambda: drone_of(world, namespace, "guest").get("node") == "drone-2", "another drone for the guest")
+    wait_for(lambda: drone_of(world, namespace, "guest").get("node") == "drone-2", "the guest to have drone-2")
     assert world.status(namespace)["drone"] == "drone-1"
 
 
-# -- nodes that come and go --
+# -- deleted, cordoned and new nodes --
 
 
 def test_deleted_or_cordoned_node_is_replaced(world: World, operator: OperatorProcess, namespace: str) -> None:
@@ -115,7 +115,7 @@ def test_deleted_or_cordoned_node_is_replaced(world: World, operator: OperatorPr
             instances(world, namespace, "traffic-ground")
             == {"traffic-ground-viewer-edge-4", "traffic-ground-viewer-edge-3"}
         ),
-        lambda: f"the node that is left: {instances(world, namespace, 'traffic-ground')}",
+        lambda: f"an instance on the remaining node: {instances(world, namespace, 'traffic-ground')}",
     )
     world.api.merge("/api/v1/nodes/edge-4", {"spec": {"unschedulable": True}})
     wait_for(
@@ -123,7 +123,7 @@ def test_deleted_or_cordoned_node_is_replaced(world: World, operator: OperatorPr
             instances(world, namespace, "traffic-ground")
             == {"traffic-ground-viewer-edge-1", "traffic-ground-viewer-edge-3"}
         ),
-        lambda: f"the cordoned node to be left: {instances(world, namespace, 'traffic-ground')}",
+        lambda: f"the instance to be moved from the cordoned node: {instances(world, namespace, 'traffic-ground')}",
     )
     assert world.status(namespace)["drone"] == "drone-1"
 
@@ -134,7 +134,7 @@ def test_cordoned_drone_is_kept_in_flight_and_replaced_on_ground(
     running(world, namespace)
     world.api.merge("/api/v1/nodes/drone-1", {"spec": {"unschedulable": True}})
     # No other drone exists, so the plan is kept.
-    wait_for(lambda: world.status(namespace).get("drone") == "drone-1", "the plan to stand")
+    wait_for(lambda: world.status(namespace).get("drone") == "drone-1", "drone-1 in the status")
     world.drone_status("drone-1", "flying")
     world.add_drone("drone-2")
     world.put(traffic(namespace, "second"))
@@ -179,7 +179,7 @@ def test_policy_conflict_is_reported_before_takeoff_until_policy_is_deleted(
     assert world.status(namespace)["phase"] == "Waiting"
     wait_for(lambda: "PolicyConflict" in events(world, namespace), "the Event")
     world.api.delete(world.path(policy))
-    wait_for(lambda: not world.condition(namespace, "PolicyConflict"), "the condition to go")
+    wait_for(lambda: not world.condition(namespace, "PolicyConflict"), "the condition to be removed")
 
 
 # -- releases --
@@ -189,7 +189,7 @@ def test_grants_serialized_by_another_release_are_kept(world: World, operator: O
     running(world, namespace)
     operator.stop()
     for grant in world.grants(namespace):
-        # Simulate a release that writes defaults and an annotation of what it applied.
+        # Simulate a release that writes default values, and an annotation with a digest of what it applied.
         old = {"metadata": {"annotations": {"fractus.dev/applied": "of-old"}}, "spec": {"tour": [], "policies": []}}
         world.api.merge(f"{FRACTUS}/grants/{grant['metadata']['name']}", old)
     before = {g["metadata"]["name"]: g["metadata"]["resourceVersion"] for g in world.grants(namespace)}
@@ -197,7 +197,7 @@ def test_grants_serialized_by_another_release_are_kept(world: World, operator: O
     operator.start()
     path = f"/apis/apps/v1/namespaces/{namespace}/deployments/traffic-data-store"
     world.api.merge(path, {"spec": {"replicas": 3}})
-    wait_for(lambda: (world.api.get(path) or {})["spec"]["replicas"] == 1, "the end of a reconcile")
+    wait_for(lambda: (world.api.get(path) or {})["spec"]["replicas"] == 1, "the end of a reconciliation")
     assert {g["metadata"]["name"]: g["metadata"]["resourceVersion"] for g in world.grants(namespace)} == before
 
 
@@ -225,7 +225,7 @@ def test_second_operator_takes_over_from_frozen_leader(
         world.phase(namespace, "Deploying", "second")
         assert f"planned (application={namespace}/second " in second.log()
         first.signal(signal.SIGCONT)
-        wait_for(lambda: not first.running, "the first one to end")
+        wait_for(lambda: not first.running, "the first operator to exit")
         assert "two has acted since one last held the Lease" in first.log()
         assert f"planned (application={namespace}/second " not in first.log()
     finally:

@@ -1,4 +1,4 @@
-"""Running Applications in trouble: policies still reach their grants, and they keep their drones."""
+"""Running Applications with a problem: policies still reach their Grants, and they keep their drones."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ UNREADABLE = LOW | {"validFrom": "0000-01-01T00:00:00Z"}
 
 
 def granted(world: World, namespace: str, instance: str = "traffic-navigator") -> list[str]:
-    """Names of the policies in a grant."""
+    """Return the names of the policies in a Grant."""
     grant = world.api.get(f"{FRACTUS}/grants/{namespace}.{instance}") or {"spec": {}}
     return [policy["name"] for policy in grant["spec"].get("policies", [])]
 
 
 def reason(world: World, namespace: str, expected: str, name: str = "traffic") -> Body:
-    """The Ready condition, once it has this reason."""
+    """Wait until the condition Ready has this reason, and return the condition."""
 
     def reached() -> Body | None:
         condition = world.condition(namespace, "Ready", name)
@@ -59,11 +59,11 @@ def older_policies(world: World) -> Iterator[None]:
 def refusing(
     world: World, namespace: str, resource: str, operation: str, unless: str, probe: Callable[[], object]
 ) -> Iterator[None]:
-    """Let the API server refuse an operation on what a namespace has of a resource.
+    """Make the API server refuse an operation on the objects of a resource in one namespace.
 
     Args:
-        unless: A CEL expression that is true of what it is to let through.
-        probe: A dry run that it is to refuse.
+        unless: CEL expression that is true for objects that the API server still accepts.
+        probe: Dry run of a request that must be refused. The block starts when it is.
     """
     root = "/apis/admissionregistration.k8s.io/v1"
     name = f"refuse-{operation.lower()}-{resource}"
@@ -91,7 +91,7 @@ def refusing(
         about = {"apiVersion": "admissionregistration.k8s.io/v1", "kind": kind, "metadata": {"name": name}}
         world.api.apply(path, about | {"spec": spec})
     try:
-        wait_for(refused, "the API server to refuse it")
+        wait_for(refused, "the API server to refuse the operation")
         yield
     finally:
         for path in objects:
@@ -99,13 +99,13 @@ def refusing(
 
 
 def undeletable_secrets(world: World, namespace: str) -> AbstractContextManager[None]:
-    """Let the API server refuse to delete the Secrets of a namespace."""
+    """Make the API server refuse deletions of Secrets in a namespace."""
     path = f"/api/v1/namespaces/{namespace}/secrets/traffic-navigator-tls?dryRun=All"
     return refusing(world, namespace, "secrets", "DELETE", "false", lambda: world.api.call("DELETE", path))
 
 
 def unstoppable_pods(world: World, namespace: str) -> AbstractContextManager[None]:
-    """Let the API server refuse to give the pods of a namespace a deadline."""
+    """Make the API server refuse pod updates that set activeDeadlineSeconds, with which the operator stops pods."""
     path = f"/api/v1/namespaces/{namespace}/pods/{world.pods(namespace)[0]['metadata']['name']}?dryRun=All"
     stopped = {"spec": {"activeDeadlineSeconds": 1}}
     without = "!has(object.spec.activeDeadlineSeconds)"
@@ -144,12 +144,12 @@ def _foreign_deployment(world: World, namespace: str) -> None:
 
 
 def _in_trouble(world: World, namespace: str, trouble: Any) -> None:
-    """An application that runs, and has got into trouble since."""
+    """Run an Application, cause a problem, and wait until its condition Ready reports the problem."""
     running(world, namespace)
     trouble(world, namespace)
     wait_for(
         lambda: world.condition(namespace, "Ready").get("reason") not in (None, "PodsReady", "PodsNotReady"),
-        lambda: f"the trouble to show: {world.status(namespace)}",
+        lambda: f"the condition Ready to report the problem: {world.status(namespace)}",
     )
 
 
@@ -159,9 +159,9 @@ def test_policy_change_reaches_grant_of_application_in_trouble(
 ) -> None:
     _in_trouble(world, namespace, trouble)
     world.put(fractus_object("Policy", "low", LOW))
-    wait_for(lambda: granted(world, namespace) == ["low"], lambda: f"the policy: {operator.log()[-3000:]}")
+    wait_for(lambda: granted(world, namespace) == ["low"], lambda: f"the policy in the Grant: {operator.log()[-3000:]}")
     world.api.delete(f"{FRACTUS}/policies/low")
-    wait_for(lambda: granted(world, namespace) == [], "the policy to go")
+    wait_for(lambda: granted(world, namespace) == [], "the removal of the policy from the Grant")
 
 
 def _without_depot(world: World, namespace: str) -> None:
@@ -172,7 +172,7 @@ def _without_depot(world: World, namespace: str) -> None:
 def test_certificate_is_renewed_for_application_in_trouble(
     world: World, operator: OperatorProcess, namespace: str, trouble: Any
 ) -> None:
-    """Certificates last for a day, and an Application may wait longer for a node or a correction."""
+    """Certificates expire after a day. An Application may wait longer than that for a node or a correction."""
     _in_trouble(world, namespace, trouble)
     deployment = f"/apis/apps/v1/namespaces/{namespace}/deployments/traffic-navigator"
     secret = f"/api/v1/namespaces/{namespace}/secrets/traffic-navigator-tls"
@@ -194,7 +194,9 @@ def test_refreshed_grant_keeps_previous_version_of_broken_policy(
     assert granted(world, namespace) == ["fence", "odd"]
     world.api.delete(f"{FRACTUS}/zones/school")
     with older_policies(world):
-        wait_for(lambda: let_in(world, fractus_object("Policy", "odd", UNREADABLE)), "the API server to let it in")
+        wait_for(
+            lambda: let_in(world, fractus_object("Policy", "odd", UNREADABLE)), "the API server to accept the policy"
+        )
     condition = wait_for(
         lambda: policy_ready(world, "odd").get("status") == "False" and policy_ready(world, "odd"), "it"
     )
@@ -202,7 +204,7 @@ def test_refreshed_grant_keeps_previous_version_of_broken_policy(
     world.put(fractus_object("Policy", "slow", {"type": "LimitControl", "kind": "speed", "upperLimit": 3}))
     wait_for(
         lambda: granted(world, namespace) == ["fence", "odd", "slow"],
-        "the new policy in addition to the policies in the Grant",
+        "the new policy in the Grant, in addition to the previous policies",
     )
     assert world.status(namespace)["phase"] == "Waiting"
     # A new Application gets no grant while the scope of the unreadable policy is unknown.
@@ -215,7 +217,7 @@ def test_refreshed_grant_keeps_previous_version_of_broken_policy(
     world.phase(namespace, "Deploying", "second")
 
 
-# -- who has the drone --
+# -- assignment of the drone --
 
 
 def test_returning_drone_belongs_to_no_application(world: World, operator: OperatorProcess, namespace: str) -> None:
@@ -228,7 +230,7 @@ def test_returning_drone_belongs_to_no_application(world: World, operator: Opera
     world.put(again)
     world.phase(namespace, "Queued")
     world.drone_status("drone-1", "inactive", ready="False")
-    # The Application has no claim any more, so the requirements of a new mission are checked again.
+    # The drone no longer belongs to the Application, so the requirements of the new mission are checked again.
     reason(world, namespace, "NoDrone")
     world.drone_status("drone-1", "inactive")
     world.phase(namespace, "Deploying")
@@ -240,7 +242,7 @@ def test_recreated_application_waits_for_drone_of_deleted_one(
     running(world, namespace)
     world.drone_status("drone-1", "flying")
     world.api.delete(world.path(traffic(namespace)))
-    wait_for(lambda: gone(world, namespace), "the application to go")
+    wait_for(lambda: gone(world, namespace), "the Application to be deleted")
     world.put(traffic(namespace))
     world.phase(namespace, "Queued")
     assert not world.grants(namespace)
@@ -265,7 +267,7 @@ def test_plan_with_older_grant_keeps_drone_of_two_plans(
     world.api.merge(path, {"spec": spec})
     operator.start()
     world.phase(namespace, "Queued", "second")
-    wait_for(lambda: not world.grants(namespace, "second"), "its grants to go")
+    wait_for(lambda: not world.grants(namespace, "second"), "the Grants of the second Application to be deleted")
     assert {g["spec"]["node"] for g in world.grants(namespace)} >= {"drone-1"}
 
 
@@ -273,10 +275,12 @@ def test_plan_with_older_grant_keeps_drone_of_two_plans(
 
 
 def reconciled(world: World, namespace: str) -> None:
-    """Wait for the end of a reconciliation, whose last step reverts a manual change of this function."""
+    """Wait for the end of a reconciliation: change the replicas of a Deployment, and wait until they are reset."""
     path = f"/apis/apps/v1/namespaces/{namespace}/deployments/traffic-data-store"
     world.api.merge(path, {"spec": {"replicas": 3}})
-    wait_for(lambda: (world.api.get(path) or {})["spec"]["replicas"] == 1, "the number of replicas")
+    wait_for(
+        lambda: (world.api.get(path) or {})["spec"]["replicas"] == 1, "the operator to reset the number of replicas"
+    )
 
 
 def test_deleted_drone_in_flight_keeps_its_grants(world: World, operator: OperatorProcess, namespace: str) -> None:
@@ -313,29 +317,31 @@ def test_refused_teardown_is_retried(world: World, operator: OperatorProcess, na
     with undeletable_secrets(world, namespace):
         world.api.delete(f"{FRACTUS}/namespaces/{namespace}/applications/traffic")
         wait_for(lambda: "failed temporarily" in operator.log(), "the teardown to fail")
-        assert not world.grants(namespace), "grants are deleted first"
+        assert not world.grants(namespace), "the Grants were not deleted before the Secrets"
         assert world.application(namespace) is not None
-    wait_for(lambda: world.application(namespace) is None, lambda: f"the end: {operator.log()[-3000:]}")
-    assert "is cancelled" not in operator.log(), "the end of an Application causes no warning"
+    wait_for(
+        lambda: world.application(namespace) is None, lambda: f"the Application to be deleted: {operator.log()[-3000:]}"
+    )
+    assert "is cancelled" not in operator.log(), "the deletion of the Application caused a warning"
 
 
 @pytest.mark.parametrize("restarted", [False, True], ids=["running", "restarted"])
 def test_application_deleted_at_end_of_mission_leaves_no_pods(
     world: World, operator: OperatorProcess, namespace: str, *, restarted: bool
 ) -> None:
-    """A user deletes the Application when it is Completed: its pods have lost one owner and have no other yet."""
+    """A user deletes the completed Application while its pods have no owner between two owners."""
     world.put(traffic(namespace, "traffic", navigator()))
     deployed(world, namespace, pods=1)
     with unstoppable_pods(world, namespace):
         end_mission(world, namespace, "Complete", "done")
         wait_for(
             lambda: all(not pod["metadata"].get("ownerReferences") for pod in world.pods(namespace)),
-            "the pod to lose its owner",
+            "the pod to have no owner",
         )
         if restarted:
             operator.stop(signal.SIGKILL)
         world.api.delete(f"{FRACTUS}/namespaces/{namespace}/applications/traffic")
         if restarted:
             operator.start()
-        wait_for(lambda: world.application(namespace) is None, "the application to go")
+        wait_for(lambda: world.application(namespace) is None, "the Application to be deleted")
         assert not world.pods(namespace)

@@ -15,13 +15,13 @@ Body = dict[str, Any]
 
 
 def targets(world: World, namespace: str, name: str = "traffic") -> dict[str, Any]:
-    """Return the address of the pod behind each link by node, or None if it has no pod."""
+    """Return the target address of each DirectLink by node: the IP of a pod, or None if the link has no target."""
     links = world.links(namespace, name).items()
     return {node: (body["spec"]["services"][0].get("target") or {}).get("address") for node, body in links}
 
 
 def checkers(world: World, namespace: str) -> dict[str, Body]:
-    """The pods of the hybrid component on edge nodes, by node."""
+    """Return the pods of the hybrid component on edge nodes, by node."""
     pods = [p for p in world.pods(namespace) if p["metadata"]["labels"]["fractus.dev/component"] == "ImageChecker"]
     return {pod["spec"]["nodeName"]: pod for pod in pods if pod["spec"]["nodeName"] != "cloud-1"}
 
@@ -47,7 +47,7 @@ def test_direct_links_target_pods_usable_by_drone(world: World, operator: Operat
 
 
 def restarted(world: World, namespace: str, pod: Body, ip: str) -> None:
-    """Play scheduler and kubelet for the successor of a pod."""
+    """Delete a pod, and bind and start its successor like scheduler and kubelet."""
     pods = f"/api/v1/namespaces/{namespace}/pods"
     world.api.delete(f"{pods}/{pod['metadata']['name']}", grace_s=0)
 
@@ -63,7 +63,7 @@ def restarted(world: World, namespace: str, pod: Body, ip: str) -> None:
 
 
 def base_addresses(world: World, namespace: str) -> list[str]:
-    """Return the addresses to which the cloud path of the hybrid component leads."""
+    """Return the pod addresses to which calls of the hybrid component go over the cloud path."""
     path = f"/apis/discovery.k8s.io/v1/namespaces/{namespace}/endpointslices/traffic-image-checker"
     return [a for endpoint in (world.api.get(path) or {}).get("endpoints") or () for a in endpoint["addresses"]]
 
@@ -80,7 +80,8 @@ def test_direct_links_and_cloud_path_follow_restarted_pods(
         manifest["spec"]["components"][0]["container"]["image"] = "registry.test/component:2"
         world.put(manifest)
         wait_for(
-            lambda: "WaitsForLanding" in str(world.status(namespace)), lambda: f"to wait; {world.status(namespace)}"
+            lambda: "WaitsForLanding" in str(world.status(namespace)),
+            lambda: f"the status to contain WaitsForLanding; {world.status(namespace)}",
         )
     elif change == "cannot be planned":
         manifest["spec"]["updatePolicy"] = "Immediate"
@@ -89,12 +90,14 @@ def test_direct_links_and_cloud_path_follow_restarted_pods(
         world.phase(namespace, "Invalid")
     ((node, pod),) = checkers(world, namespace).items()
     restarted(world, namespace, pod, "10.1.9.9")
-    wait_for(lambda: targets(world, namespace)[node] == "10.1.9.9", "the target to follow")
+    wait_for(lambda: targets(world, namespace)[node] == "10.1.9.9", "the new address of the edge pod in the DirectLink")
     base = next(
         p for p in world.pods(namespace) if p["metadata"]["labels"]["fractus.dev/instance"] == "traffic-image-checker"
     )
     restarted(world, namespace, base, "10.1.9.8")
-    wait_for(lambda: base_addresses(world, namespace) == ["10.1.9.8"], "the cloud path to follow")
+    wait_for(
+        lambda: base_addresses(world, namespace) == ["10.1.9.8"], "the new address of the base pod in the EndpointSlice"
+    )
 
 
 def test_direct_link_status_survives_operator_restart(world: World, operator: OperatorProcess, namespace: str) -> None:
@@ -104,11 +107,11 @@ def test_direct_link_status_survives_operator_restart(world: World, operator: Op
     reported = world.api.merge(f"{path}/status", {"status": {"phase": "Up", "traffic": "direct", "switches": 3}})
     operator.stop()
     operator.start()
-    # The new operator has processed all objects when it has created this Service again.
+    # When the new operator has created this Service again, it has processed all objects.
     service = f"/api/v1/namespaces/{namespace}/services/traffic-data-store"
     world.api.delete(service)
-    wait_for(lambda: world.api.get(service), "the Service to be made again")
-    wait_for(lambda: world.condition(namespace, "Ready").get("status") == "True", "all to be well")
+    wait_for(lambda: world.api.get(service), "the Service to be created again")
+    wait_for(lambda: world.condition(namespace, "Ready").get("status") == "True", "the Application to be Ready")
     assert world.api.get(path) == reported
 
 
@@ -138,8 +141,8 @@ def test_direct_links_of_another_release_are_corrected(world: World, operator: O
     world.api.call("PATCH", f"{FRACTUS}/directlinks/{name}", steps, content_type=ContentType.JSON_PATCH)
     world.put(left_over)
     operator.start()
-    wait_for(lambda: world.links(namespace)[node]["spec"] == link["spec"], "the link to be corrected")
-    wait_for(lambda: "long-ago" not in world.links(namespace), "the link that no plan knows to go")
+    wait_for(lambda: world.links(namespace)[node]["spec"] == link["spec"], "the DirectLink to be corrected")
+    wait_for(lambda: "long-ago" not in world.links(namespace), "the DirectLink without a plan to be deleted")
 
 
 def test_direct_links_follow_drone_and_end_with_mission(
@@ -154,19 +157,21 @@ def test_direct_links_follow_drone_and_end_with_mission(
     def moved() -> bool:
         return {body["spec"]["drone"] for body in world.links(namespace).values()} == {"drone-2"}
 
-    wait_for(moved, lambda: f"links of drone-2; {world.links(namespace)}")
+    wait_for(moved, lambda: f"the DirectLinks of drone-2; {world.links(namespace)}")
     assert set(world.links(namespace)) == nodes
     world.api.delete(f"{FRACTUS}/edgenodes/{min(nodes)}")
-    wait_for(lambda: min(nodes) not in world.links(namespace), "the link to the node that is gone to go")
+    wait_for(lambda: min(nodes) not in world.links(namespace), "the DirectLink of the deleted node to be deleted")
     world.drone_status("drone-2", "flying")
     end_mission(world, namespace, "Complete", "done")
-    wait_for(lambda: not world.links(namespace), "the links to go")
+    wait_for(lambda: not world.links(namespace), "the DirectLinks to be deleted")
 
 
 def test_direct_links_are_deleted_with_application(world: World, operator: OperatorProcess, namespace: str) -> None:
     running(world, namespace)
     world.api.delete(world.path(traffic(namespace)))
-    wait_for(lambda: gone(world, namespace), lambda: f"everything to go; {world.children(namespace).keys()}")
+    wait_for(
+        lambda: gone(world, namespace), lambda: f"all child objects to be deleted; {world.children(namespace).keys()}"
+    )
 
 
 def test_direct_links_without_application_are_deleted(world: World, operator: OperatorProcess, namespace: str) -> None:
@@ -177,7 +182,7 @@ def test_direct_links_without_application_are_deleted(world: World, operator: Op
     world.api.merge(path, {"metadata": {"finalizers": None}})
     assert world.links(namespace)
     operator.start()
-    wait_for(lambda: not world.links(namespace), "the links to go")
+    wait_for(lambda: not world.links(namespace), "the DirectLinks to be deleted")
 
 
 def test_direct_links_of_two_applications_on_one_drone_are_separate(
@@ -194,10 +199,10 @@ def test_direct_links_of_two_applications_on_one_drone_are_separate(
     guests = world.links(namespace, "guest")
     hosts = world.links(namespace)
     assert {body["spec"]["drone"] for body in [*guests.values(), *hosts.values()]} == {"drone-1"}
-    # The host flies, so both have the path of the host.
+    # Both Applications share the flight of the host, so the DirectLinks of both contain its path.
     assert next(iter(guests.values()))["spec"]["path"] == next(iter(hosts.values()))["spec"]["path"]
     world.api.delete(f"{FRACTUS}/namespaces/{namespace}/applications/guest")
-    wait_for(lambda: not world.links(namespace, "guest"), "the guest's links to go")
+    wait_for(lambda: not world.links(namespace, "guest"), "the DirectLinks of the guest to be deleted")
     assert {n: b["metadata"]["uid"] for n, b in world.links(namespace).items()} == {
         n: b["metadata"]["uid"] for n, b in hosts.items()
     }

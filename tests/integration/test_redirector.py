@@ -34,7 +34,7 @@ def world() -> Iterator[Rig]:
 @pytest.fixture
 def redirector(world: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Redirector]:
     """The redirector of the drone, with access to the namespaces of the drone and its pod."""
-    monkeypatch.setattr(module, "LEASE_S", 60.0)  # a client may take long to start
+    monkeypatch.setattr(module, "LEASE_S", 60.0)  # longer than the start of a client on a busy machine
     conntrack = Conntrack(world.netlink("drone"))
     (tmp_path / "pod").symlink_to(world.path("dpod"))
     redirector = Redirector(world.maps("drone"), conntrack, PodNamespaces(tmp_path, node_namespace=world.path("drone")))
@@ -189,7 +189,7 @@ async def test_a_hundred_switches_end_in_the_last_state(world: Rig, redirector: 
     for number in range(100):
         await redirector.switch(TO_CLOUD if number % 2 else TO_EDGE, planned=bool(number % 3))
     assert redirector.redirects == {}
-    await asyncio.to_thread(responses, client)  # may be complete before the last switch
+    await asyncio.to_thread(responses, client)  # the client may have ended before the last switch
     assert await asyncio.to_thread(call_once, world) == "cloud"
 
 
@@ -280,12 +280,12 @@ def test_only_allowed_callers_are_redirected(world: Rig, redirector: Redirector)
     assert call_once(world) == "edge"
     assert call_once(world, other) == "cloud"
     assert call_once(world, "drone") == "cloud"
-    # Allow this pod, and a client in the host network, which calls from the address of its route.
+    # Allow the other pod, and clients in the node's host network: they use the node's address on the uplink.
     redirector.set_services([VIP], {VIP: frozenset(map(IPv4Address, ("10.86.0.2", "10.90.0.1")))})
     assert call_once(world, other) == "edge"
     assert call_once(world, "drone") == "edge"
     assert call_once(world) == "cloud"
-    # After the table was removed, the new table contains the callers from the beginning.
+    # When the removed table is created again, it contains the allowed callers from the beginning.
     run(*world.inside("drone"), "nft", "flush", "ruleset")
     redirector.set_peers([])  # writes the whole table except the callers
     assert call_once(world) == "cloud"

@@ -24,7 +24,7 @@ class CommandFailed(AssertionError):
 
 @dataclass(frozen=True)
 class Kube:
-    """kubectl on one cluster."""
+    """Runs kubectl on one cluster."""
 
     kubectl: pathlib.Path
     kubeconfig: pathlib.Path

@@ -93,7 +93,7 @@ def until(condition: Callable[[], Any], description: str, timeout_s: float = 40.
 
 
 def leftovers(name: str) -> list[str]:
-    """Return mounts, namespaces, control groups, files, claims, links and processes of a cluster on this machine."""
+    """Return everything that a cluster has left on this machine, such as mounts, namespaces, files and processes."""
     remains = [f"mount {line}" for line in Path("/proc/self/mountinfo").read_text().splitlines() if f"/{name}/" in line]
     remains += [f"netns {p}" for p in Path("/run/netns").glob(f"fractus.{name}*")]
     # os.walk ignores control groups of other clusters that are removed during the walk.

@@ -217,7 +217,7 @@ def test_deployments_create_no_pods_with_access_to_the_node(alices: Kube) -> Non
     assert not alices.all("pods", NAMESPACE, "app=grasps")
 
 
-def test_pending_pod_gets_no_toleration_of_drones_later(alices: Kube) -> None:
+def test_toleration_of_drones_cannot_be_added_to_pending_pod(alices: Kube) -> None:
     waiting = host_network_pod("waiting")
     waiting["spec"]["schedulingGates"] = [{"name": "example.com/later"}]
     tolerations = waiting["spec"].pop("tolerations")

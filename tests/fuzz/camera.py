@@ -143,7 +143,7 @@ async def _ended(running: list[asyncio.Task[None]]) -> None:
 
 
 def _named(data_provider: atheris.FuzzedDataProvider, service: Service, name: str) -> bytes:
-    """Return a request with a valid size, or with the name of an existing picture of either component."""
+    """Return a request with a valid or extreme size, or with the name of an existing picture of either component."""
     if name == "CaptureImage":
         sizes = [0, 16, 48, 64, 2**32 - 1]
         return bytes(

@@ -1,4 +1,4 @@
-"""Fuzz manifests: each is refused with one sentence, or all of its applications are planned or refused.
+"""Fuzz manifests. Each file is refused with one sentence, or each of its Applications is planned or refused.
 
 The input is the content of a file, or selects changes of the example's objects: values, location, spelling. Such changes reach
 deeper than arbitrary bytes. Plans can be serialised, and their Grants can be compiled.
@@ -53,7 +53,7 @@ SPELLINGS = [
 logging.disable(logging.CRITICAL)
 
 Place = tuple[Any, Any]
-"""A list or object, and the index or key of a value."""
+"""A list or object, and the index or key of a value in it."""
 
 
 def places(inside: Any) -> Iterator[Place]:

@@ -51,7 +51,7 @@ def accepted(frame: bytes, noise: bytes) -> Message:
 
 
 def check_unsigned(frame: bytes, kind: MessageClass) -> None:
-    """Check that a signed link accepts no frame without a signature except that of a modem."""
+    """Check that a signed link accepts no unsigned frames except RADIO_STATUS, which radio modems send."""
     messages = signed_link().decode(frame)
     assert [message.name for message in messages] == ["RADIO_STATUS"] * (kind.msgname == "RADIO_STATUS")
     assert not any(message.signed for message in messages)
@@ -77,7 +77,7 @@ def parsed(data: bytes) -> list[Message]:
 
 
 def check_encoded_again(message: Message) -> None:
-    """Check that a received message can be sent and is received as the same."""
+    """Check that a received message can be encoded and decoded again without a change."""
     (decoded,) = Parser().feed(Endpoint(1, 1).encode(message.name, message.values))
     assert repr(decoded.values) == repr(message.values)
 

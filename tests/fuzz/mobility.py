@@ -107,7 +107,9 @@ class Flight:
                     raise AssertionError("a task of the service failed") from task.exception()
             if spoofed:
                 return
-            assert self._driven or toured or not world.plane.vehicle.armed, "no one drove"
+            assert self._driven or toured or not world.plane.vehicle.armed, (
+                "the vehicle is armed without a call of a driver"
+            )
             for x, y, _ in world.plane.trace:
                 assert max(abs(x), abs(y)) < AREA_M + NEAR_M, (x, y)
                 assert not (WALL[0] + NEAR_M < x < WALL[2] - NEAR_M and WALL[1] + NEAR_M < y < WALL[3] - NEAR_M), (x, y)

@@ -24,7 +24,7 @@ _BEGIN = datetime(2020, 1, 1, tzinfo=UTC)
 
 
 def certificate(*uris: str, days: int = 36500) -> bytes:
-    """Return a certificate with these identities."""
+    """Return a certificate with the given identities."""
     name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "fuzz")])
     builder = (
         x509.CertificateBuilder().subject_name(name).issuer_name(name).public_key(_KEY.public_key()).serial_number(1)
@@ -100,7 +100,7 @@ class Registry:
         self.handlers: dict[str, grpc.RpcMethodHandler] = {}
 
     def add_generic_rpc_handlers(self, _handlers: object) -> None:
-        """Ignore the handlers, because generated code also passes them to the other method."""
+        """Ignore the handlers, because generated code also passes them to `add_registered_method_handlers`."""
 
     def add_registered_method_handlers(self, _service: str, handlers: dict[str, grpc.RpcMethodHandler]) -> None:
         """Store the handlers wrapped by the admission check, which runs before a request is decoded."""

@@ -80,7 +80,7 @@ class ApiServer(ControlPlane):
             os.kill(pid, signal.SIGCONT)
 
     def compact(self) -> None:
-        """Remove old revisions from etcd, so that the API server refuses watches from before with 410."""
+        """Remove old revisions from etcd, so that the API server refuses watches from these revisions with 410."""
         etcd = next(a for a in self._arguments() if a.startswith("--etcd-servers=")).split("=", 1)[1]
         key = base64.b64encode(b"/").decode()
         revision = _post(f"{etcd}/v3/kv/range", {"key": key})["header"]["revision"]
@@ -114,7 +114,7 @@ class ApiServer(ControlPlane):
         self._permit("agent", [tokens], AGENT)
 
     def publish(self, node: str) -> None:
-        """Create the objects of a node like the operator: its NodeGrants, and an account that may read it."""
+        """Create the objects of a node like the operator: its NodeGrants object, and an account that may read it."""
         if self.get(f"{ACCOUNTS}/{node}") is None:
             self.post(ACCOUNTS, {"metadata": {"name": node}})
         if self.get(f"{RBAC}/namespaces/{NODE_GRANTS_NAMESPACE}/roles/{node}") is None:

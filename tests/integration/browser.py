@@ -46,7 +46,7 @@ def serving(*arguments: str | Path) -> Iterator[str]:
 
 
 def wait_for_events(address: str, *words: str) -> None:
-    """Wait until the event stream contained all words. Check that the page is refused without the token."""
+    """Wait until the event stream has sent all words. Also check that the page is refused without the token."""
     plain, _, token = address.partition("?token=")
     with pytest.raises(urllib.error.HTTPError) as refused:
         urllib.request.urlopen(plain, timeout=20)
@@ -56,7 +56,7 @@ def wait_for_events(address: str, *words: str) -> None:
     with urllib.request.urlopen(request, timeout=20) as response:
         while missing:
             line = response.readline().decode()
-            assert line, f"the stream ended without {missing}"
+            assert line, f"the event stream ended before it sent {missing}"
             missing = {word for word in missing if word not in line}
 
 

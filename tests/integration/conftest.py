@@ -14,7 +14,7 @@ from control_plane import ControlPlane, programs
 from mobility_rig import Rig
 from operator_world import OperatorProcess, World, fresh_namespace
 
-# Background jobs of a shell ignore SIGINT, and nohup ignores SIGHUP. Programs that tests start would inherit this.
+# Background jobs of a shell ignore SIGINT, and nohup ignores SIGHUP. Programs that tests start would also ignore them.
 for number in (signal.SIGINT, signal.SIGHUP):
     if signal.getsignal(number) is signal.SIG_IGN:
         signal.signal(number, signal.default_int_handler)

@@ -35,7 +35,7 @@ _CONTROLLERS = (
 
 
 def programs() -> dict[str, Path]:
-    """Return the programs of a control plane. Build missing programs like `fractus cluster binaries`."""
+    """Return the programs of a control plane. Build missing programs, as `fractus cluster binaries` does."""
     paths = ensure_binaries(PROGRAMS, report=print)
     return {name: paths[name] for name in PROGRAMS}
 
@@ -69,7 +69,7 @@ class ControlPlane:
     Args:
         programs: Files of the programs.
         directory: Directory of data, keys and logs.
-        arguments: More arguments of some programs.
+        arguments: Additional arguments by program.
     """
 
     def __init__(
@@ -152,7 +152,7 @@ class ControlPlane:
         )
         wait_for(self.admin.ready, "the API server", timeout_s=60)
         if kinds:
-            # The garbage collector looks for new kinds only every 30 s, so install them before it starts.
+            # The garbage collector looks for new kinds only every 30 s, so install the CRDs before it starts.
             self._install_crds()
         self._run(
             "kube-controller-manager",

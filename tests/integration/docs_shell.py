@@ -18,7 +18,7 @@ class Shell:
 
     Args:
         folder: The working directory.
-        plane: Control plane for KUBECONFIG. None: KUBECONFIG is not set.
+        plane: Control plane that KUBECONFIG selects. If None, KUBECONFIG is not set.
     """
 
     def __init__(self, folder: Path, plane: ControlPlane | None = None) -> None:
@@ -31,7 +31,7 @@ class Shell:
             self.environment["KUBECONFIG"] = str(plane.kubeconfig)
 
     def type(self, line: str, code: int = 0) -> str:
-        """Run a line and return its standard output. Fail if its exit code, or that of a part of a pipe, is not as expected."""
+        """Run a line with pipefail, and return its standard output. Fail if its exit code is not `code`."""
         result = subprocess.run(
             ["bash", "-o", "pipefail", "-c", line], cwd=self._folder, env=self.environment, capture_output=True, text=True,
             timeout=TIMEOUT_S, check=False,

@@ -10,7 +10,7 @@ from PIL import Image
 def save(
     path: Path, lat: float, lon: float, amsl_m: float | None, colour: tuple[int, int, int] = (10, 200, 30)
 ) -> None:
-    """Write a picture with a GPS position like a camera."""
+    """Write a picture with a GPS position in its EXIF metadata, as a camera does."""
     path.parent.mkdir(parents=True, exist_ok=True)
     exif = Image.Exif()
 

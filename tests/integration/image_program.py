@@ -23,7 +23,7 @@ def modules(package: str) -> Iterator[str]:
 
 
 def check_bytecode() -> None:
-    """Fail if the bytecode of a module is checked against the time stamp of its source, because images reset time stamps."""
+    """Check that no bytecode file is validated by the time stamp of its source, because images reset time stamps."""
     for name, module in list(sys.modules.items()):
         source = getattr(module, "__file__", None) or ""
         if source.endswith(".py"):

@@ -37,7 +37,7 @@ async def main(node: str, files: Path, max_peers: int) -> None:
             emit("ended", session.peer)
 
     async def on_paired(session: Session) -> None:
-        while session.latency_ms is None:  # noqa: ASYNC110 - the session has no event for it
+        while session.latency_ms is None:  # noqa: ASYNC110 - the session has no event for its first latency
             await asyncio.sleep(0.01)
         emit("latency", f"{session.latency_ms:.1f}")
         await asyncio.Event().wait()

@@ -92,7 +92,7 @@ class Agent:
         self.add_radio()
         self.run("nft", "-f", "-", text=FOREIGN)
         self.certify(name)
-        # With this uplink, a direct link is faster even on a busy machine.
+        # The uplink is so slow that the direct link is the better path even on a busy machine.
         self.describe(uplink_mbps=1)
         self._process: subprocess.Popen[str] | None = None
         self._reading: threading.Thread | None = None
@@ -100,7 +100,7 @@ class Agent:
         self.statuses: dict[str, dict[str, Any]] = {}
 
     def add_pod(self) -> None:
-        """Create the namespace of the node's pod like a container runtime."""
+        """Create the network namespace of the node's pod, like a container runtime."""
         name = f"{self.name}p"
         net = f"10.88.{self.number}"
         self.world.namespace(name)
@@ -110,7 +110,7 @@ class Agent:
         run(*self.world.inside(name), "ip", "route", "add", "default", "via", f"{net}.1")
 
     def lose_power(self) -> None:
-        """Kill agent and pod, and remove all state that is not on disk."""
+        """Simulate a power loss: kill the agent and the pod, and remove all state that is not on disk."""
         self.kill()
         self.world.end(f"{self.name}p")
         self.run("ip", "link", "del", "pod0")
@@ -122,7 +122,7 @@ class Agent:
         self.add_pod()
 
     def describe(self, uplink_mbps: float) -> None:
-        """Write the node's description."""
+        """Write the node description."""
         interfaces = [
             {"technology": "4G", "bandwidth": uplink_mbps},
             {
@@ -208,7 +208,7 @@ class Agent:
         self._write("links.json", list(links))
 
     def fly(self, east: float, north: float = 0.0, velocity: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> None:
-        """Set the position of the drone's radio and its telemetry."""
+        """Set the position of the drone's radio, and the telemetry to the same position."""
         self.set_telemetry(east, north, velocity)
         self.world.command(station=self.name, position=[east, north, 0.0])
 
@@ -304,7 +304,7 @@ class Agent:
         )
 
     def tables(self) -> set[str]:
-        """Return the tables of the agent."""
+        """Return the nftables tables of the agent."""
         return set(self._show("nft", "list", "tables").split("\n")) - {"", "table ip kube-proxy"}
 
     def addresses(self) -> list[str]:
@@ -319,17 +319,17 @@ class Agent:
         return subprocess.run(inside, input=text, capture_output=True, text=True, timeout=30, check=True).stdout
 
     def state(self) -> dict[str, Any]:
-        """Return all state of a node that direct links may change: packet filter, routes, addresses, device and connections."""
+        """Return the state that direct links may change: packet filter, routes, addresses, device and connections."""
         addresses = re.sub(r"(?m)^\d+: | valid_lft.*", "", self._show("ip", "-o", "-4", "address"))
         return {
             "ruleset": self._show("nft", "list", "ruleset"),
             "rules": self._show("ip", "rule"),
-            # The carrier of a cable comes up a moment after its ends.
+            # Ignore the flag linkdown, because the carrier of a device comes up a moment after the device.
             "routes": sorted(
                 self._show("ip", "-4", "route", "show", "table", "all").replace("linkdown ", "").splitlines()
             ),
             "addresses": sorted(addresses.splitlines()),
-            # A device gets a queue when it is brought up for the first time, and keeps the queue.
+            # Ignore the queue. The first agent that brings the device up adds a queue, which stays.
             "device": re.sub(r" qdisc \w+", "", self._show("ip", "address", "show", "dev", "wlan0")),
             "connections": self.world.conntrack(self),
         }
@@ -399,7 +399,7 @@ class World:
         return self.agents[name]
 
     def link(self, drone: Agent, edge: Agent, **spec: Any) -> dict[str, Any]:
-        """Return a DirectLink like the operator's."""
+        """Return a DirectLink as the operator would create it."""
         service = {
             "component": "Server", "instance": f"server-{edge.name}",
             "virtual": {"address": str(VIP.address), "port": VIP.port},
@@ -418,7 +418,7 @@ class World:
         }  # fmt: skip
 
     def states(self) -> dict[str, dict[str, Any]]:
-        """Return the state of each node that direct links may change, by node."""
+        """Return the state that direct links may change, by node."""
         return {name: agent.state() for name, agent in self.agents.items()}
 
     def python(self, node: str, program: str, *arguments: object) -> subprocess.Popen[str]:
@@ -452,7 +452,7 @@ class World:
         return Client(self.python(f"{drone.name}p", CLIENT, f"{VIP.address}:{VIP.port}", calls, pause_s, size))
 
     def conntrack(self, agent: Agent) -> int:
-        """Return the number of a node's connections with a mark of the redirector."""
+        """Return the number of connections of a node that have a mark of the redirector."""
         listed = in_namespace(self.path(agent.name), lambda: Path("/proc/thread-self/net/nf_conntrack"))
         text = in_namespace(self.path(agent.name), lambda: listed.read_text() if listed.exists() else "")
         marks = [int(mark) for mark in re.findall(r"mark=(\d+)", text)]
@@ -526,7 +526,7 @@ def until(
             return time.monotonic() - begun
         time.sleep(0.02)
     logs = "".join(f"\n--- {a.name}\n{a.log()[-3000:]}\n{a.statuses}" for a in world.agents.values()) if world else ""
-    raise AssertionError(f"not within {timeout_s:g} s: {description}{logs}")
+    raise AssertionError(f"waited {timeout_s:g} s for {description}{logs}")
 
 
 def start_drone(world: World, *edges: Agent) -> Agent:

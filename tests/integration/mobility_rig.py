@@ -343,7 +343,7 @@ class Rig:
             pb.SubscribeTelemetryRequest(), wait_for_ready=True, timeout=20
         ):
             return message
-        raise AssertionError("no telemetry")
+        raise AssertionError("the service sent no telemetry")
 
     async def until(
         self, condition: Callable[[pb.Telemetry], bool], timeout_s: float = 30.0, description: str = "state"

@@ -26,7 +26,7 @@ NODE_OBJECTS = (
     f"/apis/rbac.authorization.k8s.io/v1/namespaces/{NODES}/roles",
     f"/api/v1/namespaces/{NODES}/serviceaccounts",
 )
-"""Paths of the collections that contain an object of the operator for each node."""
+"""Paths of the collections in which the operator creates an object for each node."""
 LAT = 39.3606
 LON = 22.9307
 MOBILITY = [
@@ -189,7 +189,7 @@ class World:
         return self.api.list(f"{FRACTUS}/grants", labelSelector=selector)
 
     def children(self, namespace: str) -> dict[str, Body]:
-        """Return the objects of the operator in a namespace by `PLURAL/NAME`, without objects that Kubernetes creates."""
+        """Return the objects that the operator created in a namespace, by `PLURAL/NAME`."""
         objects = {}
         for path in (
             f"{FRACTUS}/namespaces/{namespace}/deploymentplans",
@@ -213,12 +213,12 @@ class World:
         return {body["spec"]["node"]: body for body in self.api.list(f"{FRACTUS}/directlinks", labelSelector=selector)}
 
     def pods(self, namespace: str) -> list[Body]:
-        """Return the pods that are not being deleted. Deleted pods stay, because there is no kubelet."""
+        """Return the pods without a deletion timestamp. Deleted pods do not disappear, because there is no kubelet."""
         pods = self.api.list(f"/api/v1/namespaces/{namespace}/pods")
         return [pod for pod in pods if "deletionTimestamp" not in pod["metadata"]]
 
     def run_pods(self, namespace: str) -> None:
-        """Bind every pod and mark it as ready like scheduler and kubelet."""
+        """Bind every pod and mark it as ready, as scheduler and kubelet do."""
         for number, pod in enumerate(self.pods(namespace)):
             name = pod["metadata"]["name"]
             if not pod["spec"].get("nodeName"):
@@ -236,7 +236,7 @@ class World:
             self.api.merge(f"/api/v1/namespaces/{namespace}/pods/{name}/status", {"status": status})
 
     def clear(self) -> None:
-        """Remove cluster-scoped objects of tests, and all pods, because there is no kubelet that removes them."""
+        """Remove cluster-scoped objects of tests. Also remove all pods, because no kubelet removes them."""
         for drone in self.api.list(f"{FRACTUS}/drones"):
             state = {"status": {"flightState": "inactive", "conditions": []}}
             self.api.merge(f"{FRACTUS}/drones/{drone['metadata']['name']}/status", state)
@@ -253,7 +253,7 @@ class World:
             self._delete(f"/api/v1/nodes/{node['metadata']['name']}")
 
     def _delete(self, path: str, grace_s: int | None = None) -> None:
-        """Delete an object. Retry because the deletion is refused until admission has received the landing of a drone."""
+        """Delete an object. Retry, because the API server first needs to receive that the drones have landed."""
 
         def deleted() -> bool:
             try:
@@ -328,7 +328,7 @@ def fresh_namespace(world: World, name: str) -> Iterator[str]:
     world.api.apply(f"/api/v1/namespaces/{name}", _namespace(name))
     # Pods are refused until the controller manager has created this account.
     account = f"/api/v1/namespaces/{name}/serviceaccounts/default"
-    wait_for(lambda: world.api.get(account), "the namespace's service account")
+    wait_for(lambda: world.api.get(account), "the default service account of the namespace")
     try:
         yield name
     finally:

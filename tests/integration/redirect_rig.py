@@ -89,7 +89,7 @@ class Rig:
         return f"{self.tag}{node}"
 
     def path(self, node: str) -> Path:
-        """Return the file of the namespace."""
+        """Return the file of the network namespace of a node or pod."""
         return Path("/run/netns", self.name(node))
 
     def inside(self, node: str) -> list[str]:
@@ -142,7 +142,7 @@ class Rig:
         return result.returncode == 0
 
     def maps(self, node: str) -> NftMaps:
-        """Return the maps of a node. A missing table is created again."""
+        """Return the nftables maps of a node. They create their table again if it is missing."""
 
         def make_table(callers: Callers) -> None:
             create("fxl*", PORTS, self.inside(node), clients=node == "drone", callers=callers)

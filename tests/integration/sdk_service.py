@@ -71,7 +71,7 @@ class Authority:
 
 
 EXPIRED = Event()
-"""Queued to a control stream: end the stream, because its client's certificate has expired."""
+"""Item for the queue of a control stream. The stream then ends, because the client's certificate has expired."""
 
 
 class Drone(mobility_pb2_grpc.MobilityServiceServicer):
@@ -186,10 +186,10 @@ class Drone(mobility_pb2_grpc.MobilityServiceServicer):
 
 
 class Pictures(camera_pb2_grpc.CameraServiceServicer):
-    """Fake camera service whose picture has 600 kB.
+    """Fake camera service. Each picture has 600 kB.
 
     Attributes:
-        cut: End the transfer of a picture too early.
+        cut: If True, the transfer of a picture ends too early.
         stored: Names of the pictures that were not deleted.
     """
 

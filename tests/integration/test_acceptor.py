@@ -23,7 +23,7 @@ LOOPBACK = IPv4Address("127.0.0.1")
 
 
 class Site:
-    """Edge node that accepts sessions, and certificates of its peers."""
+    """An edge node that accepts sessions, with certificates for its peers."""
 
     def __init__(self, directory: Path) -> None:
         self.directory = directory
@@ -46,7 +46,7 @@ class Site:
         try:
             await asyncio.Event().wait()
         finally:
-            await asyncio.sleep(0.05)  # traffic is moved back
+            await asyncio.sleep(0.05)  # stands for the time in which the agent moves traffic back
             self.active.remove(session.peer)
 
     def refusal_of(self, _peer: str) -> str:
@@ -80,7 +80,7 @@ def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Site:
 
 async def until(condition: Callable[[], bool]) -> None:
     async with asyncio.timeout(10):
-        while not condition():  # noqa: ASYNC110 - sockets have no event for this
+        while not condition():  # noqa: ASYNC110 - the conditions have no event
             await asyncio.sleep(0.01)
 
 

@@ -204,7 +204,7 @@ def phase(server: ApiServer, name: str, node: str = "drone-1") -> str | None:
     return server.reported(node, name).get("phase")
 
 
-def test_agent_of_drone_registers_reports_and_stores_grants(server: ApiServer, drone: Node) -> None:
+def test_drone_agent_registers_node_reports_status_and_stores_grants(server: ApiServer, drone: Node) -> None:
     drone.describe()
     uid = add_grant(server, "mine", control="full")["metadata"]["uid"]
     add_grant(server, "not-mine", node="drone-2")
@@ -343,7 +343,7 @@ def test_agent_reports_a_denied_certificate(server: ApiServer, drone: Node) -> N
     assert "not in the fleet" in drone.log()
 
 
-def test_agent_of_edge_node_registers(server: ApiServer, authority: TestAuthority, tmp_path: Path) -> None:
+def test_edge_node_agent_registers_node(server: ApiServer, authority: TestAuthority, tmp_path: Path) -> None:
     node = Node(server, authority, tmp_path, "edge-1", "EdgeNode")
     try:
         node.describe()
@@ -358,7 +358,7 @@ def test_agent_of_edge_node_registers(server: ApiServer, authority: TestAuthorit
 
 
 def test_agent_reports_a_direct_link_with_missing_device(server: ApiServer, drone: Node) -> None:
-    """Run the agent with a DirectLink. Its traffic is tested in test_link_manager.py."""
+    """Run the agent with a DirectLink. Other tests, in test_link_manager.py, check the traffic of links."""
     pairing = {"mode": "adhoc", "networkId": "fleet"}
     drone.describe(interfaces=[{"technology": "WiFi", "device": "fxnone0", "range": 80, "pairing": pairing}])
     drone.start()

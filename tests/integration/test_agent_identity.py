@@ -164,7 +164,7 @@ async def test_damaged_certificate_files_are_replaced(bench: IdentityBench, harm
 
 
 @pytest.mark.parametrize("kind", ["Denied", "Failed"])
-async def test_refused_signing_request_is_raised(bench: IdentityBench, kind: str) -> None:
+async def test_refused_signing_request_raises_signing_refused(bench: IdentityBench, kind: str) -> None:
     bench.signer.conditions = [{"type": kind, "message": "node drone-1 is not in the fleet"}]
     with pytest.raises(SigningRefused, match="not in the fleet") as refusal:
         await bench.identity.step()
@@ -216,14 +216,14 @@ async def test_certificate_of_another_authority_is_not_installed(bench: Identity
     assert not (bench.directory / "tls.crt").exists()
 
 
-async def test_missing_authority_is_raised(bench: IdentityBench) -> None:
+async def test_missing_authority_raises_signing_refused(bench: IdentityBench) -> None:
     bench.signer.published = None
     with pytest.raises(SigningRefused) as refusal:
         await bench.identity.step()
     assert refusal.value.reason == "NoAuthority"
 
 
-async def test_clock_before_the_validity_requests_nothing_and_recovers(bench: IdentityBench) -> None:
+async def test_clock_before_certificate_validity_causes_no_request(bench: IdentityBench) -> None:
     await bench.identity.step()
     now = bench.clock.now
     bench.clock.now = datetime(1970, 1, 1, tzinfo=UTC)
@@ -235,7 +235,7 @@ async def test_clock_before_the_validity_requests_nothing_and_recovers(bench: Id
     assert bench.identity.condition.status == "True"
 
 
-async def test_clock_after_the_validity_is_reported_and_recovers(bench: IdentityBench) -> None:
+async def test_clock_after_authority_validity_is_reported(bench: IdentityBench) -> None:
     now = bench.clock.now
     bench.clock.now = now + timedelta(days=900)
     with pytest.raises(SigningRefused) as refusal:

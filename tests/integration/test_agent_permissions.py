@@ -44,7 +44,7 @@ def agents(control_plane: ControlPlane, world: World, chart: None) -> Iterator[d
                    "spec": {"expirationSeconds": 600, "boundObjectRef": bound}}  # fmt: skip
         path = f"/api/v1/namespaces/{SYSTEM}/serviceaccounts/fractus-node/token"
         clients[node] = control_plane.with_token(world.api.call("POST", path, request)["status"]["token"])
-    # The API server applies a new admission policy after a moment. Wait until it denies.
+    # The API server enforces a new admission policy after a delay. Wait until the policy denies a request.
     wait_for(lambda: _denied(clients["edge-1"]), "the admission policy to be in force")
     yield clients
     for client in clients.values():
@@ -100,8 +100,8 @@ def test_agent_registers_only_the_kind_of_its_node_label(world: World, agents: d
 
     drone = fractus_object("Drone", "edge-1", {"services": {}})
     edge = fractus_object("EdgeNode", "drone-1", {"location": at(0, 0)})
-    wait_for(lambda: refused("edge-1", drone, "edge"), "the refusal of a drone")
-    wait_for(lambda: refused("drone-1", edge, "drone"), "the refusal of an edge node")
+    wait_for(lambda: refused("edge-1", drone, "edge"), "the refusal of a Drone")
+    wait_for(lambda: refused("drone-1", edge, "drone"), "the refusal of an EdgeNode")
     world.api.call("POST", f"{FRACTUS}/drones?dryRun=All", drone)
 
 
@@ -139,7 +139,7 @@ def token_path(node: str, namespace: str = NODES) -> str:
 
 @pytest.fixture
 def accounts(control_plane: ControlPlane, world: World, agents: dict[str, BlockingClient]) -> None:
-    """Create the accounts and objects of drone-1 and edge-1 with the rights of the operator."""
+    """Create the accounts and objects of drone-1 and edge-1 with the operator's token."""
     operator = control_plane.with_token(operator_token(world))
     for node in agents:
         for path, body in node_objects(node).items():
@@ -207,7 +207,7 @@ def _rules(node: str, *more: Body, **changed: Any) -> Body:
 
 
 PODS = {"apiGroups": [""], "resources": ["pods"], "verbs": ["get"]}
-"""A permission of the operator itself. Otherwise the API server refuses before admission."""
+"""A permission that the operator has. Without it, the API server would refuse the role before admission runs."""
 
 
 @pytest.mark.parametrize(

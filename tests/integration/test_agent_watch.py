@@ -1,4 +1,4 @@
-"""Watches of Grants and DirectLinks while the API server restarts, loses data, freezes and compacts."""
+"""Watches of Grants and DirectLinks while the API server restarts, loses data, freezes, or compacts its storage."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ async def until(events: AsyncIterator[WatchEvent], kind: type[WatchEvent]) -> Wa
         async for event in events:
             if isinstance(event, kind):
                 return event
-    raise AssertionError("the events ended")
+    raise AssertionError("the stream of events ended")
 
 
 async def served(watched: Store) -> None:

@@ -1,4 +1,4 @@
-"""Alert rules, evaluated by promtool: each alert fires in its situation, and no alert fires during normal operation."""
+"""Alert rules, evaluated by promtool: each alert fires in its case, and no alert fires during normal operation."""
 
 from __future__ import annotations
 
@@ -22,27 +22,27 @@ FILES = CHARTS / "fractus" / "files"
 RULES: list[dict[str, Any]] = yaml.safe_load((FILES / "alerts.yaml").read_text())["groups"][0]["rules"]
 CACHE = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "fractus" / "promtool"
 ON = 'job="fractus-system/fractus-mobility", node="drone-1", pod="m", instance="10.0.0.1:46813"'
-"""Labels that Prometheus adds to every sample of a service."""
+"""Labels that Prometheus adds to every sample of the mobility service."""
 
 
 def of(name: str, labels: str = "", values: str = "0x30") -> tuple[str, str]:
-    """Return a series: its name with labels, and one value per 15 s in promtool's notation."""
+    """Return the name of a series with its labels, and its values in promtool's notation, one per 15 s."""
     return f"{name}{{{ON}{', ' if labels else ''}{labels}}}", values
 
 
 FLYING = of("fractus_in_air", "", "1x30")
 KNOWN = of("fractus_audit_sequence", "", "7x60")
-"""The service has been observed for a while."""
+"""Series that shows that Prometheus has scraped the service for 15 minutes."""
 
 
 @dataclass(frozen=True)
 class Case:
-    """A situation that an alert is for.
+    """A case in which an alert must fire.
 
     Attributes:
         series: Scraped series.
-        at: Time by which the alert fires. One sample takes 15 s.
-        well: Series of a similar situation in which no alert fires.
+        at: Time from the beginning of the series by which the alert has fired, in promtool's notation.
+        well: Similar series with which the alert must not fire.
     """
 
     series: tuple[tuple[str, str], ...]
@@ -130,21 +130,21 @@ CASES = {
 
 @pytest.fixture(scope="session")
 def promtool() -> str:
-    """Return the path of promtool from Debian's package, which is unpacked but not installed, because installing it would start a server."""
+    """Return the path of promtool. Unpack it from Debian's package, because installing the package starts a server."""
     program = shutil.which("promtool") or str(CACHE / "usr/bin/promtool")
     if not Path(program).exists():
         CACHE.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=CACHE.parent) as unpacked:
             for argv in (["apt-get", "download", "-q", "prometheus"], ["sh", "-c", "dpkg -x prometheus_*.deb root"]):
                 subprocess.run(argv, cwd=unpacked, check=True, timeout=240, stdout=subprocess.DEVNULL)
-            with contextlib.suppress(OSError):  # another test was quicker
+            with contextlib.suppress(OSError):  # another test worker has unpacked the package
                 (Path(unpacked) / "root").rename(CACHE)
     return program
 
 
 def judge(promtool: str, directory: Path, tests: list[dict[str, Any]]) -> str:
     """Return the output of promtool for tests of the rules, or an empty string if they pass."""
-    # Without annotations, which a test would have to repeat word for word.
+    # Remove annotations, because expected alerts would have to repeat them.
     bare = [{key: value for key, value in rule.items() if key != "annotations"} for rule in RULES]
     (directory / "rules.yaml").write_text(yaml.safe_dump({"groups": [{"name": "fractus", "rules": bare}]}))
     test_file = {"rule_files": ["rules.yaml"], "evaluation_interval": "15s", "tests": tests}
@@ -176,8 +176,8 @@ def test_alerts_have_a_case_and_a_section_in_the_docs() -> None:
         assert rule["labels"]["severity"] in {"critical", "warning", "info"}
 
 
-def test_alerts_fire_in_their_situation(promtool: str, tmp_path: Path) -> None:
-    # With which labels is its own affair, so the opposite is claimed of each, and must be wrong.
+def test_alerts_fire_in_their_cases(promtool: str, tmp_path: Path) -> None:
+    # An expected alert would have to list all its labels. Instead, expect no alerts, so that promtool reports each one.
     output = judge(
         promtool, tmp_path, [test_case(case.series, silent(alert, case.at)) for alert, case in CASES.items()]
     )

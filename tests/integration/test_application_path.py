@@ -35,15 +35,15 @@ MAX_FILES = 28
 MAX_FUNCTIONS = 83
 """Limits for the steps in the operator. Steps in core and runtime are printed, but not limited here.
 
-Measured: 25 files and 80 functions. With access to data, metrics and observers of the cache: 32 files and 152 functions.
+Measured: 25 files and 80 functions. With data access, metrics and observers of the cache: 32 files and 152 functions.
 """
 
 _on_path = contextvars.ContextVar("on_path", default=False)
-"""True until the first rollout in the task of the Application's handler, and in tasks and threads that this task starts."""
+"""True in the task of the Application's handler, and in its tasks and threads, until the first rollout is complete."""
 
 
 _CACHE_UPDATES = frozenset({Informer.record_write.__code__, ActivePlans.decide.__code__})
-"""Functions that update the cache. The functions that they call are observers: indexes, wake-ups and other controllers."""
+"""Functions that update the cache. They call observers of the cache: indexes, wake-ups and other controllers."""
 _METRICS = operator_metrics.__file__
 
 
@@ -55,7 +55,7 @@ class PathRecorder:
         self._steps: set[CodeType] = set()
 
     def profile(self, frame: FrameType, event: str, _argument: object) -> None:
-        """Record a call; a profile function as `sys.setprofile` takes it."""
+        """Record a call. This is a profile function for `sys.setprofile`."""
         if event == "call" and frame.f_code not in self._steps and _on_path.get():
             self._codes[frame.f_code] = None
             if not _is_observer(frame):
@@ -100,7 +100,7 @@ class PathRecorder:
 
 
 def _is_observer(frame: FrameType) -> bool:
-    """Return True if a function is called by an update of the cache, or measures for the metrics."""
+    """Return True for a function of the metrics module, and for a function called during an update of the cache."""
     caller = frame.f_back
     while caller is not None:
         if caller.f_code in _CACHE_UPDATES:
@@ -110,14 +110,14 @@ def _is_observer(frame: FrameType) -> bool:
 
 
 def _is_data_access(path: Path, name: str) -> bool:
-    """Return True for a property, a special method, a name, or a lookup."""
+    """Return True for special methods, properties, and functions that only return a name or a lookup."""
     short = name.rpartition(".")[2]
     return (short.startswith("__") and short.endswith("__")) or name in _lookups(path)
 
 
 @functools.cache
 def _lookups(path: Path) -> frozenset[str]:
-    """Return the qualified names of all properties of a module, and of functions that only return an unconditional expression."""
+    """Return the qualified names of the properties in a module, and of functions that only return an expression."""
     lookups = set()
     module = ast.parse(path.read_text())
     for owner in (module, *(node for node in module.body if isinstance(node, ast.ClassDef))):
@@ -161,7 +161,7 @@ async def test_application_path_has_few_files_and_functions(
 
     monkeypatch.setattr(ApplicationController, "follow", marked)
     monkeypatch.setattr(ApplicationController, "reconcile", until_deployed)
-    # A long Lease also means long timeouts of requests. A failed request would add the path of failures.
+    # A long Lease allows long request timeouts. A request that fails would add its error handling to the path.
     settings = Settings(namespace=SYSTEM, health=f"http://127.0.0.1:{free_port()}/healthz", lease_s=60.0)
     stop = asyncio.Event()
     with recorder.recording():
@@ -183,6 +183,6 @@ async def test_application_path_has_few_files_and_functions(
             f"{'steps' if steps else 'all functions'}: {len(files)} files, {len(functions)} functions;"
             f" operator: {len(operator_files)} files, {len(operator_functions)} functions"
         )
-    assert "deployment" in operator_functions, "the path reaches the Deployments"
+    assert "deployment" in operator_functions, "the recorded path does not reach the Deployments"
     assert len(operator_files) <= MAX_FILES
     assert len(operator_functions) <= MAX_FUNCTIONS

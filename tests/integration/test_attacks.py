@@ -47,7 +47,7 @@ FLOOD_PER_S = 500.0
 
 
 async def served(rig: Rig, identity: str = DRIVER) -> mobility_pb2_grpc.MobilityServiceStub:
-    """Return the stub of an accepted caller."""
+    """Return a stub for an identity, after its first call was accepted."""
     stub = rig.stub(identity)
     await stub.GetSpeed(ASK, timeout=20, wait_for_ready=True)
     return stub
@@ -82,7 +82,9 @@ async def test_attack_with_foreign_certificate_is_refused(rig: Rig) -> None:
         return code, why.code
 
     stranger = Authority(rig.directory, "ca")
-    assert (await call(DRIVER, authority=stranger))[0] == Status.UNAVAILABLE, "of an authority of the same name"
+    assert (await call(DRIVER, authority=stranger))[0] == Status.UNAVAILABLE, (
+        "issued by another authority of the same name"
+    )
     assert (await call(DRIVER, seconds=-10.0, begun=-3600.0))[0] == Status.UNAVAILABLE, "expired"
     assert (await call(DRIVER, begun=1800.0))[0] == Status.UNAVAILABLE, "not valid yet"
     no_grant = (Status.PERMISSION_DENIED, "NoGrant")
@@ -121,7 +123,7 @@ async def test_attack_with_certificate_of_removed_instance_is_refused(rig: Rig) 
     path.unlink()
     await until(lambda: [e for e in rig.entries("grant") if e["change"] == "removed"], "the grant's end")
     code, why = await denied(stub.GetSpeed(ASK, timeout=5))
-    assert (code, why.code) == (Status.PERMISSION_DENIED, "NoGrant"), "on the connection that was open"
+    assert (code, why.code) == (Status.PERMISSION_DENIED, "NoGrant"), "a call on the open connection was accepted"
     path.write_bytes(stale)
     await until(lambda: [e for e in rig.entries("grant") if e["change"] == "refused"], "the replay's refusal")
     assert "was revoked here" in rig.entries("grant")[-1]["reason"]
@@ -130,7 +132,7 @@ async def test_attack_with_certificate_of_removed_instance_is_refused(rig: Rig) 
     rig.kill("service")
     rig.start_service()
     code, why = await denied(rig.stub(DRIVER).GetSpeed(ASK, timeout=20, wait_for_ready=True))
-    assert (code, why.code) == (Status.PERMISSION_DENIED, "NoGrant"), "a restart forgets nothing"
+    assert (code, why.code) == (Status.PERMISSION_DENIED, "NoGrant"), "the restarted service accepted the revoked Grant"
     rig.write_grant(grant())
     await until(lambda: rig.entries("grant")[-1]["change"] == "added", "the new grant")
     await stub.GetSpeed(ASK, timeout=20, wait_for_ready=True)
@@ -209,7 +211,7 @@ async def test_clock_step_neither_refuses_callers_nor_accepts_expired_certificat
         if step_s > 0:
             code, why = await denied(rig.stub(DRIVER).GetSpeed(ASK, timeout=5))
             assert (code, why.code) == (Status.UNAUTHENTICATED, "NotAuthenticated"), (
-                "callers that were unknown before the step"
+                "a caller without a connection before the step was accepted"
             )
             assert "expired" in why.reason
     await until(lambda: len(rig.entries("clock")) >= 3, "the steps in the audit log")
@@ -221,12 +223,14 @@ async def test_clock_step_neither_refuses_callers_nor_accepts_expired_certificat
 
     for call in (watched, lambda: short.GetSpeed(ASK, timeout=5)):
         code, why = await denied(call())
-        assert (code, why.code) == (Status.UNAUTHENTICATED, "NotAuthenticated"), "expired by steady time"
+        assert (code, why.code) == (Status.UNAUTHENTICATED, "NotAuthenticated"), (
+            "the certificate has expired by the monotonic clock"
+        )
     code, why = await denied(short.Hover(pb.HoverRequest(), timeout=5))
     assert (code, why.code) == (Status.FAILED_PRECONDITION, "NotInControl"), (
-        "stopping is accepted with an expired certificate"
+        "Hover was refused because of the expired certificate"
     )
-    # A grant does not hang on the node's clock.
+    # The validity of a Grant does not depend on the clock of the node.
     rig.write_grant(grant(altitude_limit(5, 15)))
     await until(lambda: [e for e in rig.entries("grant") if e["change"] == "changed"], "the new grant")
 
@@ -304,9 +308,9 @@ async def test_attack_with_invalid_call_is_refused(rig: Rig) -> None:
 
 
 async def _flood(address: str, pem: list[bytes], until_s: float) -> None:
-    """Call at a steady rate regardless of responses, and print the results. Runs in the attacker's process.
+    """Start calls at a constant rate regardless of responses, and print the results. Runs in the attacker's process.
 
-    When a busy machine lets calls pile up, gRPC itself refuses more of a connection than it may have open: SHED.
+    SHED counts calls that gRPC itself refused, because the connection had too many open calls on a busy machine.
     """
     ca, key, certificate = pem
     ended: Counter[str] = Counter()
@@ -358,13 +362,15 @@ async def test_attack_with_flood_of_calls_does_not_affect_others(rig: Rig) -> No
         await asyncio.sleep(0.05)
     output, _ = await attacker.communicate()
     result = json.loads(output)
-    print(f"flood {result}; the other's calls {len(latencies_s)}, slowest {max(latencies_s) * 1000:.0f} ms")
+    print(f"flood {result}; calls of the other caller {len(latencies_s)}, slowest {max(latencies_s) * 1000:.0f} ms")
     assert result["sent"] > FLOOD_PER_S
     ended = result["ended"]
     assert set(ended) <= {"OK", "RESOURCE_EXHAUSTED", "SHED"}
     assert sum(ended.values()) == result["sent"]
-    assert 0 < ended["OK"] <= CALL_BURST + CALLS_PER_S * result["seconds"] + 1, "at most the limit of each caller"
-    assert result["hints"] == ended["RESOURCE_EXHAUSTED"] > 0, "each refusal contains a retry delay"
+    assert 0 < ended["OK"] <= CALL_BURST + CALLS_PER_S * result["seconds"] + 1, (
+        "the service answered more calls than its limit of each caller"
+    )
+    assert result["hints"] == ended["RESOURCE_EXHAUSTED"] > 0, "a refusal lacks the retry delay"
     assert len(latencies_s) > 10
 
 
@@ -397,7 +403,7 @@ async def test_attack_with_flood_of_connections_does_not_affect_others(rig: Rig)
                     continue
         await stub.GetSpeed(ASK, timeout=5)
         await served(rig)
-        await until(lambda: _closed(silent[-1]), "the end of a connection that sends nothing", 20)
+        await until(lambda: _closed(silent[-1]), "the service to close a connection that sends nothing", 20)
     finally:
         for connection in silent:
             connection.close()
@@ -457,7 +463,7 @@ async def test_full_disk_ends_no_flight_but_prevents_arming(rig: Rig) -> None:
     resource.prlimit(rig.pid("service"), resource.RLIMIT_FSIZE, full)
     await driver.goto(0, 30)
     code, why = await denied(flown(driver.start_goto(0, 150)))
-    assert (code, why.code) == (Status.PERMISSION_DENIED, "OutsideOperationArea"), "judged as before"
+    assert (code, why.code) == (Status.PERMISSION_DENIED, "OutsideOperationArea"), "the full disk changed the verdict"
     await driver.stub.Hover(pb.HoverRequest(), timeout=5)
     await flown(driver.stub.Land(pb.LandRequest(), timeout=60))
     await rig.until(lambda t: not t.armed, 30, "landing")
@@ -467,7 +473,8 @@ async def test_full_disk_ends_no_flight_but_prevents_arming(rig: Rig) -> None:
     assert why.reason
     resource.prlimit(rig.pid("service"), resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
     await until(
-        lambda: any(e.get("code") == "OutsideOperationArea" for e in rig.entries("call")), "what was written late"
+        lambda: any(e.get("code") == "OutsideOperationArea" for e in rig.entries("call")),
+        "the entry of the denied call in the audit log",
     )
     assert len(rig.entries()) > before
     with rig.audit.open("rb") as log:

@@ -1,4 +1,4 @@
-"""Procedure of docs/backup.md: a second cluster gets the objects and the authority of a lost one; then Fractus is uninstalled."""
+"""Run the commands of docs/backup.md: restore objects and authority in a second cluster. Then uninstall Fractus."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ SERVER_S = {"uid", "resourceVersion", "generation", "creationTimestamp", "manage
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A folder with the charts, as in a checkout."""
+    """A folder that contains the charts, like a checkout."""
     (tmp_path / "charts").symlink_to(ROOT / "charts")
     return tmp_path
 
@@ -71,7 +71,7 @@ def granted(world: World, namespace: str) -> dict[str, Body]:
 
 
 def authority(world: World) -> bytes:
-    """Return the CA certificate that nodes verify Grants with."""
+    """Return the CA certificate with which nodes verify Grants, in PEM."""
     public = world.api.get(f"/api/v1/namespaces/{SYSTEM}/configmaps/fractus-ca") or {}
     return str(public["data"]["ca.crt"]).encode()
 
@@ -99,7 +99,7 @@ def test_backup_is_restored_into_another_cluster_and_uninstalled(
     for line in RESTORE:
         shell.type(line)
     assert found.api.get(f"{FRACTUS}/drones/drone-1"), (
-        "the Drone is restored before an agent can create it from the node description"
+        "the Drone is missing, so an agent would create it from the node description"
     )
     found.drone_status("drone-1", "inactive")
     again = OperatorProcess(found.plane.kubeconfig, folder / "found.log")
@@ -121,7 +121,7 @@ def test_backup_is_restored_into_another_cluster_and_uninstalled(
         assert written(found) == before
         # The manifest from version control has no finalizer. The operator adds it again.
         shell.type("kubectl apply -f application.yaml")
-        wait_for(lambda: written(found) == before, "the application to be as it was")
+        wait_for(lambda: written(found) == before, "the Application to equal the backed up Application")
         shell.type(REMOVE[0])
     finally:
         again.stop(signal.SIGKILL)
@@ -138,10 +138,10 @@ def remove(world: World, shell: Shell) -> None:
     world.api.merge(
         "/api/v1/nodes/drone-1", {"spec": {"taints": [{"key": "fractus.dev/class", "effect": "NoExecute"}]}}
     )
-    # The status that the agent reports after its Grants are deleted.
+    # Report the drone as landed, like its agent after its Grants are deleted.
     world.drone_status("drone-1", "inactive")
     attempt = f"kubectl -n {SYSTEM} delete daemonset fractus-mobility --dry-run=server || true"
-    wait_for(lambda: "deleted" in shell.type(attempt), "the admission policies to know that no drone is in the air")
+    wait_for(lambda: "deleted" in shell.type(attempt), "the admission policies to allow the deletion")
     for line in REMOVE:
         if re.search(r"uninstall fractus(-crds)?$", line):
             shell.type(f"{line} --no-hooks")
@@ -150,7 +150,7 @@ def remove(world: World, shell: Shell) -> None:
             shell.type(line)
     for begins in ("kubectl delete crd", "kubectl label nodes", "kubectl taint nodes"):
         (line,) = re.findall(rf"`({begins}[^`]*)`", (ROOT / "docs/upgrades.md").read_text())
-        # kubectl exits with 1 if nodes lack the taint.
+        # kubectl exits with 1 because some nodes do not have the taint.
         shell.type(line, code=1 if "taint" in line else 0)
     assert "fractus" not in shell.type(f"kubectl get {EVERYWHERE} -o name")
     assert "fractus" not in shell.type(f"kubectl get -n {SYSTEM} {INSIDE} -o name")

@@ -82,7 +82,7 @@ def zone(**spec: Any) -> Body:
 
 BAD: list[tuple[str, Body, str]] = [
     ("two drivers", app(DRIVER, DRIVER | {"name": "Other"}), "an application has at most one driver"),
-    ("no one says where to fly", app(PASSENGER), "an application with drone components needs a driver, or one passenger with pointsOfInterest"),
+    ("no driver and no points of interest", app(PASSENGER), "an application with drone components needs a driver, or one passenger with pointsOfInterest"),
     ("driver and points of interest", app(DRIVER, GUIDED), "an application with a driver cannot have pointsOfInterest; remove them"),
     ("two guides", app(GUIDED, GUIDED | {"name": "Second"}), "only one passenger may have pointsOfInterest"),
     ("driver without control points", app({k: v for k, v in DRIVER.items() if k != "controlPoints"}), "a driver requires controlPoints"),
@@ -92,9 +92,9 @@ BAD: list[tuple[str, Body, str]] = [
     ("path without waypoints", driver(path=[]), "spec.components[0].controlPoints[0].path"),
     ("path and region", driver(region=DISC), "give either path or region, and only one of them"),
     ("region without region", app(DRIVER | {"controlPoints": [{"navigation": "regionBased"}]}), "regionBased navigation needs region"),
-    ("stay on a path", driver(duration=5), "duration is for regionBased navigation"),
-    ("start twice", driver(point={"depot": "base", "position": HERE}), "give either depot or position, and only one of them"),
-    ("datum of no altitude", driver(path=[{"lat": 1, "lon": 2, "altitudeReference": "amsl"}]), "altitudeReference requires alt; set alt or remove altitudeReference"),
+    ("path with a duration", driver(duration=5), "duration is for regionBased navigation"),
+    ("point with depot and position", driver(point={"depot": "base", "position": HERE}), "give either depot or position, and only one of them"),
+    ("altitude reference without altitude", driver(path=[{"lat": 1, "lon": 2, "altitudeReference": "amsl"}]), "altitudeReference requires alt; set alt or remove altitudeReference"),
     ("latitude of 95", driver(path=[HERE | {"lat": 95}]), "should be less than or equal to 90"),
     ("edge component without locations", app({k: v for k, v in EDGE.items() if k != "locations"}), "locations are required for placement edge, and not allowed otherwise"),
     ("radius of 0", app(EDGE | {"locations": [{"center": HERE, "radius": 0}]}), "radius: Invalid value: 0: spec.components[0].locations[0].radius in body should be greater than 0"),
@@ -110,7 +110,7 @@ BAD: list[tuple[str, Body, str]] = [
     ("method of another service", app(EDGE | {"services": [CAMERA | {"methods": ["Goto"]}]}), "the methods of the camera service are CaptureImage, DeleteImage, ListImages, RetrieveImage"),
     ("egress to a stranger", app(CLOUD | {"egress": ["Stranger"]}), "egress names a component that is not in the application"),
     ("egress to itself", app(CLOUD | {"egress": ["Store"]}), "egress names the component itself; remove it"),
-    ("egress to one without ports", app(CLOUD | {"egress": ["Mute"]}, MUTE), "egress names a component without container.ports; give it the port it listens on"),
+    ("egress to a component without ports", app(CLOUD | {"egress": ["Mute"]}, MUTE), "egress names a component without container.ports; give it the port it listens on"),
     ("ingress from a stranger", app(CLOUD | {"ingress": ["Stranger"]}), "ingress names a component that is not in the application"),
     ("ingress from itself", app(CLOUD | {"ingress": ["Store"]}), "ingress names the component itself; remove it"),
     ("hybrid to a stranger", app(HYBRID | {"hybridTo": ["Stranger"]}), "hybridTo names a component that is not in the application"),
@@ -120,21 +120,21 @@ BAD: list[tuple[str, Body, str]] = [
     ("path without path", app(DRIVER | {"controlPoints": [{"navigation": "pathBased"}]}), "pathBased navigation needs path"),
     ("method of the camera", app(DRIVER | {"services": [MOBILITY | {"methods": ["CaptureImage"]}]}), "the methods of the mobility service are Arm, Disarm"),
     ("two components of one name", app(CLOUD, CLOUD), "duplicate entries for key"),
-    ("volume from nowhere", volume(), "give exactly one of emptyDir, configMap, secret and claim"),
-    ("volume from two sources", volume(claim="c", secret="s"), "give exactly one of emptyDir, configMap, secret and claim"),
-    ("certificate as a volume", volume(secret="viewer-tls"), "Secrets with names ending in -tls are reserved for component certificates"),
-    ("zone of two shapes", zone(area=DISC | {"polygon": RING}), "give either polygon or circle, and only one of them"),
+    ("volume without a source", volume(), "give exactly one of emptyDir, configMap, secret and claim"),
+    ("volume with two sources", volume(claim="c", secret="s"), "give exactly one of emptyDir, configMap, secret and claim"),
+    ("volume of a certificate Secret", volume(secret="viewer-tls"), "Secrets with names ending in -tls are reserved for component certificates"),
+    ("zone with two shapes", zone(area=DISC | {"polygon": RING}), "give either polygon or circle, and only one of them"),
     ("zone upside down", zone(altitude={"lower": 50, "upper": 10}), "lower must be below upper"),
-    ("half a time of day", zone(schedule=[{"start": "08:00"}]), "give start and end together, or neither"),
+    ("start without end", zone(schedule=[{"start": "08:00"}]), "give start and end together, or neither"),
     ("no such time", zone(schedule=[{"start": "08:00", "end": "24:30"}]), "spec.schedule[0].end"),
-    ("schedule that ends before it begins", zone(schedule=[{"validFrom": "2026-02-01T00:00:00Z", "validUntil": "2026-01-01T00:00:00Z"}]), "validUntil must be after validFrom"),
+    ("schedule with validUntil before validFrom", zone(schedule=[{"validFrom": "2026-02-01T00:00:00Z", "validUntil": "2026-01-01T00:00:00Z"}]), "validUntil must be after validFrom"),
     ("ring of two points", zone(area={"polygon": {"exterior": RING["exterior"][:2]}}), "should have at least 3 items"),
     ("denial of nothing", policy("AccessControl", "denial"), "AccessControl requires kind grant or denial, and methods"),
     ("limit without limits", policy("LimitControl", "speed"), "LimitControl requires kind speed or altitude, and upperLimit or lowerLimit"),
     ("limits crossed", policy("LimitControl", "speed", upperLimit=1, lowerLimit=2), "lowerLimit must not be above upperLimit"),
     ("speed limit of -5", policy("LimitControl", "speed", upperLimit=-5), "speed limits require an upperLimit above 0 and a lowerLimit of at least 0 m/s; limits above terrain require an upperLimit above 0 m"),
     ("speed limit of 0", policy("LimitControl", "speed", upperLimit=0), "speed limits require an upperLimit above 0 and a lowerLimit of at least 0 m/s; limits above terrain require an upperLimit above 0 m"),
-    ("least speed of -1", policy("LimitControl", "speed", lowerLimit=-1), "speed limits require an upperLimit above 0 and a lowerLimit of at least 0 m/s; limits above terrain require an upperLimit above 0 m"),
+    ("minimum speed of -1", policy("LimitControl", "speed", lowerLimit=-1), "speed limits require an upperLimit above 0 and a lowerLimit of at least 0 m/s; limits above terrain require an upperLimit above 0 m"),
     ("flight below terrain", policy("LimitControl", "altitude", upperLimit=0, altitudeReference="terrain"), "speed limits require an upperLimit above 0 and a lowerLimit of at least 0 m/s; limits above terrain require an upperLimit above 0 m"),
     ("altitude limit in space", policy("LimitControl", "altitude", upperLimit=20_001), "should be less than or equal to 20000"),
     ("limit that lands", policy("LimitControl", "speed", upperLimit=1, action="land"), "LimitControl requires action enforce or refuse"),
@@ -146,34 +146,34 @@ BAD: list[tuple[str, Body, str]] = [
         policy("PrivacyControl", "camera", action="blurAverage", fallback="black"),
         "faces and fallback are only allowed for PrivacyControl with action blurFaces",
     ),
-    ("policy that ends before it begins", policy("LimitControl", "speed", upperLimit=1, validFrom="2026-02-01T00:00:00Z", validUntil="2026-01-01T00:00:00Z"), "validUntil must be after validFrom"),
-    ("nothing to be in", selecting({"key": "class", "operator": "In"}), "values are required for In, NotIn, Gt and Lt, and not allowed for Exists"),
-    ("greater than two", selecting({"key": "mtom", "operator": "Gt", "values": ["1", "2"]}), "Gt and Lt require exactly one value"),
-    ("heavier than much", selecting({"key": "mtom", "operator": "Gt", "values": ["much"]}), "Gt and Lt require a number"),
+    ("policy with validUntil before validFrom", policy("LimitControl", "speed", upperLimit=1, validFrom="2026-02-01T00:00:00Z", validUntil="2026-01-01T00:00:00Z"), "validUntil must be after validFrom"),
+    ("operator In without values", selecting({"key": "class", "operator": "In"}), "values are required for In, NotIn, Gt and Lt, and not allowed for Exists"),
+    ("operator Gt with two values", selecting({"key": "mtom", "operator": "Gt", "values": ["1", "2"]}), "Gt and Lt require exactly one value"),
+    ("operator Gt with a word", selecting({"key": "mtom", "operator": "Gt", "values": ["much"]}), "Gt and Lt require a number"),
     ("drone of class C9", body("Drone", {"class": "C9"}), 'Unsupported value: "C9"'),
-    ("edge node in no place", body("EdgeNode", {}), "spec.location: Required value"),
-    ("time before times", policy("LimitControl", "speed", upperLimit=1, validUntil="1970-01-01T00:00:00+05:00"), "validFrom and validUntil must be RFC 3339 times after 1970"),
-    ("access with a limit", policy("AccessControl", "denial", methods=["Arm"], upperLimit=5), "lowerLimit and upperLimit are only allowed for type LimitControl"),
-    ("access with a datum", policy("AccessControl", "denial", methods=["Arm"], altitudeReference="amsl"), "altitudeReference is only allowed for type LimitControl with kind altitude"),
-    ("limit of methods", policy("LimitControl", "speed", upperLimit=5, methods=["Arm"]), "methods are only allowed for type AccessControl"),
-    ("access that acts", policy("AccessControl", "denial", methods=["Arm"], action="refuse"), "AccessControl has no action"),
-    ("names alike", app(CLOUD | {"name": "DataStore"}, CLOUD | {"name": "data-store"}), "component names must differ in more than capitalisation and hyphens"),
+    ("edge node without location", body("EdgeNode", {}), "spec.location: Required value"),
+    ("time before 1970", policy("LimitControl", "speed", upperLimit=1, validUntil="1970-01-01T00:00:00+05:00"), "validFrom and validUntil must be RFC 3339 times after 1970"),
+    ("access control with a limit", policy("AccessControl", "denial", methods=["Arm"], upperLimit=5), "lowerLimit and upperLimit are only allowed for type LimitControl"),
+    ("access control with an altitude reference", policy("AccessControl", "denial", methods=["Arm"], altitudeReference="amsl"), "altitudeReference is only allowed for type LimitControl with kind altitude"),
+    ("limit control with methods", policy("LimitControl", "speed", upperLimit=5, methods=["Arm"]), "methods are only allowed for type AccessControl"),
+    ("access control with an action", policy("AccessControl", "denial", methods=["Arm"], action="refuse"), "AccessControl has no action"),
+    ("names that differ only in case and hyphens", app(CLOUD | {"name": "DataStore"}, CLOUD | {"name": "data-store"}), "component names must differ in more than capitalisation and hyphens"),
     ("control of a passenger", app(GUIDED | {"control": "full"}), "control is only allowed for class driver"),
-    ("port of a system name", app(CLOUD | {"container": {"image": "app", "ports": [{"port": 1, "name": "port-2"}]}}), "names that begin with port- are reserved for ports without a name"),
-    ("ports of one name", app(CLOUD | {"container": {"image": "app", "ports": [{"port": 1, "name": "a"}, {"port": 2, "name": "a"}]}}), "port names must be unique"),
-    ("variable of the system", app(CLOUD | {"container": {"image": "app", "env": [{"name": "FRACTUS_NODE"}]}}), "names that begin with FRACTUS_ are reserved"),
+    ("reserved port name", app(CLOUD | {"container": {"image": "app", "ports": [{"port": 1, "name": "port-2"}]}}), "names that begin with port- are reserved for ports without a name"),
+    ("two ports with one name", app(CLOUD | {"container": {"image": "app", "ports": [{"port": 1, "name": "a"}, {"port": 2, "name": "a"}]}}), "port names must be unique"),
+    ("reserved environment variable", app(CLOUD | {"container": {"image": "app", "env": [{"name": "FRACTUS_NODE"}]}}), "names that begin with FRACTUS_ are reserved"),
     ("unknown resource", resources(requests={"disk": 1}), "a resource must be cpu, memory"),
     ("request above the limit", resources(requests={"cpu": 2}, limits={"cpu": "1500m"}), "a request must not be above the limit"),
     ("extended resource without limit", resources(requests={"a.b/c": 2}), "an extended resource needs a limit that is equal to its request"),
-    ("half a device", resources(limits={"a.b/c": "500m"}), "limits of extended resources must be whole numbers"),
-    ("volume of the pod", volume(claim="c", name="tls"), "the volumes tls and tmp at"),
-    ("volumes at one place", app(CLOUD | {"container": CONTAINER | {"volumes": [{"name": n, "mountPath": "/v", "claim": "c"} for n in "vw"]}}), "mountPath must be unique"),
+    ("half of an extended resource", resources(limits={"a.b/c": "500m"}), "limits of extended resources must be whole numbers"),
+    ("reserved volume name", volume(claim="c", name="tls"), "the volumes tls and tmp at"),
+    ("two volumes with one mount path", app(CLOUD | {"container": CONTAINER | {"volumes": [{"name": n, "mountPath": "/v", "claim": "c"} for n in "vw"]}}), "mountPath must be unique"),
     ("edge node that flies", body("EdgeNode", {"location": HERE, "services": {"mobility": {"maxAltitude": 1, "maxFlightTime": 1, "maxSpeed": 1, "methods": ["Arm"]}}}), "an edge node cannot fly"),
-    ("gimbal on a mast", body("EdgeNode", {"location": HERE, "services": {"camera": {"methods": ["CaptureImage"], "mount": {"gimbal": True}}}}), "an edge node has no gimbal"),
-    ("drone on a mast", body("Drone", {"services": {"camera": {"methods": ["CaptureImage"], "mount": {"height": 5}}}}), "mount.height applies to cameras of edge nodes only"),
+    ("edge node with a gimbal", body("EdgeNode", {"location": HERE, "services": {"camera": {"methods": ["CaptureImage"], "mount": {"gimbal": True}}}}), "an edge node has no gimbal"),
+    ("drone with a mount height", body("Drone", {"services": {"camera": {"methods": ["CaptureImage"], "mount": {"height": 5}}}}), "mount.height applies to cameras of edge nodes only"),
     ("fisheye with polynomials", body("Drone", {"services": {"camera": {"methods": ["CaptureImage"], "lens": {"model": "equidistant", "k1": 0.1}}}}), "distortion coefficients belong to model brownConrady"),
-    ("depot that no one can name", body("Depot", {"location": HERE}) | {"metadata": {"name": "a.b"}}, "the name of a Depot must have at most 63"),
-    ("zone that no one can name", zone() | {"metadata": {"name": "a.b"}}, "the name of a Zone must have at most 63"),
+    ("depot name with a dot", body("Depot", {"location": HERE}) | {"metadata": {"name": "a.b"}}, "the name of a Depot must have at most 63"),
+    ("zone name with a dot", zone() | {"metadata": {"name": "a.b"}}, "the name of a Zone must have at most 63"),
     ("depot without radius", body("Depot", {"location": HERE, "radius": 0}), "should be greater than 0"),
 ]  # fmt: skip
 
@@ -190,7 +190,7 @@ def test_bad_manifest_is_refused_at_apply_with_reason(
 
 
 def rules(schema: Body) -> Iterator[str]:
-    """The sentences of all CEL rules of a schema, at any depth."""
+    """Yield the messages of all CEL rules of a schema, at any depth."""
     yield from (rule["message"] for rule in schema.get("x-kubernetes-validations", ()))
     for inner in (*schema.get("properties", {}).values(), schema.get("items")):
         if isinstance(inner, dict):
@@ -219,7 +219,7 @@ def test_every_validation_rule_has_a_bad_manifest() -> None:
 
 @pytest.fixture(scope="module")
 def https(control_plane: ControlPlane) -> urllib.request.OpenerDirector:
-    """HTTPS client that sends YAML text unchanged, so that the API server parses it."""
+    """HTTPS client of the API server. It sends YAML text unchanged, so that the API server parses the YAML."""
     credential = control_plane.authority.issue("corpus", common_name="corpus", organizations=("system:masters",))
     context = ssl.create_default_context(cafile=control_plane.ca)
     context.load_cert_chain(credential.certificate, credential.key)
@@ -229,7 +229,7 @@ def https(control_plane: ControlPlane) -> urllib.request.OpenerDirector:
 def test_corpus_verdicts_of_api_server_equal_those_of_plan_command(
     control_plane: ControlPlane, https: urllib.request.OpenerDirector
 ) -> None:
-    """The unit tests of the corpus check the same verdicts with `fractus plan`."""
+    """Unit tests check that `fractus plan` gives the same verdicts for the same corpus."""
     taken = {case: all(not _refusal(control_plane, https, text) for text in case.documents) for case in CASES}
     assert [case for case, was in taken.items() if was == bool(case.refused)] == []
 
@@ -244,7 +244,7 @@ TOKENS = [
 def test_yaml_scalars_have_same_types_as_in_api_server(
     control_plane: ControlPlane, https: urllib.request.OpenerDirector, tmp_path: Path
 ) -> None:
-    """A number is valid as a radius but not as an annotation, and a string vice versa."""
+    """Use each scalar as a radius, which must be a number, and as an annotation, which must be a string."""
     rng = random.Random(1)
     head = "apiVersion: fractus.dev/v1alpha1\nkind: Depot\nmetadata:\n  name: x\n  annotations:\n    a: "
     taken = 0
@@ -344,7 +344,7 @@ CHOICES: dict[str, list[Any]] = {
     "limits": [{"cpu": "1.5"}, {"cpu": 1}, {"a.b/c": "1"}, {"a.b/c": "0.5"}, {"memory": "1G"}],
     "mount": [{"height": 5}, {"pitch": -90}, {"gimbal": True}], "mobility": [{"maxSpeed": 5}], "resolution": ["640x480", "640"],
 }  # fmt: skip
-"""Replacement values by field. They may be valid or invalid, alone or in combination with other fields."""
+"""Replacement values by field. Some are valid, some are invalid, some are invalid only with certain other fields."""
 
 ODD: list[Any] = [
     "5",
@@ -368,14 +368,14 @@ ODD: list[Any] = [
 
 
 def objects(value: Any) -> Iterator[Body]:
-    """Every object below a value."""
+    """Yield every object inside a value, at any depth."""
     for inner in value.values() if isinstance(value, dict) else value if isinstance(value, list) else ():
         yield from ([inner] if isinstance(inner, dict) else [])
         yield from objects(inner)
 
 
 def mutated(rng: random.Random, manifest: Body) -> Body:
-    """A manifest with one to three fields taken out, changed, or put in."""
+    """Return the manifest with one to three fields removed, changed or added."""
     changed = copy.deepcopy(manifest)
     for _ in range(rng.randint(1, 3)):
         place = rng.choice([changed["spec"], *objects(changed["spec"])])
@@ -392,7 +392,7 @@ def mutated(rng: random.Random, manifest: Body) -> Body:
 
 
 def schema_of(place: Body) -> set[str]:
-    """Return the possible fields of an object: the fields of all shapes that have every field of the object."""
+    """Return the fields that the object may have: the fields of all schemas that contain each field of the object."""
     keys: set[str] = set()
     for fields in SHAPES:
         if place.keys() <= fields:
@@ -401,7 +401,7 @@ def schema_of(place: Body) -> set[str]:
 
 
 def shapes(schema: Body) -> Iterator[set[str]]:
-    """The sets of fields of all objects in a schema."""
+    """Yield the set of fields of each object type in a schema."""
     if "properties" in schema:
         yield set(schema["properties"])
     for inner in (*schema.get("properties", {}).values(), schema.get("items")):
@@ -418,7 +418,7 @@ SHAPES = [
 
 @pytest.mark.parametrize("seed", range(len(GOOD)))
 def test_api_server_and_models_refuse_same_random_manifests(control_plane: ControlPlane, seed: int) -> None:
-    """Randomly changed manifests evaluate both forms of every rule on the same objects."""
+    """Each rule exists in the CRD and in the models. Compare both on the same randomly changed manifests."""
     rng = random.Random(seed)
     refused = 0
     model = MODELS[GOOD[seed]["kind"]]

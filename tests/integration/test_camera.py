@@ -112,7 +112,9 @@ async def test_edge_node_camera_captures_lists_and_deletes_pictures(rig: Rig) ->
     assert [i.name for i in listed.images] == [taken.image.name, large.image.name]
 
     code, why = await denied(retrieve(stub(rig, address, DRIVER), taken.image.name))
-    assert (code, why.code) == (grpc.StatusCode.NOT_FOUND, "NoSuchImage"), "pictures are their taker's"
+    assert (code, why.code) == (grpc.StatusCode.NOT_FOUND, "NoSuchImage"), (
+        "the driver retrieved a picture of the passenger"
+    )
     code, why = await denied(retrieve(camera, "../../../etc/passwd"))
     assert code == grpc.StatusCode.NOT_FOUND
     await camera.DeleteImage(camera_pb2.DeleteImageRequest(name=taken.image.name), timeout=5)
@@ -130,7 +132,9 @@ async def test_camera_uses_changed_node_description_at_once(rig: Rig) -> None:
     handed = rig.directory / "node.json"
     handover = NodeObjectFile(handed)
     camera = stub(rig, rig.start_camera("--node-object", str(handed)))
-    assert (await denied(capture(camera)))[1].code == "PositionUnknown", "not even the kind of node is known"
+    assert (await denied(capture(camera)))[1].code == "PositionUnknown", (
+        "the service took a picture before it knew its node"
+    )
     await rig.until_logged("camera", "the camera counts as seeing everything (missing=services.camera)")
 
     async def becomes(code: str) -> None:
@@ -169,7 +173,7 @@ async def until_refused(call: Any) -> tuple[grpc.StatusCode, types_pb2.Decision]
         except grpc.aio.AioRpcError:
             return await denied(call())
         await asyncio.sleep(0.05)
-    raise AssertionError("the new policy has no effect")
+    raise AssertionError("the new policy had no effect on the stored picture")
 
 
 async def test_later_policy_applies_to_stored_pictures(rig: Rig) -> None:
@@ -192,7 +196,9 @@ async def test_later_policy_applies_to_stored_pictures(rig: Rig) -> None:
             break
         await asyncio.sleep(0.05)
     assert list(chunks[0].decision.policies) == ["privacy"]
-    assert "blurAverage is applied" in chunks[0].decision.reason, "4 m up, 640 pixels: too few for faces"
+    assert "blurAverage is applied" in chunks[0].decision.reason, (
+        "faces cannot be detected at 640 pixels from 4 m, so the fallback blurAverage must be applied"
+    )
     blurred = b"".join(c.data for c in chunks)
     assert len(blurred) == chunks[0].image.size_bytes < len(plain)
     assert not chunks[0].image.HasField("position")
@@ -211,7 +217,7 @@ async def test_later_policy_applies_to_stored_pictures(rig: Rig) -> None:
 
 @pytest.fixture
 def noise_url() -> Iterator[str]:
-    """A camera whose pictures cannot be compressed."""
+    """URL of a picture of random noise, which cannot be compressed."""
     picture = np.random.default_rng(1).integers(0, 256, (1800, 2400, 3), np.uint8)
     data = cv2.imencode(".png", picture, [cv2.IMWRITE_PNG_COMPRESSION, 0])[1].tobytes()
 
@@ -222,7 +228,7 @@ def noise_url() -> Iterator[str]:
             self.wfile.write(data)
 
         def log_message(self, *_: Any) -> None:
-            """Tests are quiet."""
+            """Log no requests."""
 
     server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Snapshots)
     threading.Thread(target=server.serve_forever, daemon=True).start()
@@ -241,7 +247,7 @@ async def test_changed_grant_ends_capture_in_progress(rig: Rig, noise_url: str, 
 
     path = write()
     address = rig.start_camera("--camera", noise_url, description=EDGE)
-    # Without this option, the gRPC library of the client reads megabytes ahead of the program on a fast link.
+    # Disable bdp_probe. Otherwise the client's gRPC library reads megabytes ahead of the program on a fast link.
     camera = camera_pb2_grpc.CameraServiceStub(
         rig.channel(PASSENGER, address=address, options=(("grpc.http2.bdp_probe", 0),))
     )
@@ -293,7 +299,7 @@ async def test_ip_camera_is_used_again_after_failure(rig: Rig) -> None:
             self.wfile.write(data)
 
         def log_message(self, *_: Any) -> None:
-            """Tests are quiet."""
+            """Log no requests."""
 
     server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Snapshots)
     threading.Thread(target=server.serve_forever, daemon=True).start()
@@ -301,7 +307,9 @@ async def test_ip_camera_is_used_again_after_failure(rig: Rig) -> None:
         url = f"http://user:secret@127.0.0.1:{server.server_address[1]}/snapshot.jpg"
         camera = stub(rig, rig.start_camera("--camera", url, description=EDGE))
         taken = await capture(camera, width=320, height=320)
-        assert requests == ["/snapshot.jpg?width=427&height=320"], "in the camera's own proportions"
+        assert requests == ["/snapshot.jpg?width=427&height=320"], (
+            "the requested size does not have the proportions of the camera"
+        )
         data = await retrieve(camera, taken.image.name)
         shown = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
         assert shown.shape == (320, 320, 3)
@@ -324,7 +332,7 @@ async def test_ip_camera_is_used_again_after_failure(rig: Rig) -> None:
 
 
 BILLBOARD = (39.36009591, 22.95004318)
-"""A lying picture of a face in the simulated landscape."""
+"""Position of a picture of a face that lies on the ground of the simulated landscape."""
 
 
 async def test_face_in_simulated_world_is_blurred(rig: Rig) -> None:
@@ -369,7 +377,7 @@ async def test_face_in_simulated_world_is_blurred(rig: Rig) -> None:
     fine = [np.abs(np.diff(p[face], axis=1)) for p in (plain, hidden)]
     assert (fine[1] > 4).mean() < 0.35 * (fine[0] > 4).mean()
     border = np.s_[:, :60]
-    assert np.abs(plain[border] - hidden[border]).mean() < 12, "nothing else is touched"
+    assert np.abs(plain[border] - hidden[border]).mean() < 12, "the filter changed pixels outside the face"
     assert np.abs(plain[face] - hidden[face]).mean() > 5
 
 
@@ -417,7 +425,7 @@ async def test_drone_camera_is_refused_over_privacy_zone(rig: Rig) -> None:
                     return (await denied(capture(camera)))[1]
             for shot in (await camera.ListImages(camera_pb2.ListImagesRequest(), timeout=5)).images:
                 await camera.DeleteImage(camera_pb2.DeleteImageRequest(name=shot.name), timeout=5)
-            await asyncio.sleep(0.1)  # well below the limit on calls a second
-        raise AssertionError("the service still takes pictures without a position")
+            await asyncio.sleep(0.1)  # below the rate limit of the service
+        raise AssertionError("the service takes pictures although the position is unknown")
 
     assert (await until_unknown()).code in {"PositionUnknown", "PrivacyZone"}

@@ -48,7 +48,7 @@ def eventually(poll: Callable[[], int | None], timeout_s: float = 60.0) -> int:
 
 
 def wait_for_picture(port: int, path: str) -> tuple[int, dict[str, str], bytes]:
-    """Return the first response with a picture. On a busy machine, a vehicle may be silent for a while."""
+    """Return the first response with a picture. On a busy machine, the messages of the vehicle may arrive late."""
     responses: list[tuple[int, dict[str, str], bytes]] = []
 
     def status_if_ok() -> int | None:
@@ -79,7 +79,7 @@ def running_world(*arguments: str) -> Iterator[int]:
 
 @pytest.fixture
 def served() -> Iterator[CameraServer]:
-    """A server in this process, with a camera at a fixed position."""
+    """Camera server in this process. Its camera has a fixed position."""
     frame_pose = Pose(50.8637, 4.6785, 40.0, yaw_deg=20.0)
     api = CameraApi(
         WorldAround(7, (50.8637, 4.6785)), FixedPose(frame_pose), Intrinsics(320, 180), Mount(), now=lambda: 1000.0
@@ -102,7 +102,7 @@ def picture_of(body: bytes) -> np.ndarray:
 
 
 def test_camera_world_follows_vehicle_and_its_restart() -> None:
-    """The server returns 503 while no vehicle is connected, and pictures while one is."""
+    """The server returns pictures while a vehicle is connected, and otherwise 503."""
     links = [f"tcp:127.0.0.1:{free_port()}" for _ in range(2)]
     origin = f"{HOME[0]},{HOME[1]}"
     small = "/snapshot.jpg?width=320&height=180"
@@ -132,12 +132,14 @@ def test_camera_world_truth_belongs_to_its_snapshot(served: CameraServer) -> Non
     status, headers, first = get(served.port, "/snapshot.jpg?time=77.5")
     assert status == 200
     assert headers["X-Fractus-Time"] == "77.500"
-    assert get(served.port, "/snapshot.jpg?time=77.5")[2] == first, "same pose and time, but different bytes"
+    assert get(served.port, "/snapshot.jpg?time=77.5")[2] == first, "two pictures with the same pose and time differ"
     assert get(served.port, "/snapshot.jpg?time=77.5&band=ir")[2] != first
     truth = json.loads(get(served.port, f"/truth.json?snapshot={headers['X-Fractus-Snapshot']}")[2])
     assert truth["time"] == 77.5
     assert truth["band"] == "rgb"
-    assert json.loads(get(served.port, "/truth.json")[2])["band"] == "ir", "without a number, not the last snapshot"
+    assert json.loads(get(served.port, "/truth.json")[2])["band"] == "ir", (
+        "without a snapshot number, the truth does not belong to the last snapshot"
+    )
 
 
 def test_camera_world_serves_orthophoto_and_page(served: CameraServer) -> None:
@@ -183,7 +185,7 @@ def test_camera_world_rejects_bad_request_with_reason(served: CameraServer, path
 
 
 def test_camera_world_disconnects_idle_and_slow_clients(served: CameraServer, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Clients that send no complete request occupy all connections. They are disconnected and cause no picture."""
+    """Clients without a complete request occupy all connections. The server disconnects them and renders no picture."""
     monkeypatch.setattr(server_module, "CLIENT_LIFE_S", 0.5)
     monkeypatch.setattr(server_module, "MAX_CLIENTS", 8)
     idle = [socket.create_connection(("127.0.0.1", served.port), timeout=5) for _ in range(24)]

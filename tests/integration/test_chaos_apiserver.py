@@ -17,7 +17,7 @@ pytestmark = pytest.mark.slow
 
 
 def status(client: BlockingClient) -> int:
-    """Return the status of a request that no account may make."""
+    """Send a request that no account may make, and return the HTTP status of its refusal."""
     with pytest.raises(KubeError) as refusal:
         client.get("/api/v1/namespaces/default/secrets/any")
     return refusal.value.status
@@ -44,6 +44,6 @@ def test_api_server_rejects_only_accounts_of_fractus_with_429(control_plane: Con
     finally:
         for body in reversed(rules):
             control_plane.admin.delete(path_of(body))
-    wait_for(lambda: all(status(account) == 403 for account in accounts), "a response other than 429")
+    wait_for(lambda: all(status(account) == 403 for account in accounts), "refusals with 403 instead of 429")
     for client in (*accounts, stranger):
         client.close()

@@ -24,7 +24,7 @@ CASES = {
 
 
 def made(chart: str, *arguments: str) -> str:
-    """The objects of a chart in one order, whatever its version is: a release changes no golden file."""
+    """Return the objects of a chart as sorted YAML. Replace the version, so that a release changes no golden file."""
     bodies = render(*arguments, chart=chart)
     bodies.sort(key=lambda body: (body["kind"], body["metadata"].get("namespace", ""), body["metadata"]["name"]))
     version = yaml.safe_load((CHARTS / chart / "Chart.yaml").read_text())["version"]
@@ -60,7 +60,7 @@ def test_chart_golden_case_sets_every_value(chart: str) -> None:
 
 
 def test_crds_chart_renders_generated_crds_with_keep_policy() -> None:
-    """The golden files of fractus-crds are crds/*.yaml."""
+    """The files crds/*.yaml serve as the golden files of fractus-crds."""
     for keep, kept in ((True, {"helm.sh/resource-policy": "keep"}), (False, {})):
         bodies = {
             body["metadata"]["name"]: body for body in render(f"--set=keep={str(keep).lower()}", chart="fractus-crds")

@@ -49,7 +49,7 @@ FOR_THE_CLOUD = FOR_PLACED | {
 
 @cache
 def templates(*arguments: str, chart: str = "fractus") -> dict[str, Body]:
-    """The pods' templates of each workload, by its part."""
+    """Return the pod template of each workload, by its component label."""
     bodies = [body for body in render(*arguments, chart=chart) if body["kind"] in {"Deployment", "DaemonSet", "Job"}]
     return {body["metadata"]["labels"]["app.kubernetes.io/component"]: body["spec"]["template"] for body in bodies}
 
@@ -135,7 +135,7 @@ def test_node_workload_has_node_priority_and_tolerates_all_taints(part: str) -> 
 
 def test_operator_replicas_prefer_different_nodes() -> None:
     anti_affinity = plain()["operator"]["spec"]["affinity"]["podAntiAffinity"]
-    assert set(anti_affinity) == {RATHER}, "two replicas on one node are better than one replica"
+    assert set(anti_affinity) == {RATHER}, "a required rule would prevent two replicas on one node"
     assert {term["podAffinityTerm"]["topologyKey"]: term["weight"] for term in anti_affinity[RATHER]} == {
         "kubernetes.io/hostname": 100,
         "topology.kubernetes.io/zone": 50,
@@ -175,7 +175,7 @@ def test_reserved_pod_label_is_refused(name: str) -> None:
 
 @pytest.mark.parametrize(("chart", "more"), [("fractus", ()), ("fractus-demo", (DRONE,))])
 def test_invalid_image_tag_is_refused(chart: str, more: tuple[str, ...]) -> None:
-    """A kubelet accepts no digest as a tag, so every node would wait for its services."""
+    """A kubelet refuses a digest in the place of a tag, so no service would start."""
     for tag in (f"sha256:{64 * '0'}", f"1.0@sha256:{64 * '0'}", "-x", 129 * "x"):
         assert "image/tag" in refusal(f"--set-string=image.tag={tag}", *more, chart=chart)
     for tag in ("", "1.2.3_amd64-rc.1"):
@@ -224,7 +224,7 @@ def test_node_services_have_no_liveness_probe(part: str) -> None:
 
 def test_operator_network_policy_opens_exactly_its_ports() -> None:
     (policy,) = (b for b in render() if (b["kind"], b["metadata"]["name"]) == ("NetworkPolicy", "fractus-operator"))
-    assert policy["spec"]["policyTypes"] == ["Ingress"], "egress is not restricted"
+    assert policy["spec"]["policyTypes"] == ["Ingress"], "the policy restricts egress"
     pod = templates()["operator"]
     assert policy["spec"]["podSelector"]["matchLabels"].items() <= pod["metadata"]["labels"].items()
     (rule,) = policy["spec"]["ingress"]

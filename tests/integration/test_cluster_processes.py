@@ -33,7 +33,7 @@ def wait_until(condition: Callable[[], bool], description: str, timeout_s: float
 
 @pytest.fixture
 def sleeper(tmp_path: Path) -> Iterator[ProcessRecord]:
-    """A process that sleeps."""
+    """Record of a running `sleep` process."""
     record = spawn(["sleep", "300"], log=tmp_path / "log", env=ENVIRONMENT)
     yield record
     kill(record)
@@ -73,7 +73,7 @@ def test_process_has_separate_session(sleeper: ProcessRecord) -> None:
 
 @pytest.fixture
 def supervisor(tmp_path: Path) -> Iterator[Callable[..., subprocess.Popen[bytes]]]:
-    """Starts a supervisor with shell scripts as units."""
+    """Function that starts a supervisor whose units are shell scripts."""
     started: list[subprocess.Popen[bytes]] = []
 
     def start(**scripts: str) -> subprocess.Popen[bytes]:
@@ -120,13 +120,13 @@ def test_supervisor_starts_unit_when_its_required_file_exists(
     supervisor(patient="echo up; exec sleep 300", other="echo up; exec sleep 300")
     wait_until(
         lambda: (tmp_path / "other.log").exists() and (tmp_path / "other.log").read_text() == "up\n",
-        "the unit without a required file",
+        "the start of the unit without a required file",
     )
     assert not (tmp_path / "patient.log").exists()
     (tmp_path / "permission").touch()
     wait_until(
         lambda: (tmp_path / "patient.log").exists() and (tmp_path / "patient.log").read_text() == "up\n",
-        "the unit with a required file",
+        "the start of the unit with a required file",
     )
 
 
@@ -166,7 +166,7 @@ def test_supervisor_starts_other_units_if_a_program_is_missing(
     with subprocess.Popen(argv, stdout=subprocess.DEVNULL) as second:
         try:
             log = tmp_path / "present.log"
-            wait_until(lambda: log.exists() and "up" in log.read_text(), "the unit whose program exists")
+            wait_until(lambda: log.exists() and "up" in log.read_text(), "the start of the unit whose program exists")
         finally:
             second.kill()
 

@@ -18,7 +18,7 @@ from fractus_cluster.images.receiver import receiving
 
 @pytest.fixture
 def layout(tmp_path: Path) -> Layout:
-    """An empty layout."""
+    """An empty OCI image layout."""
     layout = Layout(tmp_path / "layout")
     layout.create()
     return layout
@@ -46,7 +46,7 @@ def image(tmp_path: Path) -> Iterator[str]:
 
 
 @pytest.mark.root
-def test_receiver_stores_image_of_buildah_uncompressed(layout: Layout, image: str) -> None:
+def test_receiver_stores_pushed_image_uncompressed(layout: Layout, image: str) -> None:
     with receiving(layout) as address:
         buildah("push", "--quiet", "--tls-verify=false", image, f"docker://{address}/{image}")
     received = layout.image(image)
@@ -59,7 +59,7 @@ def test_receiver_stores_image_of_buildah_uncompressed(layout: Layout, image: st
 
 
 @pytest.mark.root
-def test_receiver_gets_no_layer_again_in_second_push(layout: Layout, image: str) -> None:
+def test_second_push_transfers_no_layer_again(layout: Layout, image: str) -> None:
     with receiving(layout) as address:
         buildah("push", "--quiet", "--tls-verify=false", image, f"docker://{address}/{image}")
     written = {path.name: path.stat().st_mtime_ns for path in (layout.path / "blobs" / "sha256").iterdir()}
@@ -92,7 +92,7 @@ def test_receiver_refuses_blob_with_wrong_digest(layout: Layout) -> None:
         assert layout.blob(digest).read_bytes() == b"content"
 
 
-def test_receiver_finds_compressed_layer_by_digest_of_its_content(layout: Layout) -> None:
+def test_receiver_finds_compressed_layer_by_digest_of_uncompressed_layer(layout: Layout) -> None:
     packed = gzip.compress(b"layer" * 1000)
     plain = "sha256:" + hashlib.sha256(b"layer" * 1000).hexdigest()
     with receiving(layout) as address:

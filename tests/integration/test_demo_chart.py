@@ -1,4 +1,4 @@
-"""The chart fractus-demo: the example's surroundings on a cluster whose nodes have other names."""
+"""The chart fractus-demo: nodes, zones, policies and Applications of the example, with the node names of a cluster."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def test_demo_chart_omits_vehicle_if_disabled() -> None:
 
 
 def applications(*values: str) -> dict[str, dict[str, Any]]:
-    """The applications that the chart keeps, by their names."""
+    """Return the Applications in the chart's ConfigMap, by name."""
     data = objects("drone=d", *values)["ConfigMap", "demo-applications"]["data"]
     return {name: yaml.safe_load(text) for name, text in data.items()}
 
@@ -77,7 +77,9 @@ def test_demo_chart_applications_use_its_registry_and_tag() -> None:
 def test_demo_chart_applications_have_configured_resources() -> None:
     for body in applications("example.resources.requests.cpu=1m").values():
         assert all(container["resources"] == {"requests": {"cpu": "1m"}} for container in containers(body))
-    assert applications("example=null") == applications(), "`helm upgrade --reuse-values` from a chart without it"
+    assert applications("example=null") == applications(), (
+        "values without `example`, which `helm upgrade --reuse-values` keeps, change the result"
+    )
 
 
 def test_demo_chart_notes_name_existing_application() -> None:

@@ -1,4 +1,4 @@
-"""Commands by which pages look at a cluster, on a real API server with an operator, an application and reports of nodes."""
+"""Run the documented commands that show the state of a cluster, on a real API server with an operator."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ pytestmark = pytest.mark.slow
 DRONE = f"{FRACTUS}/drones/drone-1"
 NAME = "traffic-monitoring"
 PODS = 7
-"""Pods of that application."""
+"""Number of pods of the example application."""
 
 HEAD = f"mobility:7:{'a' * 64}"
 
@@ -45,7 +45,7 @@ COMMANDS = {
     "kubectl get grants": "traffic-monitoring-navigator",
     "kubectl get policies,zones,depots,drones,edgenodes,applications -A -o yaml": "kind: List",
 }
-"""Commands of the pages, with a pattern of their output. NAME stands for an object of the kind."""
+"""Documented commands, each with a pattern of its output. NAME stands for the name of an object of the kind."""
 
 
 def furnish(world: World, shell: Shell) -> None:

@@ -1,4 +1,4 @@
-"""Procedure of docs/standalone.md, a flight without Kubernetes, and commands of other pages for its files."""
+"""Run the flight without Kubernetes of docs/standalone.md, and commands of other pages on the files of the flight."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Flown:
 
 
 def command_in_sentence(beginning: str) -> str:
-    """Return the command between backticks with this beginning."""
+    """Return the command with this beginning that the page shows between backticks."""
     match = re.search(rf"`({beginning}[^`]*)`", TEXT)
     assert match is not None, beginning
     return match[1]
@@ -66,7 +66,7 @@ def serving_process(shell: Shell, folder: Path, line: str) -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory: pytest.TempPathFactory) -> Flown:
-    """The flight of the page, with recordings enabled as docs/recordings.md does."""
+    """Fly as docs/standalone.md describes, with recordings as docs/recordings.md describes."""
     folder = tmp_path_factory.mktemp("standalone")
     shell = Shell(folder)
     ports = {known: str(free_port()) for known in ("50051", "50052", "5760")}

@@ -55,14 +55,14 @@ def test_experiment_output_is_readable_by_standard_tools(tmp_path: Path) -> None
     checks = [{"check": "landed"}, {"check": "reached", "north": 15, "east": 0}]
     outcome = run(parse(content(vehicles=[slow], faults=[GUST], checks=checks)), tmp_path)
     leg = [s.speed_mps for s in outcome.flights["d"].track.samples if s.mode == "GUIDED"]
-    assert max(leg) < 4.0, "the leg is flown at the speed of the step before it"
+    assert max(leg) < 4.0, "the vehicle flew faster than the speed that the previous step sets"
     log = mavutil.mavlink_connection(str(tmp_path / "logs" / "d.tlog"))
     seen: set[tuple[str, int]] = set()
     while (message := log.recv_match()) is not None:
         seen.add((message.get_type(), message.get_srcSystem()))
     log.close()
-    assert ("GLOBAL_POSITION_INT", 1) in seen, "sent by the vehicle"
-    assert ("SET_POSITION_TARGET_GLOBAL_INT", 255) in seen, "sent by the ground station"
+    assert ("GLOBAL_POSITION_INT", 1) in seen, "the log has no message of the vehicle"
+    assert ("SET_POSITION_TARGET_GLOBAL_INT", 255) in seen, "the log has no message of the ground station"
     with (tmp_path / "logs" / "short.mcap").open("rb") as file:
         messages = [
             (channel.topic, json.loads(message.data)) for _, channel, message in make_reader(file).iter_messages()
@@ -131,7 +131,7 @@ link.motors_disarmed_wait()
 """
 
 
-def test_program_flies_a_vehicle_faster_than_real_time(tmp_path: Path) -> None:
+def test_program_flies_the_vehicle_faster_than_real_time(tmp_path: Path) -> None:
     (tmp_path / "fly.py").write_text(PROGRAM)
     program = {"name": "fly", "command": ["python", "fly.py"], "vehicle": "d"}
     vehicle = {"name": "d", "home": HOME, "readyAfter": 2}
@@ -233,7 +233,7 @@ def test_no_process_outlives_an_interrupted_runner(
 
 
 def all_ended(mark: Path) -> bool:
-    """Return True if all processes with the mark in their command line end before a timeout."""
+    """Return True if all processes with the mark in their command line end within 20 s."""
     deadline = time.monotonic() + 20
     while subprocess.run(["pgrep", "-f", str(mark)], capture_output=True, check=False).stdout:
         if time.monotonic() > deadline:

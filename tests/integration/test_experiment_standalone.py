@@ -41,7 +41,7 @@ except fractus.FractusError as lost:  # the autopilot may have returned home bef
 
 
 def wait_for_output(drones: Standalone, text: str, count: int) -> None:
-    """Wait until the output of the program contains a text a number of times."""
+    """Wait until the output of the program contains the text `count` times."""
     log = drones.processes.log("pilot")
     deadline = time.monotonic() + 60
     while log.read_text().count(text) < count:
@@ -72,7 +72,7 @@ def test_program_flies_until_its_companion_computer_loses_power(tmp_path: Path) 
     log = mavutil.mavlink_connection(tlog)
     takeoff = log.recv_match(type="COMMAND_LONG", condition="COMMAND_LONG.command==22")
     log.close()
-    assert takeoff is not None, "the tlog contains the commands of the service"
+    assert takeoff is not None, "the tlog lacks the takeoff command of the service"
 
 
 def test_standalone_rejects_invalid_use_immediately(tmp_path: Path) -> None:

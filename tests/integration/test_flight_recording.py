@@ -1,4 +1,4 @@
-"""Recordings of a real flight, read by foreign tools."""
+"""Recordings of a real flight, read by third-party tools."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def messages(directory: Path) -> dict[str, list[Any]]:
 
 
 def frames(directory: Path) -> set[tuple[str, int]]:
-    """Types of messages with the systems that sent them."""
+    """Return the types of the recorded messages, each with the system id of its sender."""
     names = set()
     for path in directory.glob("*.tlog"):
         log = mavutil.mavlink_connection(str(path))
@@ -46,7 +46,7 @@ def sizes(directory: Path) -> list[int]:
 
 
 async def flushed(directory: Path) -> None:
-    """Wait until a good part of a flight is on the disk."""
+    """Wait until a large part of the flight is on the disk."""
     async with asyncio.timeout(60):
         while True:
             if any(size > 20_000 for size in sizes(directory)):
@@ -59,7 +59,7 @@ def indexed(directory: Path) -> bool:
 
 
 async def completed(directory: Path) -> None:
-    """Wait until the recordings of earlier runs of the service have an index."""
+    """Wait until the service has written the missing indexes of recordings of its earlier runs."""
     async with asyncio.timeout(120):
         while True:
             if indexed(directory):
@@ -153,7 +153,7 @@ def test_chart_value_enables_recordings() -> None:
 
     directory = "/var/lib/fractus/recordings"
     assert arguments("mobility") == ["--recordings", f"{directory}/mobility", "--recordings-mb", "500"]
-    assert not arguments("camera"), "pictures are copied only where that is wanted"
+    assert not arguments("camera"), "the camera service records pictures although its recordings are not enabled"
     assert not arguments("mobility", "--set", "mobility.recordings.enabled=false")
     more = ("--set", "camera.recordings.enabled=true", "--set", "camera.recordings.megabytes=2000000")
     assert arguments("camera", *more) == ["--recordings", f"{directory}/camera", "--recordings-mb", "2000000"]

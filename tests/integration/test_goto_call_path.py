@@ -1,4 +1,4 @@
-"""The call path of one `Goto`: every function of this repository from the SDK call to the first byte on the link.
+"""Limit the call path of one `Goto`: the functions of this repository between the SDK call and the first byte sent.
 
 The number of files and functions is the amount that an engineer has to read to follow one call. It must not grow.
 """
@@ -26,7 +26,7 @@ from fractus_services.options import MobilityOptions
 from mobility_rig import DRIVER, FRAME, NODE, Rig, altitude_limit, fence, grant
 
 MAX_FILES = 38
-MAX_FUNCTIONS = 120  # varies by a few with the timing of telemetry
+MAX_FUNCTIONS = 120  # the timing of telemetry changes the number by a few
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 VALUE_METHODS = frozenset({"__init__", "__new__", "__post_init__", "__eq__", "__hash__", "__bool__", "__len__"})
@@ -36,14 +36,14 @@ _traced: contextvars.ContextVar[bool] = contextvars.ContextVar("traced", default
 
 
 class CallPath:
-    """Records the functions of this repository that run on behalf of one call, up to the first byte on the link.
+    """Records the functions of this repository that one call runs, up to its first byte on the MAVLink link.
 
-    A function counts if it runs in a task that began after the recording (the SDK call, gRPC's task of the handler, and
-    the tasks and threads that these start). Tasks that ran before, such as heartbeats, telemetry and the monitor, do not
+    A function counts if it runs in a task that was created during the recording: the SDK call, gRPC's task of the
+    handler, and tasks and threads that these start. Earlier tasks, such as heartbeats and telemetry, do not
     count. Comprehensions, lambdas and nested functions count as part of the function that contains them.
 
-    Data access is not a step that a reader follows, so properties, constructors and other double underscore methods of
-    values do not count.
+    Properties, constructors and other special methods of values do not count, because a reader does not follow data
+    access.
     """
 
     def __init__(self) -> None:
@@ -83,7 +83,7 @@ class CallPath:
             self.sent.set()
 
     def _counts(self) -> bool:
-        """Return True in a task of the call, and in threads that such a task starts."""
+        """Return True if the current function runs in a task of the call, or in a thread that such a task started."""
         if _traced.get():
             return True
         try:
@@ -130,7 +130,7 @@ def _properties(file: str) -> frozenset[str]:
 
 
 def _sends(function: Any) -> bool:
-    """Return True for a socket's `send`. The sockets of gRPC are not Python's, so this is the link's."""
+    """Return True for `socket.send`. It is a call of the MAVLink link, because gRPC does not use Python's sockets."""
     return function.__name__ == "send" and isinstance(getattr(function, "__self__", None), socket.socket)
 
 
@@ -175,7 +175,7 @@ def endpoint(rig: Rig) -> Endpoint:
 
 
 async def record(call: Callable[[], Any]) -> CallPath:
-    """Start a motion, record its path to the first byte on the link, then wait until it is complete."""
+    """Start a motion, record the call path to its first byte on the link, and wait for the end of the motion."""
     path = CallPath()
 
     async def fly() -> None:
@@ -192,7 +192,7 @@ async def record(call: Callable[[], Any]) -> CallPath:
     return path
 
 
-async def test_goto_call_path_stays_within_its_number_of_files_and_functions(rig: Rig) -> None:
+async def test_goto_call_path_stays_within_its_limits(rig: Rig) -> None:
     rig.write_grant(grant(altitude_limit(2, 30), fence("no-fly", "exclusion", "ignore", -60, -10, -40, 10)))
     rig.start_vehicle(2.0)
     async with serving(rig), Mobility(endpoint(rig)) as drone, drone.control():

@@ -1,4 +1,4 @@
-"""Container images: they have what their programs import, unmodified packages, and a bill of materials."""
+"""Container images: their imports, unmodified packages, reproducible layers, and bill of materials."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ PACKAGES = {
     "view": ["fractus_view"],
     "sim": ["fractus_vehicle", "fractus_world", "fractus_radio", "fractus_sim", "fractus_cluster"],
 }
-"""Packages whose modules the image must be able to import. All other images are of components."""
+"""Packages whose modules the image must be able to import, by image. All other images contain a component."""
 LACKING = {
     "component": {"numpy", "kubernetes", "fractus_vehicle"},
     "operator": {"cv2", "fractus_vehicle"},
@@ -38,12 +38,12 @@ LACKING = {
     "mobility": {"cv2", "kubernetes", "fractus_vehicle"},
     "camera": {"kubernetes", "fractus_vehicle"},
 }
-"""Libraries of other images."""
+"""Libraries that an image must not contain, because only other images need them."""
 
 
 @pytest.fixture(scope="module")
 def image(request: pytest.FixtureRequest) -> Iterator[tuple[str, str]]:
-    """A target, and a container of its image."""
+    """Name of a build target, and a container that runs its image."""
     target: str = request.param
     build_images(ROOT, targets=[target], report=print)
     container = run(["buildah", "from", "--pull-never", image_name(target)]).stdout.strip()
@@ -86,7 +86,7 @@ def test_equal_sources_give_equal_layers(tmp_path: Path) -> None:
             shutil.copy2(source, copy)
     for name in ("Dockerfile", ".dockerignore"):
         shutil.copy(ROOT / name, checkout)
-    # This file is in no image. It keeps the second build from using the cached steps of the first.
+    # Add a file that is in no image, so that this build does not use cached steps of the first build.
     (checkout / "examples" / "another.txt").write_text(f"{time.time_ns()}\n")
     [image] = build_images(ROOT, targets=["component"], report=print)
     try:
@@ -97,7 +97,7 @@ def test_equal_sources_give_equal_layers(tmp_path: Path) -> None:
 
 
 def layers(image: str) -> list[str]:
-    """The digests of an image's layers."""
+    """Return the digests of the layers of an image."""
     described = json.loads(run(["buildah", "inspect", "--type", "image", image]).stdout)
     digests: list[str] = described["OCIv1"]["rootfs"]["diff_ids"]
     assert len(digests) > 2

@@ -21,7 +21,7 @@ TOKENS = {"apiVersion": "authentication.k8s.io/v1", "kind": "TokenRequest"}
 
 @pytest.fixture
 def kubelet(control_plane: ControlPlane, world: World, chart: None) -> Iterator[BlockingClient]:
-    """With the certificate of drone-1's kubelet."""
+    """API client with the certificate of the kubelet of drone-1."""
     client = control_plane.as_user("kubelet", "system:node:drone-1", ("system:nodes",))
     yield client
     client.close()
@@ -29,7 +29,7 @@ def kubelet(control_plane: ControlPlane, world: World, chart: None) -> Iterator[
 
 @pytest.fixture
 def pod_on(world: World, namespace: str) -> Callable[..., Body]:
-    """Makes a pod on a node, as the scheduler and the DaemonSets would."""
+    """Function that creates a pod on a node, like the scheduler and the DaemonSet controller."""
 
     def make(node: str, place: str = namespace, **spec: object) -> Body:
         return world.bound_pod(place, f"p-{uuid.uuid4().hex[:8]}", node, **spec)
@@ -133,7 +133,7 @@ def test_kubelet_creates_only_mirror_pods_of_its_node(
 def test_component_certificate_is_refused_by_api_server(
     control_plane: ControlPlane, world: World, tmp_path: Path
 ) -> None:
-    """The pod of an Application has no credentials for the API server, because it mounts no token."""
+    """Pods of Applications mount no token, so a component could only try its own certificate."""
     now = datetime.now(UTC)
     issued = Authority.generate(now).issue_component("spiffe://fractus.dev/ns/n/app/a/component/C/instance/i", now)
     for name, value in issued.items():

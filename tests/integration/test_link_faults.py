@@ -1,4 +1,4 @@
-"""Direct links after a loss of power, and with peers and strangers that do not play by the rules."""
+"""Direct links after a power loss, with faulty peers, and with an impostor at the address of the peer."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_nodes_recover_after_power_loss_during_a_link(world: World, restored: st
     for agent in (drone, edge):
         rules = agent.run("nft", "list", "ruleset")
         agent.lose_power()
-        # The agent restarts without an API server, so it knows only its stored files.
+        # The agent restarts while the API server is unreachable, so it has only its stored files.
         (agent.folder / "links.json").unlink()
         if restored == "nothing":
             agent.run("nft", "-f", "-", text=FOREIGN)
@@ -61,10 +61,10 @@ def test_nodes_recover_after_power_loss_during_a_link(world: World, restored: st
     assert len(drone.redirects()) == len(edge.redirects()) == 1
     for agent in (drone, edge):
         assert agent.addresses() == [f"{link_address(agent.name)}/16"]
-    if restored == "half":  # a device that was up stays up, without addresses
+    if restored == "half":  # a device that was up before the agent stays up, without addresses
         for agent in (drone, edge):
             agent.plan()
-            until(lambda agent=agent: not agent.tables(), "no table of ours", world)
+            until(lambda agent=agent: not agent.tables(), "the tables of the agent to be removed", world)
             agent.run("ip", "link", "set", "wlan0", "down")
     check_restored(world, before)
 
@@ -96,12 +96,12 @@ asyncio.run(main())
 
 
 @pytest.mark.parametrize("fault", ["silent", "no routes", "no probes"])
-def test_peer_that_stops_after_pairing_is_left(world: World, fault: str) -> None:
+def test_drone_leaves_peer_that_stops_after_pairing(world: World, fault: str) -> None:
     bad = world.edge("e1", 5.0)
     other = world.edge("e2", 30.0)
     drone = world.drone()
     before = {name: state for name, state in world.states().items() if name != "e1"}
-    # The unresponsive edge node declares more bandwidth, so the drone tries it first.
+    # The faulty edge node declares more bandwidth, so the drone tries it first.
     links = [world.link(drone, bad, bandwidth=13.0), world.link(drone, other)]
     world.serve()
     client = world.client(drone, 100_000, 0.1)
@@ -110,7 +110,7 @@ def test_peer_that_stops_after_pairing_is_left(world: World, fault: str) -> None
     peer = Client(world.python("e1", BAD_PEER, "e1", link_address("e1"), bad.folder / "tls", fault))
     drone.plan(*links)
     drone.start()
-    until(lambda: ["paired"] in peer.responses, "that the bad one paired", world)
+    until(lambda: ["paired"] in peer.responses, "the faulty edge node to pair", world)
     other.plan(links[1])
     other.start()
     until(lambda: client.last_server == "e2", "a response over the link to the working node", world)
@@ -127,7 +127,7 @@ raw.bind((device, 0))
 own, ip = bytes.fromhex(hardware), socket.inet_aton(address)
 frame = b"\\xff" * 6 + own + struct.pack(">HHHBBH", 0x0806, 1, 0x0800, 6, 4, 2) + own + ip + b"\\xff" * 6 + ip
 print("ready", flush=True)
-while True:  # "that address is here"
+while True:  # announce the address of the peer by ARP
     raw.send(frame)
     time.sleep(0.05)
 """
@@ -143,23 +143,23 @@ def test_node_with_the_address_of_the_peer_gets_no_traffic(world: World) -> None
     until(lambda: client.last_server == "e1", "a response over the link", world)
     address = str(link_address("e1"))
     port = int(next(iter(edge.redirects())).split(" . ")[2])
-    # The other node serves calls on the address and port of the edge node, and pairs with its own certificate.
+    # The stranger serves calls on the address and port of the edge node, and pairs with its own certificate.
     stranger.join(address)
     stranger.plan(world.link(drone, edge))
     world.python("e9", SERVER, "stranger", f"{address}:{port}", 0.005)
     paired = Client(world.python("e9", BAD_PEER, "e1", address, stranger.folder / "tls", "no routes"))
     world.python("e9", STRANGER, "wlan0", address, stranger.hardware.hex())
-    until(lambda: drone.log().count("does not have its certificate") > 3, "refusals", world)
+    until(lambda: drone.log().count("does not have its certificate") > 3, "refused certificates in the log", world)
     until(lambda: client.last_server == "cloud", "a response from the cloud", world)
     led = len(client.responses)
-    until(lambda: len(client.responses) > led + 60, "more responses", world)
+    until(lambda: len(client.responses) > led + 60, "60 more responses", world)
     assert "stranger" not in {response[1] for response in client.responses[led:]}
     assert not paired.responses
-    # After the other node has left, traffic returns to the edge node, although the drone's ARP table had the other node's address.
+    # When the stranger is gone, traffic returns to the edge node, although the drone's ARP table names the stranger.
     world.end("e9")
     stranger.run("ip", "link", "set", "wlan0", "down")
     took_s = until(lambda: client.last_server == "e1", "a response over the link", world, timeout_s=20.0)
-    print("from the stranger's end to the first answer:", took_s)
+    print("time from the end of the stranger to the first response over the link:", took_s)
     check_restored(world, before)
 
 
@@ -184,5 +184,5 @@ def test_long_stream_is_reopened_without_lost_or_repeated_replies(world: World, 
     assert numbers == list(range(len(numbers)))
     ends = [response[2] for response in stream.responses if response[1] == "REOPENED"]
     assert ends
-    assert set(ends) <= {"UNAVAILABLE"}, "a status after which gRPC's clients try again"
+    assert set(ends) <= {"UNAVAILABLE"}, "streams ended with a status after which gRPC clients do not retry"
     check_restored(world, before)

@@ -24,7 +24,7 @@ def test_traffic_moves_to_the_link_and_back_before_the_link_ends(world: World) -
     client = world.client(drone, 100_000, 0.1)
     until(lambda: client.last_server == "e1", "a reply over the link", world)
     name = "app-d1-e1"
-    until(lambda: drone.status(name).get("traffic") == "direct", "the status", world)
+    until(lambda: drone.status(name).get("traffic") == "direct", "direct traffic in the status", world)
     status = drone.status(name)
     assert (status["phase"], status["observedGeneration"], status["switches"]) == ("Up", 1, 1)
     assert status["bandwidth"] > 1.0
@@ -40,12 +40,12 @@ def test_traffic_moves_to_the_link_and_back_before_the_link_ends(world: World) -
         "the traffic rate",
         world,
     )
-    # The drone flies away: traffic moves back while the link still works, so that no call is lost.
+    # The drone flies away. Traffic returns to the cloud while the link still works, so that no call is lost.
     drone.fly(70.0, velocity=(3.0, 0.0, 0.0))
     drone.fly(-57.0, velocity=(-3.0, 0.0, 0.0))
-    until(lambda: client.last_server == "cloud", "a reply of the cloud", world)
+    until(lambda: client.last_server == "cloud", "a reply from the cloud", world)
     assert not client.failed
-    until(lambda: drone.status(name).get("traffic") == "cloud", "the status", world)
+    until(lambda: drone.status(name).get("traffic") == "cloud", "cloud traffic in the status", world)
 
 
 def test_link_manager_cleans_up_when_links_are_no_longer_planned(world: World) -> None:
@@ -57,11 +57,19 @@ def test_link_manager_cleans_up_when_links_are_no_longer_planned(world: World) -
     assert drone.addresses() == [f"{link_address('d1')}/16"]
     assert len(edge.redirects()) == 1
     drone.plan()
-    until(lambda: client.last_server == "cloud", "a reply of the cloud", world)
-    until(lambda: not drone.tables() and not drone.addresses(), "a clean drone", world)
-    until(lambda: not edge.redirects(), "no redirect on the edge", world)
+    until(lambda: client.last_server == "cloud", "a reply from the cloud", world)
+    until(
+        lambda: not drone.tables() and not drone.addresses(),
+        "the drone to have no tables and addresses of the agent",
+        world,
+    )
+    until(lambda: not edge.redirects(), "the redirects of the edge node to be removed", world)
     edge.plan()
-    until(lambda: not edge.tables() and not edge.addresses(), "a clean edge node", world)
+    until(
+        lambda: not edge.tables() and not edge.addresses(),
+        "the edge node to have no tables and addresses of the agent",
+        world,
+    )
     assert edge.routes() == before
     assert world.conntrack(drone) == world.conntrack(edge) == 0
     assert not client.failed
@@ -80,27 +88,27 @@ def test_traffic_returns_to_the_cloud_within_a_second_after_link_loss(world: Wor
     client = world.client(drone, 100_000, 0.02)
     until(lambda: client.last_server == "e1", "a reply over the link", world)
     servers = [response[1] for response in client.responses]
-    assert "FAILED" not in servers, "the planned switch to the link loses no call"
+    assert "FAILED" not in servers, "the planned switch to the link lost a call"
     switched = []
     gaps = []
-    # The loss is detected after 0.6 s, and the switch takes a millisecond. Several losses, because the machine may be busy.
+    # The loss is detected after 0.6 s, and the switch takes a millisecond. Measure several losses on a busy machine.
     while len(gaps) < 5 and not (gaps and min(switched) < 1.0 and min(gaps) < 1.0):
         begun = len(client.responses) - 1
         lost_at = time.time()
         world.command(station="d1", off=True)
-        until(lambda: client.last_server == "cloud", "a reply of the cloud", world)
+        until(lambda: client.last_server == "cloud", "a reply from the cloud", world)
         assert not drone.redirects()
         received = client.responses[begun:]
         led = next(number for number, response in enumerate(received) if response[1] == "cloud")
         gaps.append(float(received[led][2]) - max(float(a[2]) for a in received[:led] if a[1] == "e1"))
-        # This client does not repeat calls: the call that was cut fails.
+        # The client does not repeat calls, so the call that was cut fails.
         assert sum(response[1] == "FAILED" for response in received) <= 1
         switched.append(next(at for at in drone.cut_at() if at > lost_at) - lost_at)
-        until(lambda: drone.status("app-d1-e1").get("traffic") == "cloud", "the status", world)
+        until(lambda: drone.status("app-d1-e1").get("traffic") == "cloud", "cloud traffic in the status", world)
         # Traffic returns to the link when the radio works again.
         world.command(station="d1", off=False)
         until(lambda: client.last_server == "e1", "a reply over the link again", world)
-    print("from the loss to the switch, and from reply to reply:", switched, gaps)
+    print("times in seconds from the loss to the switch, and between the last and first reply:", switched, gaps)
     assert min(switched) < 1.0, switched
     assert min(gaps) < 1.0, gaps
 
@@ -111,8 +119,8 @@ def test_killed_agent_leaves_the_cloud_path_and_restarts_cleanly(world: World) -
     client = world.client(drone, 100_000, 0.1)
     until(lambda: client.last_server == "e1", "a reply over the link", world)
     drone.kill()
-    until(lambda: client.last_server == "cloud", "a reply of the cloud without an agent", world)
-    until(lambda: not drone.redirects() and not edge.redirects(), "redirects that ended by themselves", world)
+    until(lambda: client.last_server == "cloud", "a reply from the cloud without an agent", world)
+    until(lambda: not drone.redirects() and not edge.redirects(), "the redirects to expire", world)
     # The new agent restores its links from disk, because the API server may be unreachable.
     (drone.folder / "links.json").unlink()
     drone.start()
@@ -134,10 +142,10 @@ def test_state_of_killed_agents_is_removed_without_planned_links(world: World) -
             stored.unlink()
         assert agent.tables()
         agent.start()
-    until(lambda: not drone.tables() and not edge.tables(), "no table", world)
-    until(lambda: not drone.addresses() and not edge.addresses(), "no address", world)
+    until(lambda: not drone.tables() and not edge.tables(), "both agents to remove their tables", world)
+    until(lambda: not drone.addresses() and not edge.addresses(), "both agents to remove their addresses", world)
     assert world.conntrack(drone) == world.conntrack(edge) == 0
-    until(lambda: client.last_server == "cloud", "a reply of the cloud", world)
+    until(lambda: client.last_server == "cloud", "a reply from the cloud", world)
 
 
 def test_instances_are_isolated_without_a_radio(world: World) -> None:
@@ -148,11 +156,11 @@ def test_instances_are_isolated_without_a_radio(world: World) -> None:
     }
     link = world.link(drone, edge, services=[service])
     world.serve()
-    assert drone.reaches(edge.pod, VIP.port), "by the cloud"
+    assert drone.reaches(edge.pod, VIP.port), "the drone cannot reach the pod over the cloud path"
     edge.lose_radio()
     edge.plan(link)
     edge.start()
-    until(lambda: not drone.reaches(edge.pod, VIP.port), "isolation", world)
+    until(lambda: not drone.reaches(edge.pod, VIP.port), "the agent to block the node's access to the pod", world)
     assert edge.condition("app-d1-e1", "PeerReady")["reason"] == "DeviceMissing"
     edge.regain_radio()
     drone.plan(link)
@@ -168,7 +176,7 @@ def test_link_is_restored_after_the_edge_agent_is_killed(world: World) -> None:
     client = world.client(drone, 100_000, 0.05)
     until(lambda: client.last_server == "e1", "a reply over the link", world)
     edge.kill()
-    until(lambda: client.last_server == "cloud", "a reply of the cloud", world)
+    until(lambda: client.last_server == "cloud", "a reply from the cloud", world)
     edge.start()
     until(lambda: client.last_server == "e1", "a reply over the link again", world)
 
@@ -188,7 +196,7 @@ def test_second_drone_waits_for_a_busy_edge_node(world: World) -> None:
     until(lambda: clients[0].last_server == "e1", "the first drone's response over the link", world)
     second.plan(links[1])
     second.start()
-    until(lambda: second.status("app-d2-e1").get("reason") == "PairingFailed", "a refusal", world)
+    until(lambda: second.status("app-d2-e1").get("reason") == "PairingFailed", "the reason PairingFailed", world)
     assert clients[1].last_server == "cloud"
     assert clients[0].last_server == "e1"
     assert edge.condition("app-d2-e1", "PeerReady")["reason"] == "Busy"
@@ -200,7 +208,7 @@ def test_second_drone_waits_for_a_busy_edge_node(world: World) -> None:
 
 
 @pytest.mark.parametrize("fault", ["silent", "impostor"])
-def test_peer_that_does_not_pair_costs_no_calls(world: World, fault: str) -> None:
+def test_calls_continue_while_a_peer_does_not_pair(world: World, fault: str) -> None:
     edge = world.edge("e1", 5.0)
     other = world.edge("e2", 30.0)
     if fault == "impostor":
@@ -208,7 +216,7 @@ def test_peer_that_does_not_pair_costs_no_calls(world: World, fault: str) -> Non
     drone = world.drone()
     links = [world.link(drone, edge, bandwidth=13.0), world.link(drone, other)]
     world.serve()
-    # The edge node knows of no ready pod, so that nothing takes its link in the moment before it falls silent.
+    # The edge node has no ready pod, so no traffic moves to its link before it becomes silent.
     edge.plan(world.link(drone, edge, bandwidth=13.0, services=[]))
     other.plan(links[1])
     edge.start()
@@ -216,12 +224,12 @@ def test_peer_that_does_not_pair_costs_no_calls(world: World, fault: str) -> Non
     drone.plan(*links)
     drone.start()
     client = world.client(drone, 100_000, 0.1)
-    if fault == "silent":  # the drone received beacons of the node, which then stops responding
-        until(lambda: "pairing" in drone.log(), "an attempt", world)
+    if fault == "silent":  # the edge node stops responding after the drone has received its beacons
+        until(lambda: "pairing" in drone.log(), "an attempt to pair", world)
         world.command(station="e1", silent=True)
     until(lambda: client.last_server == "e2", "a response over the link to the working node", world)
     assert "e1" not in {response[1] for response in client.responses}
-    assert len(client.failed) <= 1  # in the planned switch, by a client that repeats nothing
+    assert len(client.failed) <= 1  # the client does not repeat the call that the planned switch may cut
 
 
 def test_missing_device_is_reported_and_used_when_it_appears(world: World) -> None:
@@ -235,12 +243,16 @@ def test_missing_device_is_reported_and_used_when_it_appears(world: World) -> No
     drone.lose_radio()
     drone.start()
     client = world.client(drone, 100_000, 0.1)
-    until(lambda: drone.condition("app-d1-e1", "Linked").get("reason") == "DeviceMissing", "the condition", world)
-    until(lambda: client.last_server == "cloud", "a reply of the cloud", world)
+    until(
+        lambda: drone.condition("app-d1-e1", "Linked").get("reason") == "DeviceMissing",
+        "the reason DeviceMissing",
+        world,
+    )
+    until(lambda: client.last_server == "cloud", "a reply from the cloud", world)
     drone.regain_radio()
     until(lambda: client.last_server == "e1", "a reply over the link", world)
     drone.lose_radio()
-    until(lambda: client.last_server == "cloud", "a reply of the cloud", world)
+    until(lambda: client.last_server == "cloud", "a reply from the cloud", world)
     drone.regain_radio()
     until(lambda: client.last_server == "e1", "a reply over the link again", world)
 
@@ -257,7 +269,7 @@ def test_unpaired_node_reaches_nothing_over_the_link(world: World) -> None:
     assert not stranger.reaches(str(link_address("e1")), port)
     world.python("e1", LISTENER, 10250)
     assert not stranger.reaches(str(link_address("e1")), 10250)
-    assert drone.reaches(f"10.90.{edge.number}.1", 10250)  # over the cloud: the node's own business
+    assert drone.reaches(f"10.90.{edge.number}.1", 10250)  # agents do not block the path over the cloud
     assert client.last_server == "e1"
 
 
@@ -286,7 +298,7 @@ def test_a_hundred_changes_in_a_minute_end_in_the_last_state(world: World) -> No
     assert len(edge.redirects()) == 1
     assert drone.addresses() == [f"{link_address('d1')}/16"]
     check_restored(world, before)
-    until(lambda: client.last_server == "cloud", "a reply of the cloud", world)
+    until(lambda: client.last_server == "cloud", "a reply from the cloud", world)
 
 
 def test_uplink_loss_does_not_affect_direct_traffic(world: World) -> None:
@@ -294,30 +306,30 @@ def test_uplink_loss_does_not_affect_direct_traffic(world: World) -> None:
     drone = start_drone(world, edge)
     client = world.client(drone, 100_000, 0.05)
     until(lambda: client.last_server == "e1", "a reply over the link", world)
-    until(lambda: drone.status("app-d1-e1").get("traffic") == "direct", "the status", world)
+    until(lambda: drone.status("app-d1-e1").get("traffic") == "direct", "direct traffic in the status", world)
     drone.uplink(up=False)
     for agent in (drone, edge):
         agent.api(up=False)
     before = len(client.responses)
-    until(lambda: len(client.responses) > before + 200, "answers", world)
+    until(lambda: len(client.responses) > before + 200, "200 more responses", world)
     assert {response[1] for response in client.responses[before + 1 :]} == {"e1"}
     assert drone.addresses() == [f"{link_address('d1')}/16"]
     drone.uplink(up=True)
     for agent in (drone, edge):
         agent.api(up=True)
     drone.fly(-57.0, velocity=(-3.0, 0.0, 0.0))
-    until(lambda: client.last_server == "cloud", "a reply of the cloud", world)
-    until(lambda: drone.status("app-d1-e1").get("traffic") == "cloud", "the status", world)
+    until(lambda: client.last_server == "cloud", "a reply from the cloud", world)
+    until(lambda: drone.status("app-d1-e1").get("traffic") == "cloud", "cloud traffic in the status", world)
     assert not client.failed
 
 
-def test_unreachable_cloud_path_is_left_even_if_it_was_better(world: World) -> None:
+def test_traffic_leaves_unreachable_cloud_path_even_if_it_was_better(world: World) -> None:
     edge = world.edge("e1", 20.0)
     drone = start_drone(world, edge)
     client = world.client(drone, 100_000, 0.05)
     until(lambda: client.last_server == "e1", "a reply over the link", world)
     drone.describe(uplink_mbps=900)
-    until(lambda: client.last_server == "cloud", "a reply of the cloud", world)
+    until(lambda: client.last_server == "cloud", "a reply from the cloud", world)
     drone.uplink(up=False)
     for agent in (drone, edge):
         agent.api(up=False)
@@ -327,14 +339,14 @@ def test_unreachable_cloud_path_is_left_even_if_it_was_better(world: World) -> N
         world,
     )
     cut = len(client.responses)
-    until(lambda: len(client.responses) > cut + 100, "more of them", world)
+    until(lambda: len(client.responses) > cut + 100, "100 more responses", world)
     assert {response[1] for response in client.responses[cut:]} == {"e1"}
     drone.uplink(up=True)
     for agent in (drone, edge):
         agent.api(up=True)
-    until(lambda: client.last_server == "cloud", "a response from the cloud, which is the better path again", world)
+    until(lambda: client.last_server == "cloud", "a response from the cloud, which has the better path again", world)
     assert "FAILED" not in {response[1] for response in client.responses[cut:]}
-    until(lambda: drone.status("app-d1-e1").get("traffic") == "cloud", "the status", world)
+    until(lambda: drone.status("app-d1-e1").get("traffic") == "cloud", "cloud traffic in the status", world)
 
 
 def test_agent_killed_during_a_switch_recovers(world: World) -> None:
@@ -342,15 +354,17 @@ def test_agent_killed_during_a_switch_recovers(world: World) -> None:
     drone = world.drone()
     before = world.states()
     start_drone(world, edge)
-    world.python("d1p", STREAM, f"{VIP.address}:{VIP.port}")  # never idle, so that a switch takes all its time
+    world.python(
+        "d1p", STREAM, f"{VIP.address}:{VIP.port}"
+    )  # the stream is never idle, so that a switch takes its maximum time
     client = world.client(drone, 100_000, 0.1)
     until(lambda: client.last_server == "e1", "a reply over the link", world)
     drone.fly(-57.0, velocity=(-3.0, 0.0, 0.0))
-    until(lambda: not drone.redirects(), "the switch", world)
-    drone.kill()  # its old connections are being drained
+    until(lambda: not drone.redirects(), "the redirects to be removed", world)
+    drone.kill()  # the agent still drains old connections
     drone.fly(0.0)
     drone.start()
     until(lambda: client.last_server == "e1", "a reply over the link again", world)
     assert len(drone.redirects()) == 1
     check_restored(world, before)
-    until(lambda: client.last_server == "cloud", "a reply of the cloud", world)
+    until(lambda: client.last_server == "cloud", "a reply from the cloud", world)

@@ -66,7 +66,7 @@ def test_chart_creates_pod_monitors_only_if_enabled() -> None:
 
 
 def node_addresses(*arguments: str) -> set[tuple[str, bool]]:
-    """Return the metrics addresses of the DaemonSets, and if their pods declare a port for metrics."""
+    """Return, for each DaemonSet, its metrics address, and True if its pods declare a port for metrics."""
     bodies = [body for body in render(*arguments) if body["kind"] == "DaemonSet"]
     assert len(bodies) == 3
     containers = [body["spec"]["template"]["spec"]["containers"][0] for body in bodies]

@@ -44,7 +44,7 @@ async def test_mobility_mission_applies_corrections_and_denials(rig: Rig) -> Non
     rig.write_grant(grant(altitude_limit(5, 15), fence("no-fly", "exclusion", "ignore", -60, -10, -40, 10)))
     rig.write_grant(passenger_grant())
     port = free_port()
-    rig.start_service("--metrics", f"127.0.0.1:{port}")  # before the vehicle: it waits for it
+    rig.start_service("--metrics", f"127.0.0.1:{port}")  # the service starts first and waits for the vehicle
     rig.start_vehicle()
     driver = Driver(rig)
     climbed = await driver.up(3.0)
@@ -129,7 +129,7 @@ def _check_audit(rig: Rig) -> None:
 
 
 def _check_log(rig: Rig) -> None:
-    """Each decision that is no plain permission has a line, and a permission has none."""
+    """Check that the log has a line for each decision except plain permissions."""
     log = (rig.directory / "service.log").read_text()
     lines = [line for line in log.splitlines() if " policy: " in line]
     changed = [call for call in rig.entries("call") if call["action"] != "allow"]
@@ -162,13 +162,13 @@ async def test_mobility_authentication_rejects_foreign_and_expired_identities(ri
     code, why = await denied(rig.stub(node_identity("drone-2")).GetPosition(ask, timeout=5))
     assert code == grpc.StatusCode.PERMISSION_DENIED
     code, why = await denied(rig.stub(node_identity(NODE)).GetPosition(ask, timeout=5))
-    assert code == grpc.StatusCode.PERMISSION_DENIED, "the node's own services may look, not act"
+    assert code == grpc.StatusCode.PERMISSION_DENIED, "an identity of the node called GetPosition"
     for channel in (
         rig.stub(DRIVER, seconds=-1.0),  # expired
         rig.stub(DRIVER, authority=Authority(tmp_path, "stranger")),
     ):
         code, _ = await denied(channel.GetPosition(ask, timeout=5))
-        assert code == grpc.StatusCode.UNAVAILABLE, "the handshake must fail"
+        assert code == grpc.StatusCode.UNAVAILABLE, "the TLS handshake succeeded"
     plain = grpc.aio.insecure_channel(rig.address)
     code, _ = await denied(plain.unary_unary("/fractus.v1.MobilityService/GetPosition")(b"", timeout=3))
     assert code in {grpc.StatusCode.UNAVAILABLE, grpc.StatusCode.DEADLINE_EXCEEDED}

@@ -1,4 +1,4 @@
-"""Flights that lose their driver, service, grant or authority."""
+"""Flights that lose their driver, service, Grant or control authority."""
 
 from __future__ import annotations
 
@@ -45,10 +45,10 @@ async def test_lost_driver_causes_hover_then_return(rig: Rig) -> None:
     del going
     hover = await rig.until(lambda t: t.controller == "system" and t.velocity.north_mps < 0.3, 20, "hover")
     assert hover.mode == "GUIDED"
-    assert xy(hover.position)[1] < 75, "it did not fly on to the target"
+    assert xy(hover.position)[1] < 75, "the drone flew on to the target"
     home = await rig.until(outcome, 20, "return")
     assert outcome(home) == "failed: driver lost"
-    assert home.mode == "GUIDED", "the system flies it home"
+    assert home.mode == "GUIDED", "the autopilot, not the system, flies the drone home"
     landed = await rig.until(lambda t: not t.armed, 90, "landing")
     assert landed.mode == "LAND"
     assert math.hypot(*xy(landed.position)) < 2
@@ -81,14 +81,16 @@ async def test_killed_service_resumes_flight_after_restart(rig: Rig) -> None:
     await goto_once_located(again, 0, 40)
     reply = await again.stub.ReturnControl(pb.ReturnControlRequest(), timeout=5)
     assert reply.mission_complete
-    assert "drone in flight, sending heartbeats" in rig.log("service"), "while it was imported"
+    assert "drone in flight, sending heartbeats" in rig.log("service"), (
+        "the starting service sent no heartbeats while it imported modules"
+    )
     await rig.until(lambda t: not t.armed, 90, "landing")
 
 
 async def test_autopilot_returns_home_while_service_is_down(rig: Rig) -> None:
     await flying(rig, speedup=2.0)
     rig.kill("service")
-    # The autopilot's failsafe acts after five of its seconds; then the service must not hand the drone back.
+    # The autopilot's failsafe acts after 5 s of vehicle time. The service must not give control back to the driver.
     await until_mode(rig.link, ARDUCOPTER.return_retracing)
     rig.start_service()
     late = Driver(rig)
@@ -102,7 +104,7 @@ async def test_autopilot_returns_home_while_service_is_down(rig: Rig) -> None:
 
 
 async def goto_once_located(driver: Driver, x: float, y: float) -> None:
-    """Fly to a place as soon as the new service knows how late its link is: before that, it moves nothing."""
+    """Retry Goto until the restarted service has measured the delay of its link. Until then it refuses the call."""
     async with asyncio.timeout(60):
         while True:
             try:
@@ -116,7 +118,7 @@ async def goto_once_located(driver: Driver, x: float, y: float) -> None:
 
 
 async def until_mode(link: str, mode: FlightMode) -> None:
-    """Listen to the vehicle as a ground station: its heartbeats, of system 255, must not stand for the companion's."""
+    """Wait for a flight mode. Use system id 255, because the heartbeats must not look like those of the service."""
     watcher = MavlinkAutopilot(link, ARDUCOPTER, sysid=255)
     task = asyncio.create_task(watcher.run())
     try:
@@ -143,7 +145,7 @@ async def test_zone_added_in_flight_stops_drone(rig: Rig) -> None:
     assert why.code == "ExclusionZoneAhead"
     assert list(why.policies) == ["new"]
     hover = await rig.until(lambda t: speed(t) < 0.2, 20, "standstill")
-    assert hover.controller == DRIVER, "the policy ignores requests; it takes no drone"
+    assert hover.controller == DRIVER, "a policy with action ignore took control from the driver"
     assert xy(hover.position)[1] < 50
     await driver.goto(0, 20)
 
@@ -153,7 +155,7 @@ async def test_zone_added_around_drone_revokes_control_and_lands(rig: Rig) -> No
     rig.write_grant(grant(fence("new", "exclusion", "revoke", -30, -30, 30, 30)))
     event = await driver.next(LOST, 10)
     assert "new" in event.reason
-    state = await rig.until(lambda t: t.mode == "LAND", 15, "landing: it is at home")
+    state = await rig.until(lambda t: t.mode == "LAND", 15, "landing, because the drone is at home")
     assert outcome(state).startswith("revoked:")
     _, why = await denied(driver.stub.Hover(pb.HoverRequest(), timeout=5))
     assert why.code == "NotInControl"
@@ -167,7 +169,7 @@ async def test_goto_into_zone_with_takeover_action_ends_mission(rig: Rig, action
     assert code == grpc.StatusCode.PERMISSION_DENIED
     assert why.action == why.ACTION_TAKEOVER
     await driver.next(LOST, 15)
-    state = await rig.until(lambda t: t.mode == "LAND", 10, "landing: it is at home")
+    state = await rig.until(lambda t: t.mode == "LAND", 10, "landing, because the drone is at home")
     assert outcome(state).startswith("revoked:" if action == "revoke" else "failed:")
     await rig.until(lambda t: not t.armed, 90, "landing")
     assert rig.entries("takeover")[0]["policies"] == ["no-fly"]
@@ -228,7 +230,7 @@ async def test_suspended_driver_process_is_detected_as_lost(rig: Rig) -> None:
     rig.start_vehicle(1.0)
     await rig.until(lambda t: t.ready and t.HasField("position"), 20)
     rig.start_driver()
-    await rig.until(lambda t: t.controller == DRIVER and t.position.altitude_m > 8, 30, "flight of the other process")
+    await rig.until(lambda t: t.controller == DRIVER and t.position.altitude_m > 8, 30, "flight of the driver process")
     rig.send_signal("driver", signal.SIGSTOP)
     await rig.until(lambda t: t.controller == "system", 20, "loss of the driver")
     rig.send_signal("driver", signal.SIGCONT)
@@ -267,7 +269,7 @@ def partial(**changes: Any) -> dict[str, Any]:
 
 
 async def until_reason(driver: Driver, reason: str) -> None:
-    """Wait until the control stream reports a reason."""
+    """Open a control stream, and wait until it reports a reason."""
     driver._stream = driver.stub.GetControl(pb.GetControlRequest(), wait_for_ready=True)
     async with asyncio.timeout(30):
         while (await driver._stream.read()).reason != reason:
@@ -313,7 +315,7 @@ async def test_service_without_journal_returns_flying_drone_home(rig: Rig) -> No
     for path in (rig.directory / "state").glob("journal*"):
         path.unlink()
     rig.start_service()
-    # If the start takes more than five seconds, the failsafe already flies the drone home, or has landed it.
+    # If the service starts too slowly, the failsafe has already started the return flight or the landing.
     state = await rig.until(lambda t: t.mode in {"RTL", "SMART_RTL"}, 60, "return")
     assert state.controller == "system"
     await rig.until(lambda t: not t.armed, 90, "landing")

@@ -47,7 +47,7 @@ def endpoint(rig: Rig, identity: str = DRIVER, **validity: float) -> Endpoint:
 
 
 async def restart(rig: Rig) -> None:
-    """Kill the service and start it again, out of the vehicle's time: five of its seconds later it would fly home."""
+    """Restart the service while the vehicle is paused. Otherwise its failsafe would start a return flight after 5 s."""
     rig.send_signal("vehicle", signal.SIGSTOP)
     rig.kill("service")
     rig.start_service("--driver-grace", "15")
@@ -105,7 +105,7 @@ async def test_sdk_returns_control_and_mission_completes(rig: Rig) -> None:
         await rig.until(lambda t: not t.armed, 90, "landing")
         with pytest.raises(MissionComplete):
             async with drone.control():
-                raise AssertionError("control after the mission")
+                raise AssertionError("control was granted after the mission")
 
 
 async def test_sdk_watch_streams_report_vehicle_state(rig: Rig) -> None:

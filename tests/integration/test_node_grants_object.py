@@ -18,7 +18,7 @@ NODE_GRANTS = f"{FRACTUS}/namespaces/{NODES}/nodegrants"
 
 @pytest.fixture
 def operator(control_plane: ControlPlane, world: World, chart: None, tmp_path: Path) -> Iterator[OperatorProcess]:
-    """The operator with the token of its account, which the chart's roles and admission policies bind."""
+    """The operator with the token of its account. The chart's roles and admission policies apply to this account."""
     cluster = {"server": control_plane.server, "certificate-authority": str(control_plane.ca)}
     config = {
         "apiVersion": "v1",
@@ -39,7 +39,7 @@ def operator(control_plane: ControlPlane, world: World, chart: None, tmp_path: P
 
 
 def carried(world: World, node: str) -> dict[str, Body] | None:
-    """The Grants that a node's object carries, by name; None without one."""
+    """Return the Grants in the NodeGrants object of a node, by name, or None if the object does not exist."""
     body = world.api.get(f"{NODE_GRANTS}/{node}")
     return (
         None
@@ -51,14 +51,16 @@ def carried(world: World, node: str) -> dict[str, Body] | None:
 def test_node_grants_object_follows_grants_and_returns_reports(
     world: World, operator: OperatorProcess, namespace: str
 ) -> None:
-    wait_for(lambda: carried(world, "drone-1") == {}, "the object of a drone without Grants")
+    wait_for(lambda: carried(world, "drone-1") == {}, "the NodeGrants object of drone-1, without Grants")
     for path in NODE_OBJECTS:
         wait_for(lambda path=path: world.api.get(f"{path}/edge-1"), f"{path} of edge-1")
 
     name = f"{namespace}.traffic-navigator"
     running(world, namespace)
     grant = world.api.get(f"{FRACTUS}/grants/{name}") or {}
-    mine = wait_for(lambda: (carried(world, "drone-1") or {}).get(name), "the Grant in the object of its node")
+    mine = wait_for(
+        lambda: (carried(world, "drone-1") or {}).get(name), "the Grant in the NodeGrants object of its node"
+    )
     assert (mine["metadata"]["uid"], mine["spec"]) == (grant["metadata"]["uid"], grant["spec"])
     assert {each["spec"]["node"] for each in (carried(world, "drone-1") or {}).values()} == {"drone-1"}
     assert name not in (carried(world, "edge-1") or {})
@@ -72,22 +74,20 @@ def test_node_grants_object_follows_grants_and_returns_reports(
         world.api.merge(f"{NODE_GRANTS}/{node}/status", {"status": reports})
 
     report("drone-1", "Active")
-    wait_for(lambda: status() == {"phase": "Active", "message": "", "observedGeneration": 1}, "the status")
+    wait_for(lambda: status() == {"phase": "Active", "message": "", "observedGeneration": 1}, "the status of the Grant")
 
-    # The next operator processes reports that arrived while no operator ran.
+    # The restarted operator processes reports that arrived while it did not run.
     operator.stop()
     report("edge-1", "Failed", "not its own")
     report("drone-1", "Complete", "flown")
     operator.start()
-    wait_for(lambda: status().get("phase") == "Complete", "the status after a restart")
+    wait_for(lambda: status().get("phase") == "Complete", "the new status of the Grant after a restart")
     report("drone-1", "Active")
-    wait_for(lambda: world.status(namespace).get("phase") in {"Returning", "Completed"}, "the mission's end")
-    assert (status() or {"phase": "Complete"})["phase"] == "Complete", (
-        "it ends with its mission, and is not taken back before"
-    )
+    wait_for(lambda: world.status(namespace).get("phase") in {"Returning", "Completed"}, "the end of the mission")
+    assert (status() or {"phase": "Complete"})["phase"] == "Complete", "a later report reverted the phase Complete"
 
     world.api.delete(f"{FRACTUS}/namespaces/{namespace}/applications/traffic")
-    wait_for(lambda: carried(world, "drone-1") == {}, "the Grant to be revoked on its node")
+    wait_for(lambda: carried(world, "drone-1") == {}, "the removal of the Grants from the NodeGrants object")
     world.api.delete(f"{FRACTUS}/edgenodes/edge-1")
     world.api.delete("/api/v1/nodes/edge-1")
     for path in NODE_OBJECTS:

@@ -26,7 +26,7 @@ INSTANCES = {
 
 
 def deployed(world: World, namespace: str, name: str = "traffic", pods: int = 7) -> dict[str, Any]:
-    """Play scheduler and kubelet until the application is ready."""
+    """Bind and start the pods like scheduler and kubelet. Return the status when the Application is Ready."""
     wait_for(lambda: len(world.pods(namespace)) >= pods, lambda: f"{pods} pods; {world.status(namespace, name)}")
     world.run_pods(namespace)
     wait_for(lambda: world.condition(namespace, "Ready", name).get("status") == "True", "the condition Ready")
@@ -104,7 +104,7 @@ def test_application_gets_plan_grants_and_pods(world: World, operator: OperatorP
 
 
 def events(world: World, namespace: str) -> list[str]:
-    """Reasons of the Events on Applications of the namespace."""
+    """Return the reasons of the Events on Applications of the namespace."""
     found = world.api.list(f"/api/v1/namespaces/{namespace}/events")
     return sorted(e["reason"] for e in found if e["involvedObject"]["kind"] == "Application")
 
@@ -135,7 +135,7 @@ def test_unchanged_application_causes_no_writes(world: World, operator: Operator
     stored = world.api.get(world.path(traffic(namespace)))
     assert stored is not None
     assert not [name for name in stored["metadata"].get("annotations", {}) if "kopf" in name], (
-        "kopf writes annotations, each with a separate request"
+        "kopf stored annotations, which costs additional requests"
     )
     # The depot's radius is part of the drone's corridor, so only the Grants change.
     changed = {name for name in before if before[name] != after[name]}
@@ -200,12 +200,18 @@ def test_complete_mission_keeps_only_its_plan(world: World, operator: OperatorPr
     end_mission(world, namespace, "Complete", "all control points were returned")
     status = world.phase(namespace, "Returning")
     assert status["message"] == "all control points were returned; drone-1 is returning"
-    wait_for(lambda: set(world.children(namespace)) == {"deploymentplans/traffic"}, "children to go")
+    wait_for(
+        lambda: set(world.children(namespace)) == {"deploymentplans/traffic"},
+        "all child objects except the plan to be deleted",
+    )
     world.drone_status("drone-1", "inactive")
     status = world.phase(namespace, "Completed")
     assert world.condition(namespace, "MissionComplete")["status"] == "True"
     assert status["message"] == "all control points were returned"
-    wait_for(lambda: set(world.children(namespace)) == {"deploymentplans/traffic"}, "children to go")
+    wait_for(
+        lambda: set(world.children(namespace)) == {"deploymentplans/traffic"},
+        "all child objects except the plan to be deleted",
+    )
     wait_for(lambda: len(flight_events(world)) >= 4, "the Events of the flight")
     assert flight_events(world) == [
         "TookOff: drone-1 took off",
@@ -374,7 +380,7 @@ def test_failed_mission_is_reported(
     status = world.phase(namespace, "Failed")
     condition = world.condition(namespace, "MissionComplete")
     assert (condition["status"], condition["reason"], status["message"]) == ("False", reason, "driver lost")
-    wait_for(lambda: not world.grants(namespace), "grants to go")
+    wait_for(lambda: not world.grants(namespace), "the Grants to be deleted")
 
 
 def test_failed_component_is_reported_with_last_log_lines(
@@ -401,7 +407,7 @@ def test_failed_component_is_reported_with_last_log_lines(
 
 
 def test_refused_pods_are_reported(world: World, operator: OperatorProcess, namespace: str) -> None:
-    """A quota, limits or Pod Security of the namespace refuse the pods, so no pod has a status with the reason."""
+    """A quota, a LimitRange or Pod Security may refuse pods. No pod then exists whose status contains the reason."""
     path = f"/api/v1/namespaces/{namespace}/limitranges/small"
     limits = {"limits": [{"type": "Container", "max": {"cpu": "50m"}}]}
     head = {"apiVersion": "v1", "kind": "LimitRange", "metadata": {"name": "small", "namespace": namespace}}
@@ -522,7 +528,10 @@ def test_longest_valid_name_is_deployed_and_reported(world: World, operator: Ope
     deployed(world, namespace, name)
     wait_for(lambda: "PodsReady" in events(world, namespace), "the Events")
     world.api.delete(world.path(traffic(namespace, name)))
-    wait_for(lambda: world.application(namespace, name) is None and not world.children(namespace), "everything to go")
+    wait_for(
+        lambda: world.application(namespace, name) is None and not world.children(namespace),
+        "the Application and its child objects to be deleted",
+    )
 
 
 def test_deleted_application_leaves_no_objects(world: World, operator: OperatorProcess, namespace: str) -> None:
@@ -655,7 +664,7 @@ def test_grant_with_modified_signature_is_signed_again(world: World, operator: O
     second = issued()
     assert second > first
     world.api.merge(path, {"spec": {"limits": {"maxSpeed": 300}}})
-    wait_for(lambda: issued() > second and sound(), "what was granted")
+    wait_for(lambda: issued() > second and sound(), "the operator to restore and sign the Grant")
     assert observed[-1]["spec"]["limits"]["maxSpeed"] < 300, "the operator signed a change of another client"
 
 
@@ -666,7 +675,7 @@ def test_nodes_get_location_labels(world: World, operator: OperatorProcess) -> N
     assert labels["fractus.dev/interface-wifi"] == labels["fractus.dev/interface-4g"] == "true"
     assert labels["fractus.dev/class"] == "drone"
     world.api.delete(f"{FRACTUS}/drones/drone-1")
-    wait_for(lambda: _geohash(world, "drone-1") is None, "labels to go")
+    wait_for(lambda: _geohash(world, "drone-1") is None, "the location label to be removed")
     labels = (world.api.get("/api/v1/nodes/drone-1") or {})["metadata"]["labels"]
     assert set(labels) == {"fractus.dev/class"}
 

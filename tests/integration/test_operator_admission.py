@@ -156,7 +156,7 @@ def test_corrected_application_is_deployed(world: World, operator: OperatorProce
     world.phase(namespace, "Deploying")
 
 
-# -- what runs on drones and edge nodes --
+# -- pods on drones and edge nodes --
 
 
 def test_pod_with_node_name_of_drone_is_refused(world: World, chart: None, namespace: str) -> None:
@@ -179,21 +179,21 @@ def test_pod_with_node_name_of_drone_is_refused(world: World, chart: None, names
     wait_for(lambda: refused("drone-1"), "the admission policy to be in force")
     denied(named("edge-1"), "edge-1 is a drone or an edge node, for which the scheduler places pods")
     named("cloud-1")()
-    # The policy ignores a node that is also a cloud node, and a guarded node, whose kubelet enforces the taint itself.
+    # The policy ignores cloud nodes, and guarded nodes, whose NoExecute taint the kubelet enforces itself.
     for label in ("fractus.dev/cloud", "fractus.dev/guarded"):
         world.api.merge(drone, {"metadata": {"labels": {label: "true"}}})
         try:
-            wait_for(lambda: not refused("drone-1"), "the node's label to be known")
+            wait_for(lambda: not refused("drone-1"), "the policy to ignore the labelled node")
         finally:
             world.api.merge(drone, {"metadata": {"labels": {label: None}}})
-        wait_for(lambda: refused("drone-1"), "the node's label to be gone")
+        wait_for(lambda: refused("drone-1"), "the policy to apply to the node again")
 
 
 # -- the operator's own permissions --
 
 
 def test_operator_reads_no_secret(control_plane: ControlPlane, world: World, chart: None, namespace: str) -> None:
-    """The key of the authority is the exception. A patch or a deletion of a collection would return the content too."""
+    """The only exception is the Secret with the authority's key. Patches and deletions would return the content."""
     client = control_plane.with_token(operator_token(world))
     for place in (namespace, "kube-system", SYSTEM):
         secrets = f"/api/v1/namespaces/{place}/secrets"
@@ -285,7 +285,7 @@ _MADE = {
 def test_operator_token_cannot_escalate_with_pods_or_secrets(
     control_plane: ControlPlane, world: World, chart: None, namespace: str
 ) -> None:
-    """Pods and Secrets with the operator's label that would give their creator control of the cluster."""
+    """Try to create Pods and Secrets that would give control of the cluster. They have the operator's label."""
     client = control_plane.with_token(operator_token(world))
     mine = {"app.kubernetes.io/managed-by": "fractus"}
 
@@ -322,7 +322,7 @@ def test_operator_token_cannot_escalate_with_pods_or_secrets(
     root = {"runAsNonRoot": True, "runAsUser": 0, "seccompProfile": {"type": "RuntimeDefault"}}
     try:
         wait_for(lambda: _probe_refused(client), "the admission policy to be in force")
-        # The unchanged objects are accepted, so each refusal below is caused by the changed field.
+        # The API server accepts the unchanged objects, so the changed field causes each of the following refusals.
         deployment()()
         secret("traffic-navigator-tls")()
         for place in ("kube-system", SYSTEM, NODES):
@@ -375,7 +375,7 @@ def test_operator_token_cannot_escalate_with_pods_or_secrets(
         denied(secret("fractus-ca"), certificates)
         for place in (SYSTEM, NODES, "kube-system", "kube-public", "kube-node-lease"):
             denied(secret("theirs-tls", place), certificates)
-        # Nor does it read or write what gives rights.
+        # The operator must not read or write objects that give rights.
         for path in (
             f"/api/v1/namespaces/{SYSTEM}/serviceaccounts/fractus-node/token",
             "/apis/rbac.authorization.k8s.io/v1/clusterrolebindings",
@@ -391,7 +391,7 @@ def test_operator_token_cannot_escalate_with_pods_or_secrets(
 def test_operator_token_cannot_redirect_foreign_traffic(
     control_plane: ControlPlane, world: World, chart: None, namespace: str
 ) -> None:
-    """Objects with the operator's label that would give their creator the traffic of others."""
+    """Try to create objects that would redirect traffic of other users. The objects have the operator's label."""
     client = control_plane.with_token(operator_token(world))
     mine = {"app.kubernetes.io/managed-by": "fractus"}
 
@@ -460,7 +460,7 @@ def test_operator_token_cannot_redirect_foreign_traffic(
 
 
 def _leads_no_other_s_traffic(world: World, client: BlockingClient, namespace: str) -> None:
-    """The traffic of a Service goes to every EndpointSlice with its name, including those of other clients."""
+    """Check that the operator adds no EndpointSlice to a Service that another client created."""
     services = f"/api/v1/namespaces/{namespace}/services"
     slices = f"/apis/discovery.k8s.io/v1/namespaces/{namespace}/endpointslices"
 
@@ -489,11 +489,11 @@ def _leads_no_other_s_traffic(world: World, client: BlockingClient, namespace: s
         metadata = {"name": name, "labels": labels}
         body = {"apiVersion": "v1", "kind": "Service", "metadata": metadata, "spec": {"ports": [{"port": 80}]}}
         world.api.call("POST", services, body)
-    wait_for(lambda: refused("bank"), "the Service to be known")
+    wait_for(lambda: refused("bank"), "the admission policy to know the Service")
     lead("ours")
-    # EndpointSlices that the operator created before the Service got another owner cannot be changed to other addresses.
+    # When the Service has another owner, the operator cannot change the addresses of its own older EndpointSlice.
     world.api.merge(f"{services}/ours", {"metadata": {"labels": {"app.kubernetes.io/managed-by": "helm"}}})
-    wait_for(lambda: refused("ours"), "the Service to be another's")
+    wait_for(lambda: refused("ours"), "the admission policy to know the new owner of the Service")
     elsewhere = {"endpoints": ends("10.1.2.4")}
     denied(lambda: client.merge(f"{slices}/ours", elsewhere), "did not create the Service ours")
 

@@ -18,7 +18,7 @@ VISITS = [at(15, 15, alt=12), at(45, 45, alt=17)]
 
 
 def guest(namespace: str, name: str = "guest", points: list[Body] | None = None) -> Body:
-    """Return an application that takes pictures at some points from any drone that passes them."""
+    """Return a guest Application. It takes pictures at some points from any drone that passes the points."""
     services = [{"service": "camera", "methods": ["CaptureImage"]}]
     camera = component("Camera", "drone", **{"class": "passenger"}, services=services)
     camera["pointsOfInterest"] = {"points": points or VISITS}

@@ -1,4 +1,4 @@
-"""Running Applications with a problem: policies still reach their Grants, and they keep their drones."""
+"""Running Applications with a problem: policies still reach their Grants, and the Applications keep their drones."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def refusing(
 
     Args:
         unless: CEL expression that is true for objects that the API server still accepts.
-        probe: Dry run of a request that must be refused. The block starts when it is.
+        probe: Dry run of a request that must be refused. The block starts when the API server refuses it.
     """
     root = "/apis/admissionregistration.k8s.io/v1"
     name = f"refuse-{operation.lower()}-{resource}"
@@ -198,7 +198,8 @@ def test_refreshed_grant_keeps_previous_version_of_broken_policy(
             lambda: let_in(world, fractus_object("Policy", "odd", UNREADABLE)), "the API server to accept the policy"
         )
     condition = wait_for(
-        lambda: policy_ready(world, "odd").get("status") == "False" and policy_ready(world, "odd"), "it"
+        lambda: policy_ready(world, "odd").get("status") == "False" and policy_ready(world, "odd"),
+        "the policy to be Invalid",
     )
     assert (condition["reason"], "validFrom" in condition["message"]) == ("Invalid", True)
     world.put(fractus_object("Policy", "slow", {"type": "LimitControl", "kind": "speed", "upperLimit": 3}))
@@ -250,7 +251,7 @@ def test_recreated_application_waits_for_drone_of_deleted_one(
     world.phase(namespace, "Deploying")
 
 
-def test_plan_with_older_grant_keeps_drone_of_two_plans(
+def test_drone_in_two_plans_stays_with_plan_of_older_grant(
     world: World, operator: OperatorProcess, namespace: str
 ) -> None:
     running(world, namespace)
@@ -329,7 +330,7 @@ def test_refused_teardown_is_retried(world: World, operator: OperatorProcess, na
 def test_application_deleted_at_end_of_mission_leaves_no_pods(
     world: World, operator: OperatorProcess, namespace: str, *, restarted: bool
 ) -> None:
-    """A user deletes the completed Application while its pods have no owner between two owners."""
+    """The operator changes the owner of finished pods. The user deletes the Application while they have no owner."""
     world.put(traffic(namespace, "traffic", navigator()))
     deployed(world, namespace, pods=1)
     with unstoppable_pods(world, namespace):

@@ -1,4 +1,4 @@
-"""The operator is killed after each kind of write, when the write has taken effect but before the operator gets the response."""
+"""Kill the operator after each kind of write: the API server has stored the object, but not sent the response."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ EXPECTED = {
     "end of the mission": {"PATCH nodegrants", "DELETE secrets", "DELETE deployments", "DELETE replicasets", "PATCH pods"},
     "deletion": {"DELETE grants", "DELETE deploymentplans"},
 }  # fmt: skip
-"""Steps that there are at the least."""
+"""Kinds of writes that must occur, by stage of the test. Other kinds may also occur."""
 
 
 class FaultPoints:
-    """Stands between the operator and the API server, and kills the operator after the first write of each kind.
+    """Proxy between operator and API server. It kills the operator after the first write of each kind.
 
     Args:
-        plane: the API server.
-        operator: which it kills.
+        plane: Control plane to which requests are forwarded.
+        operator: Process that is killed.
     """
 
     def __init__(self, plane: ControlPlane, operator: OperatorProcess, port: int) -> None:
@@ -111,7 +111,7 @@ def _step(request: web.Request) -> str | None:
 
 @contextmanager
 def killed_at_each_step(plane: ControlPlane, folder: Path) -> Iterator[tuple[OperatorProcess, FaultPoints]]:
-    """An operator that is started again each time that it was killed."""
+    """An operator that is started again whenever it was killed."""
     port = free_port()
     kubeconfig = folder / "points.kubeconfig"
     cluster = {"name": "points", "cluster": {"server": f"http://127.0.0.1:{port}"}}
@@ -148,7 +148,7 @@ def test_operator_killed_after_any_write_reaches_same_state(
 ) -> None:
     with killed_at_each_step(control_plane, tmp_path) as (operator, points):
         world.put(traffic(namespace))
-        # Each of two dozen operators takes seconds to start, on a busy machine ten.
+        # The operator starts two dozen times. Each start takes up to ten seconds on a busy machine.
         wait_for(lambda: len(world.pods(namespace)) == 7, operator.log, 600)
         # No pod starts without its certificate.
         wait_for(lambda: sum(name.startswith("secrets/") for name in world.children(namespace)) == 7, operator.log, 600)

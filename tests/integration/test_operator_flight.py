@@ -24,7 +24,7 @@ NODE = "/api/v1/nodes/drone-1"
 
 @pytest.fixture
 def guarded(world: World, chart: None) -> Iterator[World]:
-    """Two drones with their services, under the chart's admission policies; drone-1 flies."""
+    """Two drones with their services, and the chart's admission policies. Drone-1 flies."""
     world.add_drone("drone-2")
     world.drone_status("drone-1", "flying")
     for body in render():
@@ -90,7 +90,7 @@ def attempts(world: World, drone: str) -> dict[str, Callable[[], object]]:
     pod = f"{PODS}/fractus-mobility-{drone}"
     node = f"/api/v1/nodes/{drone}"
     dry = "?dryRun=All"
-    # With the service's processes in sight, which it may end.
+    # This container shares the process namespace of the service, so it could kill the service.
     debugger = {"name": "debugger", "image": "tools:1", "targetContainerName": "mobility"}
     return {
         "delete a pod": lambda: try_delete(world, pod),
@@ -100,11 +100,13 @@ def attempts(world: World, drone: str) -> dict[str, Callable[[], object]]:
         "change a pod's image": lambda: api.merge(
             pod + dry, {"spec": {"containers": [{**whole(world, pod)["spec"]["containers"][0], "image": "bad"}]}}
         ),
-        "debug a pod": lambda: api.merge(
+        "add a debug container to a pod": lambda: api.merge(
             f"{pod}/ephemeralcontainers{dry}", {"spec": {"ephemeralContainers": [debugger]}}
         ),
         "give a pod a deadline": lambda: api.merge(pod + dry, {"spec": {"activeDeadlineSeconds": 1}}),
-        "hide a pod": lambda: api.merge(pod + dry, {"metadata": {"labels": {"app.kubernetes.io/component": "x"}}}),
+        "change the component label of a pod": lambda: api.merge(
+            pod + dry, {"metadata": {"labels": {"app.kubernetes.io/component": "x"}}}
+        ),
         "remove the node's label": lambda: api.merge(node + dry, {"metadata": {"labels": {"fractus.dev/class": None}}}),
         "change the node's label": lambda: api.merge(
             node + dry, {"metadata": {"labels": {"fractus.dev/class": "edge"}}}
@@ -116,7 +118,7 @@ def attempts(world: World, drone: str) -> dict[str, Callable[[], object]]:
 
 
 def together(world: World) -> dict[str, Callable[[], object]]:
-    """Return requests (dry runs) that would remove services of all drones."""
+    """Return requests (dry runs) that would remove services of all drones together."""
     api = world.api
     dry = "?dryRun=All"
     camera = f"{DAEMON_SETS}/fractus-camera{dry}"
@@ -129,8 +131,8 @@ def together(world: World) -> dict[str, Callable[[], object]]:
         "delete a DaemonSet": lambda: try_delete(world, f"{DAEMON_SETS}/fractus-mobility"),
         "move a DaemonSet": lambda: api.merge(camera, pods(nodeSelector={"a": "b"})),
         "move a DaemonSet to a node": lambda: api.merge(camera, pods(nodeName="drone-2")),
-        "let a DaemonSet tolerate nothing": lambda: api.merge(camera, pods(tolerations=[])),
-        "roll a DaemonSet": lambda: api.merge(
+        "remove the tolerations of a DaemonSet": lambda: api.merge(camera, pods(tolerations=[])),
+        "let a DaemonSet roll out updates": lambda: api.merge(
             f"{DAEMON_SETS}/fractus-agent{dry}", {"spec": {"updateStrategy": {"type": "RollingUpdate"}}}
         ),
         "delete the namespace": lambda: try_delete(world, f"/api/v1/namespaces/{SYSTEM}"),
@@ -158,7 +160,7 @@ def test_harmless_changes_are_allowed_in_flight(control_plane: ControlPlane, gua
     api.merge(f"{PODS}/fractus-mobility-drone-1{dry}", {"metadata": {"annotations": {"a": "b"}}})
     template = {"spec": {"template": {"metadata": {"annotations": {"a": "b"}}}}}
     api.merge(f"{DAEMON_SETS}/fractus-agent{dry}", template)
-    # A service that does not run may be replaced.
+    # A service pod that does not run may be deleted.
     waiting = {"name": "camera", "image": "bad", "imageID": "", "ready": False, "restartCount": 9}
     waiting["state"] = {"waiting": {"reason": "CrashLoopBackOff"}}
     kubelet = control_plane.as_user("kubelet", "system:node:drone-1", ("system:nodes",))
@@ -170,7 +172,9 @@ def test_harmless_changes_are_allowed_in_flight(control_plane: ControlPlane, gua
 
 def test_services_of_drone_on_ground_can_be_removed(guarded: World) -> None:
     guarded.drone_status("drone-1", "inactive")
-    wait_for(lambda: not refusal(attempts(guarded, "drone-1")["delete a pod"]), "the landing to be known")
+    wait_for(
+        lambda: not refusal(attempts(guarded, "drone-1")["delete a pod"]), "the admission policies to know the landing"
+    )
     for name, attempt in {**attempts(guarded, "drone-1"), **together(guarded)}.items():
         assert not refusal(attempt), name
 
@@ -182,14 +186,17 @@ def test_stale_drone_counts_as_in_flight_until_annotated_as_grounded(guarded: Wo
     status = {"flightState": "unknown", "lastFlightState": "landing", "lastSeen": last_seen}
     guarded.api.merge(f"{path}/status", {"status": status})
     attempt = attempts(guarded, "drone-1")["delete a pod"]
-    message = wait_for(lambda: "at its last report" in refusal(attempt) and refusal(attempt), "the silence to be known")
+    message = wait_for(
+        lambda: "at its last report" in refusal(attempt) and refusal(attempt),
+        "the admission policies to know the unknown flight state",
+    )
     assert line in message
     guarded.api.merge(path, {"metadata": {"annotations": {"fractus.dev/grounded": "2025-12-31T00:00:00Z"}}})
-    assert refusal(attempt), "the annotation refers to an earlier flight"
+    assert refusal(attempt), "the annotation of an earlier flight was accepted"
     Shell(tmp_path, guarded.plane).type(line)
-    wait_for(lambda: not refusal(attempt), "the annotation to count")
+    wait_for(lambda: not refusal(attempt), "the annotation to take effect")
     guarded.api.merge(f"{path}/status", {"status": {"lastSeen": "2026-01-01T00:00:05Z"}})
-    wait_for(lambda: refusal(attempt), "the annotation to become void after a new report")
+    wait_for(lambda: refusal(attempt), "a new report to invalidate the annotation")
 
 
 def test_node_class_cannot_be_changed_through_status(guarded: World) -> None:
@@ -202,7 +209,7 @@ def test_node_class_cannot_be_changed_through_status(guarded: World) -> None:
 def test_service_pod_status_is_written_only_by_its_kubelet(
     control_plane: ControlPlane, guarded: World, drone: str
 ) -> None:
-    """The rule also applies on the ground, so that frequent writes of kubelets need no lookup of the Drone."""
+    """The rule also applies on the ground. Otherwise each status update of a kubelet would look up the Drone."""
     path = f"{PODS}/fractus-mobility-{drone}/status?dryRun=All"
     failed = {"status": {"phase": "Failed"}}
     ended = {"status": {"containerStatuses": []}}
@@ -214,7 +221,7 @@ def test_service_pod_status_is_written_only_by_its_kubelet(
     with control_plane.as_user(f"kubelet-{drone}", f"system:node:{drone}", ("system:nodes",)) as kubelet:
         kubelet.merge(path, failed)
         kubelet.merge(path, ended)
-    # A ClusterRoleBinding of Kubernetes gives this controller rights by its user name.
+    # Kubernetes binds the rights of this controller to its user name.
     collector = "system:serviceaccount:kube-system:pod-garbage-collector"
     with control_plane.as_user("collector", collector, ()) as client:
         client.merge(path, failed)
@@ -232,24 +239,26 @@ def test_crds_cannot_be_deleted_while_chart_is_installed(guarded: World) -> None
 def test_services_of_drone_with_mission_cannot_be_removed(guarded: World) -> None:
     guarded.drone_status("drone-1", "inactive")
     attempt = attempts(guarded, "drone-1")["delete a pod"]
-    wait_for(lambda: not refusal(attempt), "the landing to be known")
+    wait_for(lambda: not refusal(attempt), "the admission policies to know the landing")
     last_seen = "2026-01-01T00:00:00Z"
     for on_mission in ("True", "Unknown"):
         mission = {"type": "OnMission", "status": on_mission, "reason": "Granted", "lastTransitionTime": last_seen}
         status = {"conditions": [mission], "lastSeen": last_seen}
         guarded.api.merge(f"{FRACTUS}/drones/drone-1/status", {"status": status})
-        message = wait_for(lambda: refusal(attempt), "the mission to be known")
+        message = wait_for(lambda: refusal(attempt), "the admission policies to know the mission")
         assert f"drone-1 has a mission and may have taken off since {last_seen}" in message
     annotation = {"metadata": {"annotations": {"fractus.dev/grounded": last_seen}}}
     guarded.api.merge(f"{FRACTUS}/drones/drone-1", annotation)
-    wait_for(lambda: not refusal(attempt), "the annotation to count")
+    wait_for(lambda: not refusal(attempt), "the annotation to take effect")
 
 
 def test_services_of_drone_without_reports_can_be_replaced(guarded: World) -> None:
     guarded.api.merge(
         f"{FRACTUS}/drones/drone-1/status", {"status": {"flightState": "unknown", "lastFlightState": None}}
     )
-    wait_for(lambda: not refusal(attempts(guarded, "drone-1")["delete a pod"]), "the status to be known")
+    wait_for(
+        lambda: not refusal(attempts(guarded, "drone-1")["delete a pod"]), "the admission policies to know the status"
+    )
 
 
 # -- the operator --
@@ -262,7 +271,7 @@ def condition(world: World, drone: str, type_: str) -> Body:
 
 @pytest.fixture
 def permitted(control_plane: ControlPlane, guarded: World, tmp_path: Path) -> Iterator[OperatorProcess]:
-    """The operator, with no more than the chart's permissions."""
+    """The operator with only the permissions that the chart gives its account."""
     config = yaml.safe_load(control_plane.kubeconfig.read_text())
     config["users"][0]["user"] = {"token": operator_token(guarded)}
     kubeconfig = tmp_path / "operator.kubeconfig"
@@ -276,7 +285,7 @@ def permitted(control_plane: ControlPlane, guarded: World, tmp_path: Path) -> It
 
 
 def release(world: World, number: int, revision: str) -> None:
-    """Create a ControllerRevision for a new template like the DaemonSet controller."""
+    """Create a ControllerRevision for a new template, as the DaemonSet controller does."""
     owner = world.api.get(f"{DAEMON_SETS}/fractus-mobility") or {}
     reference = {"apiVersion": "apps/v1", "kind": "DaemonSet", "name": "fractus-mobility", "controller": True}
     metadata = {
@@ -340,7 +349,7 @@ def test_operator_cannot_report_landing(control_plane: ControlPlane, guarded: Wo
             assert "may not change the flight state" in refusal(
                 lambda body=body: client.call("PUT", f"{path}/status", body)
             )
-        # The permitted report of a stale drone must not enable another false report.
+        # The operator may set a stale drone to unknown. After that, it must not report a landing.
         client.merge(f"{path}/status", {"status": {"flightState": "unknown", "lastFlightState": "flying"}})
         for last in ("unknown", "inactive", None):
             assert "may not change the flight state" in refusal(
@@ -350,7 +359,7 @@ def test_operator_cannot_report_landing(control_plane: ControlPlane, guarded: Wo
 
 
 def test_operator_cannot_reset_time_of_last_report(control_plane: ControlPlane, guarded: World) -> None:
-    """The grounded annotation refers to the last report before this flight and must not become valid again."""
+    """Otherwise the grounded annotation, which names the last report before this flight, would become valid again."""
     path = f"{FRACTUS}/drones/drone-1"
     last_seen = "2026-01-01T00:00:00Z"
     guarded.api.merge(path, {"metadata": {"annotations": {"fractus.dev/grounded": last_seen}}})

@@ -1,4 +1,4 @@
-"""Direct links over the simulated radio: TLS with node certificates on real devices; imposters, silence, competition, loss."""
+"""Pairing over the simulated radio with TLS on real devices. Faults: impostors, silent peers, second drones, losses."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class Node:
             self._events.put(line.strip())
 
     def expect(self, begins: str) -> str:
-        """The next event that begins like this."""
+        """Wait for the next event that begins with a text, and return the event."""
         deadline = time.monotonic() + TIMEOUT_S
         lines = []
         while (remaining_s := deadline - time.monotonic()) > 0:
@@ -74,7 +74,7 @@ class Node:
                 break
             if lines[-1].startswith(begins):
                 return lines[-1]
-        raise AssertionError(f"{self.name}: no {begins!r} in {lines}")
+        raise AssertionError(f"{self.name}: no event begins with {begins!r}: {lines}")
 
     def tell(self, command: str) -> None:
         assert self._process.stdin is not None
@@ -98,7 +98,7 @@ class Node:
 
 
 class Air:
-    """The radio on a thread, and an authority that certifies nodes."""
+    """The simulated radio in a thread, and an authority that issues node certificates."""
 
     def __init__(self, directory: Path) -> None:
         self.directory = directory
@@ -115,7 +115,7 @@ class Air:
             self.radio.step(0.02)
 
     def files(self, node: str, authority: Authority | None = None, now: datetime | None = None) -> Path:
-        """Certificate, key and authority of a node, as its agent keeps them."""
+        """Write certificate, key and authority of a node to a folder, like its agent. Return the folder."""
         folder = self.directory / f"{node}-{len(list(self.directory.iterdir()))}"
         folder.mkdir()
         for name, content in (authority or self.authority).issue_node(node, now or datetime.now(UTC)).items():
@@ -197,7 +197,7 @@ def test_pairing_with_an_unresponsive_peer_times_out(air: Air) -> None:
 
 
 @pytest.mark.parametrize("fault", ["other name", "other authority", "component", "expired"])
-def test_node_without_the_peers_certificate_is_not_linked(air: Air, fault: str) -> None:
+def test_impostor_of_the_peer_gets_no_link(air: Air, fault: str) -> None:
     if fault == "other name":
         files = air.files("e2")
     elif fault == "expired":

@@ -16,13 +16,13 @@ CHART = {"fractus": (), "fractus-demo": ("--set=drone=drone-1",)}
 
 @pytest.fixture
 def namespace(world: World) -> Iterator[str]:
-    """The system's namespace, whose labels are the test's."""
+    """Path of the namespace fractus-system. The test may set its Pod Security level, which is removed at the end."""
     yield f"/api/v1/namespaces/{SYSTEM}"
     world.api.merge(f"/api/v1/namespaces/{SYSTEM}", {"metadata": {"labels": {ENFORCE: None}}})
 
 
 def rendered(chart: str, control_plane: ControlPlane, *more: str) -> subprocess.CompletedProcess[str]:
-    """Render a chart like `helm install`, which stops if rendering fails."""
+    """Render a chart with access to the API server, like `helm install`."""
     argv = [helm(), "template", chart, str(CHARTS / chart), "-n", SYSTEM, "--kubeconfig", str(control_plane.kubeconfig)]
     argv += [KUBERNETES, *CHART[chart], *more]
     return subprocess.run(argv, capture_output=True, text=True, timeout=60, check=False)
@@ -40,7 +40,7 @@ def test_chart_is_refused_in_namespace_with_restrictive_pod_security(
             assert f"the namespace {SYSTEM} enforces Pod Security {level}" in result.stderr
             assert f"kubectl label namespace {SYSTEM} {ENFORCE}=privileged --overwrite" in result.stderr
         assert rendered(chart, control_plane).returncode == 0, (
-            "the chart is refused although helm cannot look up the namespace"
+            "the chart was refused, although helm could not look up the namespace"
         )
 
 

@@ -32,7 +32,7 @@ def _udp() -> socket.socket:
 
 
 class Air:
-    """Two nodes on one air and on an uplink, and the radio on a thread."""
+    """Two nodes with a shared radio channel and an uplink, and the simulated radio in a thread."""
 
     def __init__(self, directory: Path) -> None:
         self.names = [f"fxair{os.getpid() % 100000}{end}" for end in "ab"]
@@ -69,7 +69,7 @@ class Air:
             sender.sendto(json.dumps(command).encode(), str(self.control))
 
     def ping(self, network: str, count: int = 3) -> list[float]:
-        """Round-trip times in ms of the datagrams that come back."""
+        """Send datagrams to an echo server, and return the round-trip times of the returned ones, in ms."""
         round_trips_ms = []
         for number in range(count):
             begun = time.monotonic()

@@ -44,7 +44,7 @@ def redirector(world: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> I
 
 
 def responses(client: subprocess.Popen[str], count: int | None = None) -> list[list[str]]:
-    """Return the next responses to a client as words, or all remaining responses without a count."""
+    """Return the words of the next `count` responses to a client, or of all remaining responses if `count` is None."""
     assert client.stdout is not None
     return [line.split() for line in itertools.islice(client.stdout, count)]
 
@@ -177,7 +177,7 @@ async def test_redirects_end_without_an_agent(
     refresh.cancel()
     await asyncio.gather(refresh, return_exceptions=True)
     assert await asyncio.to_thread(call_once, world) == "cloud"
-    # A killed agent leaves elements that time out.
+    # A killed agent leaves map elements, which expire.
     await redirector.switch(TO_EDGE, planned=True)
     await asyncio.sleep(1.5)
     assert await asyncio.to_thread(call_once, world) == "cloud"
@@ -343,7 +343,7 @@ def test_guarded_pod_accepts_only_calls_over_links(world: Rig, redirector: Redir
 
 
 @pytest.mark.parametrize("owner_alias", ["", "to the north", "x" * 255])
-def test_device_brought_up_by_a_killed_agent_is_taken_down_by_the_next(world: Rig, owner_alias: str) -> None:
+def test_next_agent_takes_down_device_that_a_killed_agent_brought_up(world: Rig, owner_alias: str) -> None:
     def link_state() -> str:
         result = subprocess.run(
             [*world.inside("drone"), "ip", "link", "show", "dev", "fxl0"], capture_output=True, text=True, check=True
@@ -359,7 +359,7 @@ def test_device_brought_up_by_a_killed_agent_is_taken_down_by_the_next(world: Ri
             assert "UP" in link_state(), agent
             assert owner_alias in link_state()
         in_namespace(world.path("drone"), lambda: asyncio.run(DeviceAddresses("fxl0").clear()))
-        # If the owner's alias leaves no room for the suffix, the device stays up.
+        # The agent adds a suffix to the alias of devices that it brought up. Without room for it, they stay up.
         assert ("state UP" in link_state()) is (was_up or len(owner_alias) == 255)
         alias = link_state().partition("alias ")[2].strip()
         assert alias == owner_alias

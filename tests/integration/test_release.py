@@ -26,11 +26,11 @@ VERSION = yaml.safe_load((CHARTS / "fractus" / "Chart.yaml").read_text())["versi
 EVERYTHING = ("--set=view.enabled=true", "--set=uninstall.wipeNodes=true")
 PARTS = ("operator", "agent", "mobility", "camera", "view")
 BUILT_ON = "component"
-"""Base image of applications. Charts do not name it."""
+"""Base image for components of users. No chart uses it."""
 
 
 def script(beginning: str) -> str:
-    """Return the script of the workflow's step with this beginning."""
+    """Return the script of the workflow step whose script begins with this text."""
     steps = [step for job in WORKFLOW["jobs"].values() for step in job["steps"]]
     (text,) = [step["run"] for step in steps if step.get("run", "").startswith(beginning)]
     return str(text)
@@ -60,7 +60,7 @@ echo "$(cat "${1#oci-archive:}") ${2#docker://}" >> saved-and-pushed
 
 @pytest.fixture(scope="module")
 def published(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Run the commands of the workflow for a tag with stubs. The directory contains `dist` and lists of images."""
+    """Run the workflow for a tag, with stubs as programs. Return the directory with `dist` and the lists of images."""
     folder = tmp_path_factory.mktemp("release")
     (folder / "programs").mkdir()
     for name, text in STUBS.items():
@@ -79,7 +79,7 @@ def rendered(folder: Path, chart: str, *values: str) -> list[Body]:
 
 
 def images_of(bodies: list[Body]) -> set[str]:
-    """Return the images in objects and in manifests that ConfigMaps contain."""
+    """Return the images that objects name, or that manifests inside ConfigMaps name."""
     stored_manifests = [text for body in bodies if body["kind"] == "ConfigMap" for text in body["data"].values()]
     texts = [yaml.safe_dump(bodies), *stored_manifests]
     return {name for text in texts for name in re.findall(r"^ *(?:- )?image: (\S+)$", text, re.MULTILINE)}
@@ -88,7 +88,7 @@ def images_of(bodies: list[Body]) -> set[str]:
 def test_charts_of_a_release_name_its_pushed_images(published: Path) -> None:
     pairs = [line.split() for line in (published / "saved-and-pushed").read_text().splitlines()]
     assert all(saved == pushed for saved, pushed in pairs), (
-        "the image in an archive has another name than the pushed one"
+        "an image in an archive and the image that is pushed from it have different names"
     )
     pushed = {name for _, name in pairs}
     assert f"ghcr.io/some-one/fractus/operator:{VERSION}" in pushed
@@ -153,7 +153,7 @@ def test_notes_warn_about_another_image_tag(
     control_plane: ControlPlane, published: Path, tag: str, *, warned: bool
 ) -> None:
     argv = [helm(), "install", "fractus", str(published / "dist" / f"fractus-{VERSION}.tgz"), f"--set=image.tag={tag}"]
-    # Other tests created objects of the chart without helm.
+    # Let helm adopt objects of the chart that other tests created without helm.
     argv += [
         "--namespace",
         SYSTEM,

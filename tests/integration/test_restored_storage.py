@@ -50,7 +50,7 @@ def test_operator_restarts_after_etcd_restore(plane: ControlPlane, tmp_path: Pat
             operator.start()
             world.put(traffic(after, "second"))
             wait_for(lambda: world.status(after, "second").get("phase"), operator.log)
-            # The Application was restored from the backup and is reconciled again.
+            # The operator also reconciles the Application that the backup contains.
             wait_for(lambda: world.status(before).get("drone") == "drone-1" and world.grants(before), operator.log)
     finally:
         if operator.running:

@@ -31,19 +31,19 @@ ALL = ("deletecollection",)
 
 @cache
 def chart_roles() -> dict[str, Body]:
-    """Return the roles for users by name."""
+    """Return the ClusterRoles for users that the chart contains, by name."""
     names = {f"fractus-{kind}-{role}" for kind in KINDS for role in ("viewer", "editor", "admin")}
     return {body["metadata"]["name"]: body for body in render() if body["metadata"]["name"] in names}
 
 
 @pytest.fixture(scope="module")
 def roles(control_plane: Any) -> Iterator[World]:
-    """A control plane with the roles, after the built-in roles include them."""
+    """A control plane with the roles. Kubernetes has added their rules to the built-in roles."""
     world = World(control_plane)
     for body in chart_roles().values():
         world.api.apply(path_of(body), body)
     with bound(world, "edit", "t-settled"):
-        wait_for(lambda: may(world, "t-settled", "create", "applications"), "the built-in roles are aggregated")
+        wait_for(lambda: may(world, "t-settled", "create", "applications"), "the built-in roles to be aggregated")
     with bound(world, "view", "t-settled"):
         wait_for(lambda: all(may(world, "t-settled", "get", kind) for kind in KINDS.values()), "view is aggregated")
     yield world
@@ -86,7 +86,7 @@ def allowed(world: World, role: str) -> set[tuple[str, str]]:
     group = f"t-{role}"
     with bound(world, role, group):
         # The authorizer receives bindings through a watch, with a delay.
-        wait_for(lambda: any(may(world, group, "get", kind) for kind in KINDS.values()), f"{role} is in force")
+        wait_for(lambda: any(may(world, group, "get", kind) for kind in KINDS.values()), f"{role} to be in force")
         permitted = {(v, kind) for kind in KINDS for v in (*READ, *WRITE, *ALL) if may(world, group, v, KINDS[kind])}
         assert not any(may(world, group, verb, kind, "status") for verb in WRITE for kind in KINDS.values())
     return permitted

@@ -1,4 +1,4 @@
-"""The violating flight of the field experiment with a running autopilot at another place and with other parameters.
+"""Fly the violating program of the field experiment with a running autopilot that has another home and parameters.
 
 Waypoints, readiness, modes and acknowledgements must not depend on the set-up of the scenario's own vehicles. Only
 `make scenario-field` flies the other runs, because one run takes more than a minute.

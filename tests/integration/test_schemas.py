@@ -20,10 +20,10 @@ from kubernetes_validate.utils import SchemaNotFoundError, ValidationError
 Body = dict[str, Any]
 
 VERSIONS = ("1.32", *KUBERNETES_VERSIONS)
-"""The oldest supported version (docs/clusters.md), and the versions of embedded clusters."""
+"""Oldest supported version of Kubernetes (docs/clusters.md), and the versions of embedded clusters."""
 
 OTHER_GROUPS = {"fractus.dev", "monitoring.coreos.com"}
-"""API groups that Kubernetes has no schemas for. Other tests apply objects of `fractus.dev` to an API server."""
+"""API groups without schemas in Kubernetes. Other tests apply objects of `fractus.dev` to an API server."""
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "operator" / "expected"
 

@@ -108,7 +108,9 @@ async def test_refusal_contains_code_reason_and_policies(stage: Stage) -> None:
     async with stage.client() as drone, drone.control():
         with pytest.raises(fractus.PolicyDenied) as refusal:
             await drone.goto(40.02, 22.0, 20.0)
-        assert (await drone.goto(40.0, 22.0, 20.0)).complete, "the flight does not continue after a refusal"
+        assert (await drone.goto(40.0, 22.0, 20.0)).complete, (
+            "the next Goto did not reach its target after a refused Goto"
+        )
     assert refusal.value.code == "InsideExclusionZone"
     assert refusal.value.policies == ("no-fly-hospital",)
     assert "exclusion zone hospital (by no-fly-hospital)" in str(refusal.value)
@@ -265,7 +267,7 @@ async def test_mission_pauses_and_resumes(stage: Stage) -> None:
         stage.drone.release.set()
         mission.resume()
         assert await flight == {}
-    assert len(stage.drone.targets) == 4, "the interrupted leg is not flown again"
+    assert len(stage.drone.targets) == 4, "the mission did not repeat the interrupted leg"
 
 
 async def test_mission_without_control_is_refused(stage: Stage) -> None:
@@ -306,7 +308,7 @@ async def test_exception_in_block_does_not_return_control(stage: Stage) -> None:
     assert "ReturnControl" not in stage.drone.calls
 
 
-async def test_outer_cancellation_stays_a_cancellation(stage: Stage) -> None:
+async def test_cancellation_from_outside_is_raised_unchanged(stage: Stage) -> None:
     async def fly() -> None:
         async with stage.client() as drone, drone.control():
             await asyncio.sleep(WAIT_S)

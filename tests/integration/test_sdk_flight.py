@@ -31,7 +31,7 @@ from sdk_service import Authority
 ROOT = Path(__file__).parents[2]
 EXAMPLE = ROOT / "examples" / "traffic-monitoring"
 SPEEDUP = 3.0
-"""Limited by heartbeats: the service sends one per real second, and the failsafe acts after 5 s of the vehicle's time."""
+"""Vehicle time per real time. It must be below 5: one heartbeat per real second, failsafe after 5 s of vehicle time."""
 pytestmark = pytest.mark.timeout(300)
 
 
@@ -139,7 +139,7 @@ class Stage:
         try:
             while not condition():
                 assert time.monotonic() < deadline, (
-                    f"no {description} within {timeout_s} s\n{self.log('navigator')}\n{self.log('service')}"
+                    f"waited {timeout_s} s for {description}\n{self.log('navigator')}\n{self.log('service')}"
                 )
                 try:
                     probe.wait(0.1)
@@ -184,12 +184,12 @@ def short(tmp_path: Path) -> Iterator[Stage]:
 
 @pytest.fixture
 def slow(tmp_path: Path) -> Iterator[Stage]:
-    """A mission with two waypoints in real time, so that a service can restart before the failsafe acts."""
+    """A mission with two waypoints in real time. The service can restart before the failsafe acts."""
     yield from running_stage(tmp_path, 2, 1.0)
 
 
 def calls(stage: Stage) -> list[tuple[str, str, str]]:
-    """Return method, action and code of each call. A call that was judged again, for example after a stop, counts once."""
+    """Return method, action and code of each call. Consecutive verdicts on the same call count once."""
     entries = [e for e in stage.entries() if e["kind"] == "call"]
     judgements = [list(group) for _, group in itertools.groupby(entries, lambda e: (e["method"], e["args"]))]
     return [(last["method"], last["action"], last["code"]) for *_, last in judgements]
@@ -221,7 +221,7 @@ def test_navigator_flies_path_with_corrections_and_refusals(stage: Stage) -> Non
         assert not verify(lines).problem
 
 
-def test_killed_navigator_continues_and_stays_after_mission(short: Stage) -> None:
+def test_killed_navigator_continues_mission_and_keeps_running_after_it(short: Stage) -> None:
     short.start_navigator()
     short.wait("first waypoint", lambda: "waypoint 1/2 reached" in short.log("navigator"))
     short.kill("navigator")
@@ -296,7 +296,7 @@ def test_telemetry_command_prints_json_lines(short: Stage) -> None:
         assert result.returncode == 0, result.stderr
         return [json.loads(line) for line in result.stdout.splitlines()]
 
-    # The service observes a new vehicle for some seconds before it identifies it as its own.
+    # The service observes a new vehicle for some seconds before it accepts the vehicle.
     short.wait("position", lambda: read()[-1]["position"] is not None)
     lines = read()
     assert len(lines) == 3

@@ -34,14 +34,14 @@ def saved_plan(path: Path) -> Path:
 
 
 def distance_m(position: fractus.Position) -> float:
-    """Return the horizontal distance from the centre of the orbit."""
+    """Return the horizontal distance from the centre of the orbit, in metres."""
     north = math.radians(position.lat - MIDDLE[0]) * 6_371_008.8
     east = math.radians(position.lon - MIDDLE[1]) * 6_371_008.8 * math.cos(math.radians(MIDDLE[0]))
     return math.hypot(north, east)
 
 
 class Killed(Exception):
-    """Ends the first run of the program in flight."""
+    """Raised to end the first run of the program in flight."""
 
 
 async def test_plan_and_orbit_mission_survives_pause_and_restart(rig: Rig) -> None:
@@ -74,7 +74,7 @@ async def test_plan_and_orbit_mission_survives_pause_and_restart(rig: Rig) -> No
     flown: list[int] = []
     radii: list[float] = []
     async with fractus.mobility(endpoint(rig)) as drone, drone.control() as control:
-        assert control.waypoints_reached == 3  # both of the plan, and one of the orbit
+        assert control.waypoints_reached == 3  # the two waypoints of the plan, and the first of the orbit
         await drone.arm()
         await drone.takeoff(ALTITUDE_M)
         flight = asyncio.ensure_future(drone.mission(waypoints).fly(lambda step: flown.append(step.number)))
@@ -85,12 +85,12 @@ async def test_plan_and_orbit_mission_survives_pause_and_restart(rig: Rig) -> No
                 radii.append(distance_m(state.position))
         assert await flight == {}
         assert set(flown) == set(range(4, len(waypoints) + 1)), (
-            "a completed waypoint was flown again, or one was omitted"
+            "a completed waypoint was flown again, or another waypoint was omitted"
         )
         await drone.turn(135)
         attitude = await anext(drone.watch.attitude())
         assert abs((attitude.yaw_deg - 135 + 180) % 360 - 180) < 10
     assert control.mission_complete
-    # The straight line between two of eight waypoints comes within 92 % of the radius.
+    # The orbit has eight waypoints. The middle of a line between two of them is at 92 % of the radius.
     assert radii and all(0.8 * RADIUS_M < radius < 1.2 * RADIUS_M for radius in radii), (min(radii), max(radii))
     await rig.until(lambda t: not t.armed, 120, "landing")

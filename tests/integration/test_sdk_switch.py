@@ -66,7 +66,7 @@ def redirector(world: Rig, tmp_path: Path) -> Iterator[Redirector]:
 
 
 class SdkTraffic:
-    """SDK client in the drone's pod, and instances in the cloud and on the edge node."""
+    """Requests of an SDK client in the drone's pod to instances in the cloud and on the edge node."""
 
     def __init__(self, world: Rig, count: int, pause_s: float, size: int, age_s: float = 5.0) -> None:
         self.count = count
@@ -77,7 +77,7 @@ class SdkTraffic:
         self.client = world.python("dpod", CLIENT, f"{VIP.address}:{VIP.port}", count, pause_s, size)
 
     def responses(self, count: int | None = None) -> list[dict[str, object]]:
-        """Return the next responses to the client, or all remaining responses without a count."""
+        """Return the next `count` responses to the client, or all remaining responses if `count` is None."""
         responses: list[dict[str, object]] = []
         assert self.client.stdout is not None
         while count is None or len(responses) < count:
@@ -113,7 +113,7 @@ async def test_planned_switches_lose_and_repeat_no_sdk_request(
     assert {response["server"] for response in responses} == {"cloud", "edge"}
     executed = traffic.executed_ids()
     assert set(executed["cloud"] + executed["edge"]) == {str(number) for number in range(traffic.count)}
-    # A request whose response was lost is repeated to the other instance with the same id, so each instance is checked alone.
+    # Both instances may execute a request whose response was lost, so count the ids of each instance separately.
     assert all(count == 1 for ids in executed.values() for count in Counter(ids).values())
 
 
@@ -134,7 +134,7 @@ async def test_lost_direct_link_loses_no_sdk_request(world: Rig, redirector: Red
 
 @pytest.mark.usefixtures("redirector")
 async def test_aged_sdk_connections_move_to_the_new_path_without_a_switch(world: Rig) -> None:
-    """Change the map without closing the connection of a busy client."""
+    """Change the redirection map, but do not close the connection of the busy client."""
     traffic = SdkTraffic(world, 400, 0.01, 10, age_s=1.0)
     await asyncio.to_thread(traffic.responses, 20)
     world.maps("drone").write([Redirect(VIP, DIRECT)], None, 600.0)

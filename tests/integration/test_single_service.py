@@ -80,7 +80,7 @@ async def test_second_service_exits_after_lock_timeout(rig: Rig) -> None:
     rig.start_service(name="fourth")
     await rig.until_logged("fourth", "waiting for")
     rig.kill("fourth", signal.SIGTERM)
-    assert rig.log("fourth").count("\n") == 1, "a waiting service does not exit immediately on SIGTERM"
+    assert rig.log("fourth").count("\n") == 1, "the waiting service did more than wait and exit"
     assert len(rig.entries("started")) == 1
 
 
@@ -102,10 +102,10 @@ async def test_service_stops_sending_when_lock_is_lost(rig: Rig, lose: Callable[
     assert await rig.ended("service", 3) == 1
     assert "mobility: lock lost" in rig.log("service")
     written = [entry["kind"] for entry in rig.entries()[entries:]]
-    assert set(written) <= {"state"}, "the service wrote other entries than positions after it lost the lock"
+    assert set(written) <= {"state"}, "after the loss of the lock, the service wrote other entries than states"
     await until_mode(rig.link, ARDUCOPTER.return_retracing)
     rig.start_service()
-    await rig.until(lambda t: t.autopilot_connected, 20, "the connection of a restarted service")
+    await rig.until(lambda t: t.autopilot_connected, 20, "connection of the restarted service")
     rig.kill("service", signal.SIGTERM)
     assert has_valid_chain(rig.audit)
 

@@ -59,7 +59,7 @@ def test_doctor_prints_install_commands_for_cluster_without_charts(
 def test_doctor_warns_about_pods_that_admission_would_reject_on_recreation(
     control_plane: ControlPlane, world: World, namespace: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Example: a network plugin that was installed before Fractus."""
+    """For example, a network plugin that was installed before Fractus could not be created again."""
     pod_spec: dict[str, object] = {"nodeName": "drone-1", "hostNetwork": True, "tolerations": [{"operator": "Exists"}]}
     pod_spec |= {"containers": [{"name": "cni", "image": "registry.test/cni:1"}]}
     plugin = {"apiVersion": "v1", "kind": "Pod", "metadata": {"name": "cni", "namespace": namespace}, "spec": pod_spec}
@@ -73,12 +73,12 @@ def test_doctor_warns_about_pods_that_admission_would_reject_on_recreation(
         try:
             world.api.apply(f"/api/v1/namespaces/{namespace}/pods/cni", plugin)
         except KubeError as error:
-            # The API server enforces the deleted policy of an earlier test for a moment.
+            # For a moment, the API server still enforces an admission policy that an earlier test has deleted.
             assert "fractus-pod" in str(error), error
             return False
         return True
 
-    wait_for(pod_created, "a pod on a node without an admission policy")
+    wait_for(pod_created, "a pod on a node, created without an admission policy")
     world.api.apply(path_of(guard), guard)
     try:
         main.run(["doctor", "-o", "json", "--kubeconfig", str(control_plane.kubeconfig)])
@@ -101,11 +101,11 @@ def test_helm_test_account_has_exactly_the_permissions_of_doctor(
     def examined() -> bool:
         code = main.run(["doctor", "-o", "json", "--kubeconfig", str(kubeconfig)])
         captured = capsys.readouterr()
-        # The authorizer receives roles through a watch, with a delay.
+        # Until the API server has received the role through its watch, it refuses requests.
         assert not captured.err or "Forbidden" in captured.err, captured.err
         return code == 2 and "operator" in {finding["check"] for finding in json.loads(captured.out)}
 
-    wait_for(examined, "doctor by the chart's account")
+    wait_for(examined, "complete findings of doctor with the chart's account")
     (pod,) = (body for body in render() if body["kind"] == "Pod")
     assert pod["spec"]["serviceAccountName"] == "fractus-test"
     assert pod["spec"]["containers"][0]["command"] == ["fractus", "doctor"]

@@ -44,7 +44,7 @@ spec:
 
 @pytest.fixture
 def sdk(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """The SDK's tracing, reset so that it reads the environment of this test. Its exporters are closed after the test."""
+    """Reset the SDK's tracing, so that it reads the environment of this test. Close its exporters after the test."""
     closers: list[Callable[[], None]] = []
     monkeypatch.setattr(fractus.tracing, "atexit", SimpleNamespace(register=closers.append))
     fractus.tracing._exporting.cache_clear()
@@ -133,7 +133,7 @@ async def test_corrected_goto_is_one_trace_from_the_sdk_to_the_autopilot(rig: Ri
     assert refused.attributes["fractus.verdict.code"] == "InsideExclusionZone"
     assert refused.attributes["fractus.verdict.policies"] == ["no-fly"]
     assert refused.attributes["rpc.grpc.status_code"] == 7
-    assert refused.span.status.code == Status.STATUS_CODE_UNSET, "a refusal is not an error of the server"
+    assert refused.span.status.code == Status.STATUS_CODE_UNSET, "a refusal is recorded as an error of the server"
     failed = collector.find(f"{MOBILITY}/Goto", CLIENT, rpc__grpc__status_code=7)
     assert failed.span.status.code == Status.STATUS_CODE_ERROR
 
@@ -145,7 +145,7 @@ async def test_corrected_goto_is_one_trace_from_the_sdk_to_the_autopilot(rig: Ri
     assert parts(collector, armed, "autopilot.COMPONENT_ARM_DISARM")
     lat, lon = (f"{value:.3f}" for value in FRAME.latlon(0, 8))
     content = "".join(str(s.span) for s in collector.spans)
-    assert lat not in content and lon not in content, "spans must not contain positions"
+    assert lat not in content and lon not in content, "a span contains a position"
 
 
 async def test_image_capture_is_traced_with_its_filters(rig: Rig, collector: Collector) -> None:
@@ -218,7 +218,7 @@ async def test_flight_continues_while_the_collector_is_unreachable(
         await drone.takeoff(6)
         for _ in range(50):
             await drone.position()
-            await asyncio.sleep(0.02)  # below the rate limit of the caller
+            await asyncio.sleep(0.02)  # keeps the rate below the limit of the caller
         with pytest.raises(InvalidRequest):
             await drone.goto(float("nan"), 0.0, 6)
 

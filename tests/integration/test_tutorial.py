@@ -1,4 +1,4 @@
-"""Procedure of docs/tutorial.md without a cluster: its program flies under its Grant."""
+"""Run the commands of docs/tutorial.md that need no cluster: its program flies under its Grant."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
 
 
 def commands(ports: dict[str, str]) -> list[list[str]]:
-    """Return the arguments of the page's `fractus` commands, in order, with ports replaced."""
+    """Return the arguments of each `fractus` command of the page, in order, with other ports."""
     lines = [line.removeprefix("fractus ") for line in shell_lines(PAGE_NAME) if line.startswith("fractus ")]
     for documented, port in ports.items():
         lines = [line.replace(documented, port) for line in lines]

@@ -1,4 +1,4 @@
-"""Hooks of helm uninstall: conditions for wiping nodes, and removed objects on a real API server."""
+"""Hooks of `helm uninstall`: when they wipe nodes, and which objects they remove on a real API server."""
 
 from __future__ import annotations
 
@@ -48,7 +48,9 @@ def test_uninstall_wipes_nodes_only_if_enabled() -> None:
     created = hooks(*WIPE)
     assert not [body for body in disabled if "wipe" in str(body)]
     release = [body for body in disabled if not is_hook(body)]
-    assert [body for body in enabled if not is_hook(body)] == release, "the value changes running workloads"
+    assert [body for body in enabled if not is_hook(body)] == release, (
+        "the value uninstall.wipeNodes changes running workloads"
+    )
     assert [body["kind"] for body in created][-2:] == ["DaemonSet", "Job"]
     for body in created:
         assert body["metadata"]["annotations"]["helm.sh/hook-delete-policy"] == "before-hook-creation,hook-succeeded"
@@ -66,7 +68,7 @@ def test_wipe_pod_has_access_only_to_state_of_node() -> None:
     services = {template["metadata"]["labels"]["app.kubernetes.io/component"] for template in sets.values()}
     assert set(apart["labelSelector"]["matchExpressions"][1]["values"]) == services
     for key in ("hostNetwork", "hostPID", "hostIPC", "priorityClassName"):
-        assert key not in pod  # the PriorityClass is already deleted
+        assert key not in pod  # helm has already deleted the PriorityClass
     assert not pod["automountServiceAccountToken"]
     for container in pod["initContainers"] + pod["containers"]:
         assert not container["securityContext"]["allowPrivilegeEscalation"]
@@ -110,12 +112,12 @@ def test_wipe_is_refused_if_directory_contains_node_descriptions(state: str, con
 
 
 def test_wipe_is_not_rendered_without_cluster() -> None:
-    """Argo CD renders everything as an installation. A remaining wipe value must not refuse other changes."""
+    """Argo CD always renders the chart as an installation. A wipe value that remains must not block other changes."""
     assert render(WIPE_NODES) == render()
 
 
 def test_wipe_is_refused_at_installation(world: World) -> None:
-    """A failed `helm install --atomic` uninstalls, possibly on nodes with existing data."""
+    """A failed `helm install --atomic` runs the uninstall hooks, which would wipe existing data of nodes."""
     with pytest.raises(subprocess.CalledProcessError) as refused:
         render(*with_lookups(world, WIPE_NODES))
     assert "set it with an upgrade just before uninstalling" in refused.value.stderr
@@ -128,7 +130,7 @@ def with_lookups(world: World, *arguments: str) -> tuple[str, ...]:
 
 @pytest.mark.parametrize("arguments", [(), ("--is-upgrade",)])
 def test_chart_is_refused_while_wipe_daemon_set_remains(world: World, arguments: tuple[str, ...]) -> None:
-    """A remaining wipe DaemonSet would prevent agents from running on its nodes, or wipe a node in use."""
+    """A wipe DaemonSet that remains would keep agents from its nodes, or wipe a node in use."""
     assert render(*with_lookups(world, *arguments))
     (body,) = (body for body in hooks(*WIPE) if body["kind"] == "DaemonSet")
     world.api.apply(path_of(body), body)
@@ -141,7 +143,7 @@ def test_chart_is_refused_while_wipe_daemon_set_remains(world: World, arguments:
 
 
 def test_failed_installation_keeps_existing_authority(world: World, remaining: list[str], tmp_path: Path) -> None:
-    """A failed installation that is rolled back does not delete an authority that was restored from a backup."""
+    """The rollback of a failed installation must not delete an authority that was restored from a backup."""
     upgraded = hooks(*with_lookups(world, "--is-upgrade"))
     installed = hooks(*with_lookups(world))
     assert "keep" not in str(upgraded)
@@ -156,9 +158,9 @@ def test_failed_installation_keeps_existing_authority(world: World, remaining: l
 
 @pytest.fixture
 def remaining(world: World) -> Iterator[list[str]]:
-    """Paths of objects that operator and agents leave after the release was deleted.
+    """Create the objects that operator and agents leave when the release is deleted, and return their paths.
 
-    Similar objects of other owners also exist.
+    Also create similar objects of other owners, which must not be removed.
     """
     for body in hooks():
         if body["kind"] != "Job":

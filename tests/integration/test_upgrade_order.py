@@ -32,7 +32,7 @@ def is_stored(world: World) -> bool:
     try:
         return world.api.get(OBJECTS) is not None
     except KubeError:
-        # "storage is (re)initializing"
+        # the API server answers "storage is (re)initializing"
         return False
 
 

@@ -1,6 +1,6 @@
-"""Third-party clients fly the simulated vehicle: MAVProxy, DroneKit, MAVSDK, and plans of QGroundControl.
+"""Third-party clients fly the simulated vehicle: MAVProxy, DroneKit and MAVSDK. Also fly plans of QGroundControl.
 
-The clients are development dependencies. FRACTUS_CLIENTS_PYTHON selects another interpreter with them.
+The clients are development dependencies. FRACTUS_CLIENTS_PYTHON selects another interpreter that has these packages.
 """
 
 from __future__ import annotations

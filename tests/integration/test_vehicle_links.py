@@ -18,7 +18,7 @@ from fractus_cluster.ports import free_port
 from pymavlink import mavutil
 from vehicle_process import HOME, Client, running_vehicle
 
-# Index in a PARAM_VALUE that does not belong to a list: the response to a read by name, or a changed parameter.
+# Index in PARAM_VALUE messages outside a parameter list: responses to reads by name, and changed parameters.
 UNKNOWN_INDEX = 65535
 FAST = ("--speedup", "10", "--ready-after", "3")
 
@@ -127,7 +127,7 @@ def test_gcs_failsafe_returns_home_when_heartbeats_stop(fast: str):
     client.wait(lambda m: m.get_type() == "HEARTBEAT" and not m.base_mode & 128, 30.0)
 
 
-def test_vehicle_serves_client_despite_invalid_data_and_client_that_never_reads():
+def test_invalid_data_and_client_that_never_reads_do_not_affect_other_client():
     port = free_port()
     with running_vehicle("--ready-after", "0.5", links=(f"tcp:127.0.0.1:{port}",)) as process:
         good = Client(f"tcp:127.0.0.1:{port}")
@@ -203,7 +203,7 @@ def test_udp_links_work_in_both_modes():
         client.interval(30, 10)
         client.wait_for("ATTITUDE")
         names = {server.wait(lambda _: True).get_type() for _ in range(20)}
-        assert "ATTITUDE" not in names, "a stream that one link requested is sent on another link"
+        assert "ATTITUDE" not in names, "the vehicle sent a stream on a link that did not request it"
         assert server.command(520, 1) == 0
 
 
@@ -238,7 +238,7 @@ def _send_udp(port: int, frames: list[bytes]) -> None:
         for at, frame in enumerate(frames):
             sender.sendto(frame, ("127.0.0.1", port))
             if at % 100 == 0:
-                time.sleep(0.005)  # prevents buffering by the kernel
+                time.sleep(0.005)  # limits the data that the kernel buffers
 
 
 def _send_serial(path: Path, frames: list[bytes]) -> None:
@@ -287,7 +287,7 @@ def test_one_process_runs_several_vehicles():
 
 
 def _fly_in_lockstep(tmp_path: Path, name: str, seed: int) -> bytes:
-    """Arm, take off and fly, with each message sent at a fixed simulated time."""
+    """Arm, take off and fly. Send each message at a fixed simulated time. Return the content of the tlog."""
     port = free_port()
     clock_port = free_port()
     log = tmp_path / name

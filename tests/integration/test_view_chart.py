@@ -43,7 +43,7 @@ def test_view_is_rendered_only_if_enabled_and_without_write_permissions() -> Non
     open_ = objects["NetworkPolicy"]["spec"]["ingress"][0]["ports"]
     (served,) = objects["Service"]["spec"]["ports"]
     assert [port["port"] for port in open_] == [port["name"] for port in container["ports"]] == ["http", "metrics"]
-    assert served["targetPort"] == "http", "the Service exposes the port without a token"
+    assert served["targetPort"] == "http", "the Service exposes the metrics port, which needs no token"
     assert f"--metrics=:{container['ports'][1]['containerPort']}" in container["args"]
 
 

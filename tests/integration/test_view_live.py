@@ -25,7 +25,7 @@ pytestmark = [
 
 
 class TcpProxy:
-    """A TCP proxy to a local port that can be interrupted and opened again."""
+    """TCP proxy to a local port. Tests can interrupt the proxy and open it again."""
 
     def __init__(self, port: int) -> None:
         self._target_port = port

@@ -70,7 +70,7 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def playwright(recordings: Path) -> Iterator[Playwright]:
-    """Playwright, started after the recorded flight, because it keeps an event loop running in this thread."""
+    """Playwright. It starts after the recorded flight, because its event loop keeps running in this thread."""
     with sync_playwright() as playwright:
         yield playwright
 
@@ -88,7 +88,7 @@ def address(recordings: Path) -> Iterator[str]:
 
 
 def go_to_end(page: Page) -> None:
-    """Pause the page and move it to the end of the recording."""
+    """Pause the replay, and move to the end of the recording."""
     page.get_by_label("Shown time").wait_for()
     expect(page.locator("#mode")).to_have_text("replay", timeout=TIMEOUT_MS)
     page.get_by_role("button", name="Pause").or_(page.get_by_role("button", name="Play")).click()
@@ -121,7 +121,7 @@ def test_view_page_shows_zones_verdicts_path_and_pictures_of_flight(browser: Bro
         page.wait_for_function("[...document.querySelectorAll('#pictures img')].some(image => image.naturalWidth > 0)")
         page.wait_for_timeout(1_000)
         assert pixels(page, ZONE) > 100
-        assert pixels(page, FLOWN) > 600, "the map shows the drone, but not its path"
+        assert pixels(page, FLOWN) > 600, "the map does not show the flown path"
 
 
 def test_view_page_can_be_used_by_keyboard(browser: Browser, address: str) -> None:
@@ -155,7 +155,10 @@ def test_view_page_can_be_used_by_keyboard(browser: Browser, address: str) -> No
 def test_view_page_announces_new_verdicts_to_screen_readers(browser: Browser, address: str) -> None:
     with opened(browser, address, reduced_motion="reduce") as page:
         expect(page.locator("#mode")).to_have_text("replay", timeout=TIMEOUT_MS)
-        expect(page.locator("#play")).to_have_text("Play"), "the replay starts by itself in spite of reduced motion"
+        (
+            expect(page.locator("#play")).to_have_text("Play"),
+            "the replay starts automatically although the user prefers reduced motion",
+        )
         log = page.get_by_role("log", name="New verdicts")
         expect(log).to_be_empty()
         for _ in range(12):

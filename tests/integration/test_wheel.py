@@ -1,4 +1,4 @@
-"""Wheels: contents and requirements, and strict type checks of the examples against the shipped one."""
+"""Wheels: contents and requirements, and strict type checks of the examples against the wheel fractus-drones."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
 
 @pytest.fixture(scope="module")
 def wheels(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """The wheels of both distributions, by name."""
+    """Build the wheels of both distributions, and return their paths by name."""
     folder = tmp_path_factory.mktemp("wheels")
     uv = shutil.which("uv") or str(ROOT / ".tools" / "bin" / "uv")
     built = subprocess.run(
@@ -29,13 +29,15 @@ def wheels(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         capture_output=True, text=True, check=False,
     )  # fmt: skip
     if built.returncode != 0:
-        pytest.skip(f"the wheels cannot be built without the build backend in uv's cache: {built.stderr[-300:]}")
+        pytest.skip(
+            f"the wheels cannot be built, possibly because uv's cache lacks the build backend: {built.stderr[-300:]}"
+        )
     return {path.name.partition("-")[0]: path for path in folder.glob("*.whl")}
 
 
 @pytest.fixture(scope="module")
 def interpreter(wheels: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A Python that has only the wheel fractus-drones."""
+    """Python interpreter in whose environment only the wheel fractus-drones is installed."""
     folder = tmp_path_factory.mktemp("wheel")
     venv.create(folder / "venv", with_pip=False)
     (packages,) = (folder / "venv" / "lib").glob("python*/site-packages")
@@ -44,7 +46,7 @@ def interpreter(wheels: dict[str, Path], tmp_path_factory: pytest.TempPathFactor
 
 
 def contents(wheel: Path) -> set[str]:
-    """Top-level names in a wheel, except its metadata."""
+    """Return the top-level names in a wheel, except its metadata."""
     with ZipFile(wheel) as archive:
         return {name.split("/")[0] for name in archive.namelist() if ".dist-info/" not in name}
 

@@ -1,4 +1,4 @@
-"""WiFi interface with a real wpa_supplicant on a veth device, by the wired driver, which needs no radio."""
+"""WiFi interface with a real wpa_supplicant on a veth device. Its wired driver needs no radio."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ async def test_wifi_network_is_created_joined_and_removed(device: str, sockets: 
     supplicant = WpaSupplicant(sockets / device)
     assert await supplicant.state() == ("COMPLETED", await supplicant.find_network("fleet"))
     assert str(link_address("d1")) in addresses(device)
-    await wifi.up()  # called repeatedly while links are planned
+    await wifi.up()  # the agent calls this repeatedly while links are planned
     assert await networks(sockets, device) == ["owner", "fleet"]
     await wifi.down()
     assert await networks(sockets, device) == ["owner"]
@@ -93,7 +93,7 @@ async def test_wifi_ad_hoc_network_has_ad_hoc_settings(
     monkeypatch.setattr(module, "JOIN_TIMEOUT_S", 0.5)
     wifi = controller(device, sockets, "fleet", "adhoc")
     try:
-        await wifi.up()  # the wired driver may not support the mode
+        await wifi.up()  # may fail, because the wired driver may not support this mode
     except InterfaceProblem as problem:
         assert problem.reason == "NotJoined"
     supplicant = WpaSupplicant(sockets / device)
@@ -103,7 +103,7 @@ async def test_wifi_ad_hoc_network_has_ad_hoc_settings(
     assert await supplicant.request("GET_NETWORK", number, "frequency") == "2412"
 
 
-async def test_unresponsive_wpa_supplicant_is_an_interface_problem(device: str, tmp_path: Path) -> None:
+async def test_unresponsive_wpa_supplicant_raises_interface_problem(device: str, tmp_path: Path) -> None:
     import socket
 
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as silent:

@@ -87,7 +87,9 @@ def test_world_photo_is_resized_to_requested_size(tmp_path: Path) -> None:
     for width, height in ((80, 60), (320, 180), (60, 80), (31, 17)):
         picture = resized(photo, width, height)
         assert picture.shape == (height, width, 3)
-        assert tuple(picture[height // 2, width // 2]) == (20, 20, 200), "the order is not blue, green, red"
+        assert tuple(picture[height // 2, width // 2]) == (20, 20, 200), (
+            "the channels are not in the order blue, green, red"
+        )
     (tmp_path / "a.png").unlink()
     with pytest.raises(PhotoError, match="cannot be read"):
         resized(photo, 8, 8)

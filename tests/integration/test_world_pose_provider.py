@@ -62,7 +62,7 @@ def follower(autopilot: Autopilot) -> Iterator[VehiclePose]:
 
 
 def wait_for_pose(vehicle: VehiclePose, known: bool = True) -> CameraPose | None:
-    """Wait until the pose is known or, if `known` is False, unknown, and return it."""
+    """Wait until the pose is known, or unknown if `known` is False. Return the pose, or None if it is unknown."""
     end = time.monotonic() + TIMEOUT_S
     while time.monotonic() < end:
         camera = vehicle.now()
@@ -98,7 +98,9 @@ def test_world_pose_provider_requests_streams_without_heartbeats(autopilot: Auto
     while len(requested) < 3 and time.monotonic() < end:
         assert autopilot.link is not None
         for message in parser.feed(autopilot.link.recv(4096)):
-            assert message.name == "COMMAND_LONG", "a heartbeat would prevent the autopilot's failsafe"
+            assert message.name == "COMMAND_LONG", (
+                "the provider sent another message. A heartbeat would prevent the autopilot's failsafe"
+            )
             assert message.integer("command") == 511
             requested[int(message.real("param1"))] = message.real("param2")
     assert requested == {33: 50_000.0, 30: 50_000.0, 285: 100_000.0}
@@ -117,7 +119,7 @@ def test_world_pose_is_extrapolated_by_velocity(autopilot: Autopilot, follower: 
 def test_world_pose_uses_gimbal_attitude_instead_of_mount(
     autopilot: Autopilot, follower: VehiclePose, flags: int, yaw: float
 ) -> None:
-    """Flags of the message state if the gimbal's yaw is relative to the airframe or to north."""
+    """The flags of the message specify a yaw relative to the airframe or to north."""
     autopilot.fly(yaw_deg=80.0)
     known_pose(follower)
     half_pitch = math.radians(-40.0) / 2
@@ -164,7 +166,7 @@ def test_world_pose_provider_recovers_from_invalid_bytes_and_broken_link(
     autopilot.link.sendall(bytes(range(256)) * 40)
     end = time.monotonic() + TIMEOUT_S
     while follower.now() is None and time.monotonic() < end:
-        autopilot.fly()  # the invalid bytes may contain the beginning of a frame, which consumes the next message
+        autopilot.fly()  # the invalid bytes may begin a frame, which would consume the next message
         time.sleep(0.05)
     known_pose(follower)
     autopilot.link.close()

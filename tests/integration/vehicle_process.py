@@ -16,7 +16,7 @@ HOME = (48.2, 16.37, 150.0)
 
 @contextlib.contextmanager
 def running_vehicle(*arguments: str, links: tuple[str, ...]) -> Iterator[subprocess.Popen[str]]:
-    """Run a vehicle until the block ends. The process must exit cleanly on SIGTERM."""
+    """Run a vehicle until the block ends. Then check that the process exits with 0 on SIGTERM."""
     command = [sys.executable, "-m", "fractus_vehicle", "--home", ",".join(str(part) for part in HOME)]
     for link in links:
         command += ["--listen", link]
@@ -38,7 +38,7 @@ def running_vehicle(*arguments: str, links: tuple[str, ...]) -> Iterator[subproc
 
 
 class Client:
-    """A pymavlink client with waits in wall-clock seconds."""
+    """A pymavlink client. Its timeouts are in real seconds, not in simulated seconds."""
 
     def __init__(self, address: str, sysid: int = 255, target: int = 1) -> None:
         self.link = mavutil.mavlink_connection(address, source_system=sysid, source_component=190)
@@ -80,7 +80,7 @@ class Client:
         return int(ack.result)
 
     def interval(self, message_id: int, rate_hz: float) -> None:
-        """Request a message at a rate."""
+        """Request a stream of a message at a rate in Hz."""
         assert self.command(511, message_id, 1e6 / rate_hz) == 0
 
     def take_off(self, altitude_m: float) -> None:

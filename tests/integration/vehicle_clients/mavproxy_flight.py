@@ -22,7 +22,7 @@ FENCE = "QGC WPL 110\n" + "".join(
 
 
 class Session:
-    """MAVProxy as a process with its prompt."""
+    """MAVProxy as a process, with its prompt as input and output."""
 
     def __init__(self, address: str, directory: Path) -> None:
         program = Path(sys.executable).with_name("mavproxy.py")

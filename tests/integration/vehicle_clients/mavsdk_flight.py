@@ -94,7 +94,7 @@ async def fence(fences: geofence.GeofenceAsync, home: Any) -> None:
 
 
 async def upload(missions: mission.MissionAsync, plan: MissionPlan) -> None:
-    """Upload a mission. Retry because MAVSDK is still busy for a moment after it has reported the end of a transfer."""
+    """Upload a mission. Retry, because MAVSDK may still be busy after it has reported the end of a transfer."""
     for remaining in reversed(range(100)):
         try:
             await missions.upload_mission(plan)
@@ -118,14 +118,14 @@ async def missions(missions: mission.MissionAsync, raw: mission_raw.MissionRawAs
         )
         for north, east, altitude in ((10, 0, 10.0), (10, 10, 12.0), (0, 10, 10.0))
     ]
-    # MAVSDK fills the parameters of its return item with NaN. ArduPilot refuses these, so the simulated vehicle must refuse them.
+    # MAVSDK sets the parameters of its return item to NaN. The simulated vehicle must refuse this item, like ArduPilot.
     await missions.set_return_to_launch_after_mission(True)
     try:
         await missions.upload_mission(MissionPlan(items))
     except MissionError as error:
         print("ok: refused", error, flush=True)
     else:
-        raise SystemExit("a return with NaN for parameters was accepted")
+        raise SystemExit("the vehicle accepted a return item with NaN parameters")
     await missions.set_return_to_launch_after_mission(False)
     await upload(missions, MissionPlan(items))
     assert len(await raw.download_mission()) >= len(items)

@@ -13,6 +13,7 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
 from fractus_core.api.names import node_identity, node_server_name
+from fractus_runtime.files import check_regular
 
 CERTIFICATE_FILES = ("tls.crt", "tls.key", "ca.crt")
 
@@ -72,6 +73,8 @@ def inspect_certificate(directory: Path, node: str) -> ValidityPeriod:
             node.
     """
     try:
+        for name in CERTIFICATE_FILES:
+            check_regular(directory / name)
         server = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
         server.load_cert_chain(directory / "tls.crt", directory / "tls.key")
         client = ssl.create_default_context(cafile=str(directory / "ca.crt"))

@@ -15,7 +15,14 @@ from fractus_core.api.grants import ENDED, MAX_MESSAGE, Grant, GrantPhase, Grant
 from fractus_core.api.model import InvalidObject
 from fractus_core.control import Outcome, OutcomeKind
 from fractus_core.policy.grant_signatures import BadSignature, UnknownAuthority, read_authorities, verify
-from fractus_runtime.files import remove_file, write_file
+from fractus_runtime.files import (
+    UnsuitableFile,
+    parse_json,
+    read_file,
+    remove_file,
+    remove_temporary_files,
+    write_file,
+)
 
 from fractus_agent.store import GrantList, Object, Store
 from fractus_agent.supervisor import repeat
@@ -51,8 +58,7 @@ class GrantDirectory:
     def open(self) -> None:
         """Create the directory, and remove temporary files of a killed agent."""
         self._path.mkdir(parents=True, exist_ok=True, mode=0o700)
-        for temporary in self._path.glob(".*.tmp"):
-            temporary.unlink()
+        remove_temporary_files(self._path)
 
     def names(self) -> set[str]:
         """Return the names of the stored Grants."""
@@ -62,16 +68,16 @@ class GrantDirectory:
         """Return True if exactly this Grant is stored."""
         try:
             return self.read(grant.name) == serialize_grant(grant)
-        except FileNotFoundError:
+        except (FileNotFoundError, UnsuitableFile):
             return False
 
     def read(self, name: str) -> bytes:
         """Return the content of a stored Grant.
 
         Raises:
-            OSError: The file is missing or cannot be read.
+            OSError: The file is missing, no regular file, too large, or cannot be read.
         """
-        return self._file(name).read_bytes()
+        return read_file(self._file(name))
 
     def write(self, grant: Grant) -> bool:
         """Store a Grant. Return False if it was stored already."""
@@ -160,7 +166,7 @@ class GrantVerifier:
             UnknownAuthority: The authority of the Grant is unknown on this node.
         """
         try:
-            authorities = read_authorities(self._path.read_bytes())
+            authorities = read_authorities(read_file(self._path))
         except (OSError, ValueError) as error:
             raise UnknownAuthority(f"the node cannot read the certificate of its authority ({error})") from None
         verify(grant, authorities)
@@ -386,14 +392,14 @@ class GrantSynchronizer:
         """
         stored = None
         try:
-            stored = Grant.from_body(json.loads(self._directory.read(grant.name))).spec.unsigned
+            stored = Grant.from_body(parse_json(self._directory.read(grant.name))).spec.unsigned
         except FileNotFoundError:
             return False
         except OSError as error:
             # Possibly out of file descriptors. The services still use the stored version.
             log.warning("grants: stored Grant not readable (grant=%s error=%s)", grant.name, error)
             stored = self._written.get(grant.name)
-        except (ValueError, RecursionError, InvalidObject) as error:
+        except (ValueError, InvalidObject) as error:
             log.warning("grants: stored Grant invalid (grant=%s error=%s)", grant.name, error)
         if stored == grant.spec.unsigned:
             return False

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+from fractus_runtime.files import read_file
 from fractus_services.recording.messages import parse_time_ns, sentence
 
 from fractus_cli.audit_logs import Window, entries, find_logs, is_decision, verify_log
@@ -193,12 +194,14 @@ def _checkpoints(since: tuple[str, ...], ca: Path | None) -> dict[str, Checkpoin
 
     checkpoints: dict[str, Checkpoint] = {}
     try:
-        authorities = x509.load_pem_x509_certificates(ca.read_bytes()) if ca is not None else []
+        authorities = x509.load_pem_x509_certificates(read_file(ca)) if ca is not None else []
+    except OSError as error:
+        raise click.ClickException(f"--ca {ca}: {error.strerror or error}") from None
     except ValueError:
         raise click.ClickException(f"--ca {ca}: contains no certificate") from None
     for text in since:
         try:
-            checkpoint = parse_status_checkpoint(text) or read_checkpoint(Path(text).read_bytes(), authorities)
+            checkpoint = parse_status_checkpoint(text) or read_checkpoint(read_file(Path(text)), authorities)
         except (OSError, InvalidCheckpoint) as error:
             reason = error.strerror if isinstance(error, OSError) else error
             raise click.ClickException(f"--since {text}: {reason}") from None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import errno
 import math
 import pathlib
 from collections.abc import Collection, Iterable, Iterator, Mapping
@@ -31,6 +32,7 @@ from fractus_core.documents import MAX_BYTES, BadDocument, Documents, parse_docu
 from fractus_core.planning import Host, Inventory
 from fractus_core.planning.inventory import amount_of
 from fractus_core.validation import check_policy, check_zone
+from fractus_runtime import files
 
 from fractus_cli.output import printable
 
@@ -219,19 +221,19 @@ def read_documents(file: pathlib.Path, *, strict: bool = True) -> Iterator[Manif
 
 
 def read_file(file: pathlib.Path) -> bytes:
-    """Return the content of a file. The size limit also applies to devices and pipes without an end.
+    """Return the content of a file.
 
     Raises:
-        BadManifest: The file cannot be read or is too large.
+        BadManifest: The file cannot be read, is no regular file, or is too large.
     """
     try:
-        with file.open("rb") as opened:
-            content = opened.read(MAX_BYTES + 1)
+        return files.read_file(file, MAX_BYTES)
+    except files.UnsuitableFile as error:
+        if error.errno == errno.EFBIG:
+            raise BadManifest(f"{files.path_text(file)}: larger than {MAX_BYTES // 2**20} MiB; split it") from None
+        raise BadManifest(f"{files.path_text(file)}: is not a regular file; write its content to a file") from None
     except OSError as error:
-        raise BadManifest(f"{file}: {error.strerror}") from None
-    if len(content) > MAX_BYTES:
-        raise BadManifest(f"{file}: larger than {MAX_BYTES // 2**20} MiB; split it")
-    return content
+        raise BadManifest(f"{files.path_text(file)}: {error.strerror}") from None
 
 
 def _resource(manifest: Manifest, kinds: Mapping[str, type[Resource]]) -> Resource | Host | None:

@@ -18,7 +18,7 @@ from fractus_core.api import Grant, InvalidObject
 from fractus_core.api.names import ComponentIdentity, is_subdomain
 from fractus_core.identity.authority import Authority, BrokenAuthority, Data
 from fractus_core.identity.grant_signer import GrantSigner
-from fractus_runtime.files import write_file
+from fractus_runtime.files import read_file, read_json, write_file
 
 DEFAULT_LIFE = timedelta(days=365)
 """Default validity of the certificates of nodes and components."""
@@ -148,13 +148,13 @@ class StandalonePki:
 
 def _stored(path: Path) -> Grant | None:
     try:
-        return Grant.from_body(json.loads(path.read_bytes()))
+        return Grant.from_body(read_json(path))
     except (OSError, ValueError):
         return None
 
 
 def _read(folder: Path) -> Data:
-    return {path.name: base64.b64encode(path.read_bytes()).decode() for path in folder.glob("[!.]*")}
+    return {path.name: base64.b64encode(read_file(path)).decode() for path in folder.glob("[!.]*")}
 
 
 def _write(folder: Path, data: Data) -> Path:

@@ -29,7 +29,7 @@ from fractus_runtime.audit_chain import (
     segments,
 )
 from fractus_runtime.audit_checkpoints import sign_checkpoint
-from fractus_runtime.files import remove_temporary, write_file
+from fractus_runtime.files import open_file, open_regular, remove_temporary, write_file
 
 log = logging.getLogger(__name__)
 
@@ -123,12 +123,14 @@ class AuditLog:
         path.parent.mkdir(parents=True, exist_ok=True)
         self._lock: int | None = None
         torn = 0
-        with contextlib.suppress(OSError):  # a read-only disk is reported when the first entry is written
+        self._end = ChainEntry()
+        # A path that cannot be read or written is reported when the first entry is written.
+        with contextlib.suppress(OSError):
             whole, size = _complete_length(path)
             torn = size - whole
             self._sound_bytes = whole if torn else None
+            self._end = _end_of_chain(path)
             path.touch(0o640)  # so that verification detects a missing file
-        self._end = _end_of_chain(path)
         self._thread = threading.Thread(target=self._write, name="audit", daemon=True)
         self._thread.start()
         if torn:
@@ -314,7 +316,7 @@ class AuditLog:
 
         Bytes that an earlier failure or a crash left are removed first.
         """
-        file = os.open(self._path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o640)
+        file = open_regular(self._path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o640)
         try:
             if self._sound_bytes is not None and os.fstat(file).st_size > self._sound_bytes:
                 os.ftruncate(file, self._sound_bytes)
@@ -347,7 +349,7 @@ def _end_of_chain(log_file: Path) -> ChainEntry:
 
 def _first_entry(path: Path) -> int:
     """Return the sequence number of the first entry of a file."""
-    with path.open("rb") as file:
+    with open_file(path) as file:
         return int(json.loads(file.readline())["seq"])
 
 
@@ -404,7 +406,7 @@ def _complete_length(path: Path) -> tuple[int, int]:
         size = path.stat().st_size
     except FileNotFoundError:
         return 0, 0
-    with path.open("rb") as file:
+    with open_file(path) as file:
         end = size
         while end > 0:
             start = max(end - 65536, 0)

@@ -12,6 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from fractus_runtime.files import open_file
+
 GENESIS = "0" * 64
 PRUNED = "pruned"
 """Kind of the entry that records which segments were removed to free space."""
@@ -21,8 +23,10 @@ _SEGMENT = re.compile(r"^(?P<name>.+)\.(?P<first>\d{12})$")
 
 
 def canonical(value: dict[str, Any]) -> bytes:
-    """Return the JSON text that is hashed and written."""
-    return json.dumps(value, sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False).encode()
+    """Return the JSON text that is hashed and written. Lone surrogates, as in file names that are not UTF-8, are escaped."""
+    return json.dumps(value, sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False).encode(
+        errors="backslashreplace"
+    )
 
 
 def digest(entry: dict[str, Any]) -> str:
@@ -45,7 +49,7 @@ def last_entry(path: Path) -> ChainEntry | None:
     Raises:
         ValueError: The last complete line is not an audit entry.
     """
-    with contextlib.suppress(FileNotFoundError), path.open("rb") as file:
+    with contextlib.suppress(FileNotFoundError), open_file(path) as file:
         file.seek(0, os.SEEK_END)
         file.seek(max(file.tell() - _TAIL_BYTES, 0))
         tail = file.read()
@@ -100,7 +104,7 @@ def _log_of(path: Path) -> Path:
 def read_lines(files: Iterable[Path]) -> Iterator[tuple[Path, int, bytes]]:
     """Yield the lines of several files, each with its file and line number."""
     for path in files:
-        with path.open("rb") as file:
+        with open_file(path) as file:
             for number, line in enumerate(file, 1):
                 yield path, number, line
 

@@ -17,6 +17,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from fractus_core.api.names import node_identity
 
 from fractus_runtime.audit_chain import ChainEntry, canonical
+from fractus_runtime.files import read_file
 
 _CONTEXT = b"fractus.dev audit checkpoint 1\n"
 _NODES = node_identity("")
@@ -58,10 +59,10 @@ def sign_checkpoint(log: str, entry: ChainEntry, time: str, tls: Path) -> bytes:
         ValueError: The key or the certificate is malformed.
         TypeError: The key is not an elliptic curve key.
     """
-    key = serialization.load_pem_private_key((tls / "tls.key").read_bytes(), None)
+    key = serialization.load_pem_private_key(read_file(tls / "tls.key"), None)
     if not isinstance(key, ec.EllipticCurvePrivateKey):
         raise TypeError(f"{tls / 'tls.key'}: not an elliptic curve key")
-    certificate = x509.load_pem_x509_certificate((tls / "tls.crt").read_bytes())
+    certificate = x509.load_pem_x509_certificate(read_file(tls / "tls.crt"))
     content = {
         "log": log, "seq": entry.sequence, "hash": entry.hash, "time": time,
         "certificate": certificate.public_bytes(serialization.Encoding.PEM).decode(),

@@ -1,17 +1,123 @@
-"""Atomic and durable file replacement."""
+"""Bounded reading of regular files, and atomic and durable file replacement."""
 
 from __future__ import annotations
 
 import contextlib
+import errno
 import glob
+import json
 import os
 import shutil
+import stat
 import uuid
 from collections.abc import Mapping
 from pathlib import Path
+from typing import IO, Any
+
+MAX_FILE_BYTES = 16 * 2**20
+"""Default limit of the size of a file that is read whole, in bytes."""
+MAX_JSON_DEPTH = 100
+"""Maximum nesting of JSON from a file or a peer. Interpreters fail at different depths from about 300 on."""
 
 CURRENT = "..data"
 """Symbolic link to the directory with the current set of files, as in the kubelet's Secret volumes."""
+
+
+class UnsuitableFile(OSError):
+    """The path is not a regular file (for example a FIFO or a device), or the file is too large."""
+
+
+def open_regular(path: Path, flags: int = os.O_RDONLY, mode: int = 0o600) -> int:
+    """Open a regular file and return its descriptor. Symbolic links are followed.
+
+    Opening never blocks. A FIFO would block until it has a writer, and a device may react to being opened.
+
+    Raises:
+        UnsuitableFile: The path is not a regular file.
+        IsADirectoryError: The path is a directory.
+        OSError: The file cannot be opened.
+    """
+    with contextlib.suppress(FileNotFoundError):
+        _check_regular(path, path.stat())
+    descriptor = os.open(path, flags | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC, mode)
+    try:
+        _check_regular(path, os.fstat(descriptor))  # the path may have been replaced since the first check
+    except OSError:
+        os.close(descriptor)
+        raise
+    return descriptor
+
+
+def open_file(path: Path) -> IO[bytes]:
+    """Open a regular file for reading. See `open_regular`."""
+    return os.fdopen(open_regular(path), "rb")
+
+
+def check_regular(path: Path) -> None:
+    """Check a file that a library opens by its path. See `open_regular`."""
+    _check_regular(path, path.stat())
+
+
+def read_file(path: Path, max_bytes: int = MAX_FILE_BYTES) -> bytes:
+    """Return the content of a regular file. See `open_regular`.
+
+    Args:
+        path: File to read.
+        max_bytes: Maximum size.
+
+    Raises:
+        UnsuitableFile: The path is not a regular file, or the file is too large.
+        OSError: The file cannot be read.
+    """
+    with open_file(path) as file:
+        too_large = os.fstat(file.fileno()).st_size > max_bytes
+        content = b"" if too_large else file.read(max_bytes + 1)
+    if too_large or len(content) > max_bytes:
+        raise UnsuitableFile(errno.EFBIG, f"is larger than {max_bytes} bytes", str(path))
+    return content
+
+
+def read_json(path: Path, max_bytes: int = MAX_FILE_BYTES) -> Any:
+    """Return the JSON value in a regular file. See `read_file` and `parse_json`.
+
+    Raises:
+        OSError: The file cannot be read.
+        ValueError: The content is not JSON, or is nested too deeply.
+    """
+    return parse_json(read_file(path, max_bytes))
+
+
+def parse_json(content: bytes) -> Any:
+    """Return a JSON value from a file or a peer.
+
+    Raises:
+        ValueError: The content is not JSON, or is nested more than `MAX_JSON_DEPTH` levels deep.
+    """
+    try:
+        value = json.loads(content)
+    except RecursionError:
+        raise ValueError("nested too deeply") from None
+    level = [value]
+    for _ in range(MAX_JSON_DEPTH):
+        collections = [item for item in level if isinstance(item, dict | list)]
+        if not collections:
+            return value
+        level = [child for item in collections for child in (item.values() if isinstance(item, dict) else item)]
+    if any(isinstance(item, dict | list) for item in level):
+        raise ValueError("nested too deeply")
+    return value
+
+
+def path_text(path: Path | str) -> str:
+    """Return a path as text that can be logged and sent. Bytes of a name that is not UTF-8 are escaped."""
+    return os.fsencode(path).decode(errors="backslashreplace")
+
+
+def _check_regular(path: Path, status: os.stat_result) -> None:
+    if stat.S_ISDIR(status.st_mode):
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+    if not stat.S_ISREG(status.st_mode):
+        raise UnsuitableFile(errno.EINVAL, "is not a regular file", str(path))
 
 
 def write_file(
@@ -50,6 +156,13 @@ def remove_temporary(path: Path) -> None:
     """Remove the temporary files that killed writers of a file left. Call it only from the only writer of the file."""
     with contextlib.suppress(OSError):
         for leftover in path.parent.glob(f".{glob.escape(path.name)}.*.tmp"):
+            leftover.unlink(missing_ok=True)
+
+
+def remove_temporary_files(directory: Path) -> None:
+    """Remove the temporary files of all files of a directory. Call it only from the only writer of the directory."""
+    for leftover in directory.glob(".*.tmp"):
+        with contextlib.suppress(OSError):
             leftover.unlink(missing_ok=True)
 
 
@@ -111,7 +224,7 @@ def read_set(directory: Path, names: tuple[str, ...]) -> dict[str, bytes] | None
     """Return the files of a set that were written together, or None if a file is missing."""
     try:
         current = (directory / CURRENT).resolve(strict=True)
-        return {name: (current / name).read_bytes() for name in names}
+        return {name: read_file(current / name) for name in names}
     except FileNotFoundError:
         return None
 

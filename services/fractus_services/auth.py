@@ -14,6 +14,7 @@ import grpc
 from cryptography import x509
 from fractus_core.api.names import SPIFFE_SCHEME
 from fractus_core.policy.decision_types import UncertainTime
+from fractus_runtime.files import check_regular, read_file
 
 from fractus_services.clock import steady_s
 from fractus_services.errors import NotAuthenticated
@@ -145,6 +146,7 @@ class TlsFiles:
 
     def _present(self, name: str) -> bool:
         try:
+            check_regular(self._directory / name)
             return (self._directory / name).stat().st_size > 0
         except OSError:
             return False
@@ -154,7 +156,7 @@ class TlsFiles:
         return tuple((stat.st_mtime_ns, stat.st_size, stat.st_ino) for stat in stats)
 
     def _load(self) -> tuple[bytes, bytes, bytes]:
-        key, certificate, ca = ((self._directory / name).read_bytes() for name in FILES)
+        key, certificate, ca = (read_file(self._directory / name) for name in FILES)
         return key, certificate, ca
 
     def _configuration(self) -> Any:
@@ -167,7 +169,7 @@ class TlsFiles:
     def expires_s(self) -> float | None:
         """Return the Unix time at which the certificate expires, or None if it is missing or unreadable."""
         try:
-            pem = (self._directory / "tls.crt").read_bytes()
+            pem = read_file(self._directory / "tls.crt")
             return x509.load_pem_x509_certificate(pem).not_valid_after_utc.timestamp()
         except (OSError, ValueError):
             return None

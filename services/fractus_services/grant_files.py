@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import json
 import logging
+import os
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -16,6 +16,7 @@ from fractus_core.api.grants import Grant, GrantSpec
 from fractus_core.api.model import InvalidObject
 from fractus_core.policy.compiled_grant import CompiledGrant, compile_grant
 from fractus_core.policy.grant_signatures import BadSignature
+from fractus_runtime.files import UnsuitableFile, path_text, read_json
 
 from fractus_services.grant_verifier import GrantVerifier
 
@@ -25,6 +26,8 @@ RESCAN_INTERVAL_S = 0.25
 """Interval at which the directory is scanned. It bounds the time until a removed Grant is revoked, on any file system."""
 SETTLE_S = 0.05
 """Delay between the detection of a changed file and its reading."""
+MAX_GRANT_BYTES = 64 * 2**20
+"""Maximum size of a Grant file, as large as all Grants of a node together."""
 _Stamp = tuple[int, int, int]
 
 
@@ -63,7 +66,8 @@ class GrantFiles:
     """Grants in a directory of Grant manifests.
 
     A file that cannot be read or parsed, or that the operator did not sign, grants nothing. If a file becomes invalid, its Grant
-    is revoked, because its restrictions are then unknown.
+    is revoked, because its restrictions are then unknown. The same applies to a path that is no regular file, or too large. After
+    a disk error the Grant returns when the file can be read again.
 
     Args:
         directory: Directory in which the agent stores the Grants. It may not exist yet.
@@ -89,6 +93,9 @@ class GrantFiles:
         self._saving: asyncio.Task[None] | None = None
         self._stamps: dict[Path, _Stamp] = {}
         self._loaded: dict[Path, ActiveGrant | None] = {}
+        self._problems: dict[Path, str] = {}
+        """Reported reason why each file cannot be read now. These files are read again at each scan."""
+        self._directory_problem = ""
         self._active: dict[str, ActiveGrant] = {}
         self._listeners: list[Listener] = []
         self._reading = threading.Lock()
@@ -139,7 +146,7 @@ class GrantFiles:
     def _read_changes_locked(self) -> bool:
         stamps, complete = self._list()
         authorities_changed = self._verifier.reload_authorities()
-        if stamps == self._stamps and not authorities_changed:
+        if stamps == self._stamps and not authorities_changed and not self._problems:
             return False
         if self._stamps and stamps != self._stamps:
             # A file that is copied in place is incomplete for a moment.
@@ -148,9 +155,15 @@ class GrantFiles:
         before = dict(self._loaded)
         for path in self._stamps.keys() - stamps.keys():
             self._loaded.pop(path, None)
+            self._problems.pop(path, None)
         for path, stamp in stamps.items():
-            if self._stamps.get(path) != stamp or (authorities_changed and self._loaded.get(path) is None):
+            if (
+                self._stamps.get(path) != stamp
+                or path in self._problems
+                or (authorities_changed and self._loaded.get(path) is None)
+            ):
                 self._loaded[path] = self._load(path)
+        changed = authorities_changed or stamps != self._stamps
         self._stamps = stamps
         if complete:
             renamed = {grant.digest for grant in self._loaded.values() if grant is not None}
@@ -158,37 +171,34 @@ class GrantFiles:
                 removed = before[path]
                 if removed is not None and removed.digest not in renamed:
                     self._revoke(removed)
-        return True
+        return changed or any(before.get(path) is not grant for path, grant in self._loaded.items())
 
     def _list(self) -> tuple[dict[Path, _Stamp], bool]:
         """Return the stamps of the files. The second value is False if missing files may be unreadable rather than removed."""
         stamps: dict[Path, _Stamp] = {}
         complete = True
         try:
-            for path in sorted(self._directory.glob("*.json")):
+            # Not Path.glob, which lists a directory without read permission as empty.
+            with os.scandir(self._directory) as listed:
+                names = sorted(entry.name for entry in listed if entry.name.endswith(".json"))
+            for path in (self._directory / name for name in names):
                 try:
                     stat = path.stat()
+                    stamps[path] = (stat.st_mtime_ns, stat.st_size, stat.st_ino)
                 except FileNotFoundError:
                     continue
                 except OSError as error:
-                    complete = False
-                    log.critical(
-                        "grants: cannot read file, it grants nothing (file=%s error=%s)",
-                        path,
-                        error,
-                        extra={"limit_by": str(path)},
-                    )
-                    continue
-                stamps[path] = (stat.st_mtime_ns, stat.st_size, stat.st_ino)
-            complete = complete and self._directory.is_dir()
+                    stamps[path] = (0, 0, -(error.errno or 1))  # reading the file reports the error
         except OSError as error:
+            stamps = {}
             complete = False
-            log.critical(
-                "grants: cannot read directory, nothing is granted (directory=%s error=%s)",
-                self._directory,
-                error,
-                extra={"limit_by": str(self._directory)},
-            )
+            if self._directory_problem != str(error):
+                log.critical(
+                    "grants: cannot read directory, nothing is granted (directory=%s error=%s)", self._directory, error
+                )
+            self._directory_problem = str(error)
+        else:
+            self._directory_problem = ""
         return stamps, complete
 
     def _load(self, path: Path) -> ActiveGrant | None:
@@ -196,24 +206,32 @@ class GrantFiles:
         before = self._loaded.get(path)
         try:
             grant = self._read(path)
-        except (OSError, ValueError, InvalidObject, BadSignature) as error:
-            log.critical("grants: invalid file, it grants nothing (file=%s error=%s)", path, error)
-            self._refused(path.name, str(error))
-            if not isinstance(error, OSError):
-                self._revoke(before)
+        except (UnsuitableFile, IsADirectoryError, ValueError, InvalidObject, BadSignature) as error:
+            log.critical("grants: invalid file, it grants nothing (file=%s error=%s)", path_text(path), error)
+            self._refused(path_text(path.name), str(error))
+            self._revoke(before)
+            self._problems.pop(path, None)
+            return None
+        except OSError as error:
+            # A disk error removes no Grant for good.
+            if self._problems.get(path) != str(error):
+                log.critical("grants: cannot read file, it grants nothing (file=%s error=%s)", path_text(path), error)
+                self._refused(path_text(path.name), str(error))
+            self._problems[path] = str(error)
             return None
         except Exception as error:
-            log.exception("grants: reading failed, the file grants nothing (file=%s)", path)
-            self._refused(path.name, f"{type(error).__name__}: {error}")
+            log.exception("grants: reading failed, the file grants nothing (file=%s)", path_text(path))
+            self._refused(path_text(path.name), f"{type(error).__name__}: {error}")
             return None
+        self._problems.pop(path, None)
         if grant is None or (before is not None and before.identity != grant.identity):
             self._revoke(before)
         return grant
 
     def _read(self, path: Path) -> ActiveGrant | None:
-        grant = Grant.from_body(json.loads(path.read_bytes()))
+        grant = Grant.from_body(read_json(path, MAX_GRANT_BYTES))
         if grant.spec.node != self._node:
-            log.error("grants: Grant of another node ignored (file=%s node=%s)", path, grant.spec.node)
+            log.error("grants: Grant of another node ignored (file=%s node=%s)", path_text(path), grant.spec.node)
             return None
         digest = self._verifier.verify(grant)
         compiled = compile_grant(grant.spec, flat_terrain=self._flat_terrain)
@@ -230,11 +248,15 @@ class GrantFiles:
                 continue
             if not self._verifier.is_latest(grant.identity, grant.digest):
                 log.error(
-                    "grants: Grant ignored because a later one was seen (file=%s identity=%s)", path, grant.identity
+                    "grants: Grant ignored because a later one was seen (file=%s identity=%s)",
+                    path_text(path),
+                    grant.identity,
                 )
                 continue
             if grant.identity in fresh:
-                log.error("grants: second Grant of an identity ignored (file=%s identity=%s)", path, grant.identity)
+                log.error(
+                    "grants: second Grant of an identity ignored (file=%s identity=%s)", path_text(path), grant.identity
+                )
                 continue
             fresh[grant.identity] = grant
         before = self._active

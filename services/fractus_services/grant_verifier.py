@@ -20,7 +20,7 @@ from fractus_core.policy.grant_signatures import (
     signed_bytes,
     verify,
 )
-from fractus_runtime.files import remove_temporary, write_file
+from fractus_runtime.files import read_file, read_json, remove_temporary, write_file
 
 log = logging.getLogger(__name__)
 
@@ -79,7 +79,7 @@ class GrantVerifier:
             stamp = (stat.st_mtime_ns, stat.st_size, stat.st_ino)
             if stamp == self._stamp:
                 return False
-            self._authorities = read_authorities(self._path.read_bytes())
+            self._authorities = read_authorities(read_file(self._path))
             self._stamp = stamp
         except FileNotFoundError:
             return False
@@ -161,7 +161,7 @@ class GrantVerifier:
 
     def _restore(self) -> None:
         try:
-            body = json.loads(self._memory.read_bytes())
+            body = read_json(self._memory)
             self._seen = {str(name): _Seen(**seen) for name, seen in body["seen"].items()}
             self._oldest = str(body["floor"])
         except FileNotFoundError:

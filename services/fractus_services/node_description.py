@@ -7,6 +7,7 @@ import logging
 from pathlib import Path
 
 from fractus_core.api.nodes import Drone, EdgeNode, InvalidDescription, parse_description
+from fractus_runtime.files import read_file
 
 from fractus_services.options import CannotServe
 
@@ -89,7 +90,7 @@ def _stamp(path: Path) -> object:
 
 def _parse(path: Path, kinds: tuple[type[Drone | EdgeNode], ...], option: str = "") -> Drone | EdgeNode | None:
     try:
-        return parse_description(path.read_text(encoding="utf-8"), *kinds)
+        return parse_description(read_file(path).decode(), *kinds)
     except (FileNotFoundError, IsADirectoryError, NotADirectoryError):
         return None
     except (OSError, UnicodeDecodeError) as error:

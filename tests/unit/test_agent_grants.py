@@ -297,7 +297,7 @@ def test_unreadable_grant_file_is_kept_if_the_grant_is_unchanged(
     narrower = manifest()
     narrower["spec"]["limits"] = {"maxAltitude": 10, "maxSpeed": 5}
     with monkeypatch.context() as patch:
-        patch.setattr(Path, "read_bytes", unreadable)
+        patch.setattr("fractus_agent.grant_synchronizer.read_file", unreadable)
         synchronizer.apply(grant_list(manifest(), generation=2))
         assert on_disk(tmp_path) == {"g1.json"}
         synchronizer.apply(grant_list(narrower, generation=3))

@@ -241,6 +241,26 @@ async def test_audit_log_rejects_content_that_is_not_json(tmp_path: Path) -> Non
     assert verify(read(tmp_path / "audit.jsonl")).entries == 1
 
 
+async def test_audit_log_records_text_that_is_not_unicode(tmp_path: Path) -> None:
+    """A file name may contain any bytes."""
+    log = AuditLog(tmp_path / "audit.jsonl", lambda: 0.0)
+    log.refused_grant(os.fsdecode(b"\xe9.json"), "é")
+    log.append("call", {"n": 1})
+    await log.close()
+    assert not log.failure
+    lines = read(tmp_path / "audit.jsonl")
+    assert (verify(lines).entries, verify(lines).problem) == (2, "")
+    assert json.loads(lines[0])["name"] == os.fsdecode(b"\xe9.json")
+
+
+async def test_audit_log_reports_a_path_that_is_no_regular_file(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "audit.jsonl")
+    log = AuditLog(tmp_path / "audit.jsonl", lambda: 0.0)
+    log.append("call", {"n": 1})
+    await log.close()
+    assert "is not a regular file" in log.failure
+
+
 async def test_audit_verify_command_reports_a_broken_chain(tmp_path: Path) -> None:
     path = tmp_path / "audit.jsonl"
     lines = await written(path, 3)

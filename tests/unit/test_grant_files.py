@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import json
+import os
 import threading
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +18,7 @@ from fractus_services.grant_files import ActiveGrant, GrantFiles
 from fractus_services.grant_verifier import GrantVerifier
 from fractus_services.grpc_server import RateLimiter
 from grant_signing import CA_PEM, signed
+from odd_files import odd_files
 from policy_world import spec
 
 
@@ -237,5 +240,86 @@ def test_directory_error_during_scan_keeps_service_running_and_grants_nothing(
 ) -> None:
     files = grant_files(tmp_path)
     monkeypatch.setattr("pathlib.Path.is_dir", lambda _path: (_ for _ in ()).throw(OSError(5, "Input/output error")))
+    files.scan()
+    assert not files.active
+
+
+@odd_files
+def test_grant_files_refuse_odd_file_and_read_others(tmp_path: Path, make_odd: Callable[[Path], None]) -> None:
+    directory = tmp_path / "grants"
+    directory.mkdir()
+    refusals: list[str] = []
+    files = grant_files(directory, lambda name, _reason: refusals.append(name))
+    (directory / "sound.json").write_text(body())
+    make_odd(directory / "odd.json")
+    files.scan()
+    assert [grant.spec.mission for grant in files.active.values()] == ["u1"]
+    assert refusals == ["odd.json"]
+    (directory / "sound.json").unlink()
+    files.scan()
+    assert not files.active, "a removed Grant is revoked despite the odd file"
+    assert refusals == ["odd.json"], "reported once"
+
+
+@odd_files
+def test_grant_that_becomes_an_odd_file_is_revoked_for_good(tmp_path: Path, make_odd: Callable[[Path], None]) -> None:
+    directory = tmp_path / "grants"
+    directory.mkdir()
+    refusals: list[str] = []
+    files = grant_files(directory, lambda name, _reason: refusals.append(name))
+    path = directory / "g.json"
+    path.write_text(granted := body())
+    files.scan()
+    assert files.active
+    path.unlink()
+    make_odd(path)
+    files.scan()
+    assert not files.active
+    assert refusals == ["g.json"]
+    path.unlink()
+    path.write_text(granted)
+    files.scan()
+    assert not files.active, "only a later Grant replaces a revoked one"
+
+
+def test_grant_in_a_file_whose_name_is_not_utf8_is_read_and_can_be_reported(tmp_path: Path) -> None:
+    directory = tmp_path / "grants"
+    directory.mkdir()
+    refusals: list[str] = []
+    files = grant_files(directory, lambda name, reason: refusals.append(f"{name}: {reason}"))
+    (directory / os.fsdecode(b"sound-\xe9.json")).write_text(body())
+    (directory / os.fsdecode(b"odd-\xe9.json")).write_text("{")
+    files.scan()
+    assert len(files.active) == 1
+    assert [text.split(":")[0] for text in refusals] == ["odd-\\xe9.json"]
+    refusals[0].encode()
+
+
+def test_grant_files_return_a_grant_when_a_disk_error_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    refusals: list[str] = []
+    files = grant_files(tmp_path, lambda name, _reason: refusals.append(name))
+    (tmp_path / "g.json").write_text(body())
+    with monkeypatch.context() as patch:
+
+        def fail(*_: object) -> bytes:
+            raise OSError(5, "Input/output error")
+
+        patch.setattr(module, "read_json", fail)
+        for _ in range(3):
+            files.scan()
+        assert not files.active
+        assert refusals == ["g.json"], "reported once"
+    files.scan()
+    assert files.active
+
+
+def test_removed_grant_is_revoked_for_good_beside_a_file_that_cannot_be_read(tmp_path: Path) -> None:
+    files = grant_files(tmp_path)
+    (tmp_path / "loop.json").symlink_to("loop.json")
+    (tmp_path / "g.json").write_text(granted := body())
+    files.scan()
+    (tmp_path / "g.json").unlink()
+    files.scan()
+    (tmp_path / "g.json").write_text(granted)
     files.scan()
     assert not files.active

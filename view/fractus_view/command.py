@@ -13,6 +13,7 @@ from pathlib import Path
 
 import click
 from aiohttp import web
+from fractus_runtime.files import open_file, path_text, read_file
 from fractus_runtime.kubernetes import Client, KubeError, Unconfigured, from_environment, kubeconfig
 from fractus_runtime.metrics import serve_metrics
 from prometheus_client import Metric
@@ -24,6 +25,7 @@ from fractus_view.sources import GrowingRecordings, Replay, Source
 
 DEFAULT_LISTEN = "127.0.0.1:8650"
 MIN_TOKEN_LENGTH = 16
+MAX_TOKEN_BYTES = 64 * 1024
 TOKEN_INTERVAL_S = 1.0
 """Interval at which the token file is read again, in seconds."""
 
@@ -143,7 +145,7 @@ def _read_token(path: Path) -> str:
         click.ClickException: The file cannot be read, or contains no suitable token.
     """
     try:
-        token = path.read_bytes().decode(errors="replace").strip()
+        token = read_file(path, MAX_TOKEN_BYTES).decode(errors="replace").strip()
     except OSError as error:
         raise click.ClickException(f"cannot read {path}: {error.strerror or error}") from error
     if len(token) < MIN_TOKEN_LENGTH or not token.isascii() or not token.isprintable():
@@ -179,11 +181,15 @@ async def _follow_token(path: Path, server: ViewServer) -> None:
 
 def _replay(recordings: tuple[Path, ...]) -> Source:
     for path in recordings:
-        with path.open("rb") as file:
-            if file.read(len(MAGIC)) != MAGIC:
-                raise click.ClickException(
-                    f"{path} is not an MCAP file; specify a file that a service wrote with --recordings"
-                )
+        try:
+            with open_file(path) as file:
+                is_recording = file.read(len(MAGIC)) == MAGIC
+        except OSError as error:
+            raise click.ClickException(f"{path_text(path)}: {error.strerror or error}") from None
+        if not is_recording:
+            raise click.ClickException(
+                f"{path_text(path)} is not an MCAP file; specify a file that a service wrote with --recordings"
+            )
     return Replay(recordings)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -10,6 +9,7 @@ from io import BytesIO
 from pathlib import Path
 from typing import IO, Any
 
+from fractus_runtime.files import open_file, parse_json, path_text
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, Message, Schema
@@ -74,10 +74,10 @@ class Tail:
             DamagedFile: The rest of the file cannot be read, now or later.
             OSError: The file cannot be read.
         """
-        with self.path.open("rb") as file:
+        with open_file(self.path) as file:
             while not self.finished:
                 offset = self._offset
-                record = _read_record(file, offset)
+                record = _read_record(file, offset, self.path)
                 if record is None:
                     return
                 opcode, body, self._offset = record
@@ -106,8 +106,8 @@ def message_at(path: Path, location: MessageLocation) -> dict[str, Any] | None:
         DamagedFile: The file is damaged at this location.
         OSError: The file cannot be read.
     """
-    with path.open("rb") as file:
-        record = _read_record(file, location.offset)
+    with open_file(path) as file:
+        record = _read_record(file, location.offset, path)
     if record is None:
         return None
     opcode, body, _ = record
@@ -116,12 +116,12 @@ def message_at(path: Path, location: MessageLocation) -> dict[str, Any] | None:
     return _content(message) if isinstance(message, Message) else None
 
 
-def _read_record(file: IO[bytes], offset: int) -> tuple[int, bytes, int] | None:
+def _read_record(file: IO[bytes], offset: int, path: Path) -> tuple[int, bytes, int] | None:
     """Return opcode and content of the record at an offset, and the offset of the next record. Return None if it is incomplete."""
     if offset == 0:
         start = file.read(len(MAGIC))
         if start != MAGIC[: len(start)]:
-            raise DamagedFile(f"{file.name} is not an MCAP file")
+            raise DamagedFile(f"{path_text(path)} is not an MCAP file")
         offset = len(MAGIC)
     file.seek(offset)
     head = file.read(_HEAD.size)
@@ -129,7 +129,7 @@ def _read_record(file: IO[bytes], offset: int) -> tuple[int, bytes, int] | None:
         return None
     opcode, length = _HEAD.unpack(head)
     if length > MAX_RECORD_BYTES:
-        raise DamagedFile(f"{file.name} is damaged at byte {offset}")
+        raise DamagedFile(f"{path_text(path)} is damaged at byte {offset}")
     body = file.read(length)
     return (opcode, body, offset + _HEAD.size + length) if len(body) == length else None
 
@@ -149,13 +149,13 @@ def _parse_record(opcode: int, body: bytes, path: Path) -> list[Any]:
                 return [Message.read(stream, len(body))]
     except Exception as error:
         # Decompression libraries raise many types of exceptions.
-        raise DamagedFile(f"{path} is damaged: {error}") from error
+        raise DamagedFile(f"{path_text(path)} is damaged: {error}") from error
     return []
 
 
 def _content(message: Message) -> dict[str, Any] | None:
     try:
-        content = json.loads(message.data)
+        content = parse_json(message.data)
     except ValueError:
         return None
     return content if isinstance(content, dict) else None

@@ -171,6 +171,6 @@ def _modification_times(directory: Path) -> Iterator[tuple[Path, float]]:
     """Yield the recordings below a directory with their modification times."""
     directory.stat()
     for path in directory.rglob("*.mcap"):
-        # Services may remove the oldest files at any time.
-        with contextlib.suppress(FileNotFoundError):
+        # Services may remove the oldest files at any time, and a link may lead nowhere.
+        with contextlib.suppress(OSError):
             yield path, path.stat().st_mtime

@@ -11,7 +11,15 @@ from pathlib import Path
 
 from fractus_core.api.direct_links import DirectLink, LinkedService
 from fractus_core.api.model import InvalidObject
-from fractus_runtime.files import remove_file, write_file
+from fractus_runtime.files import (
+    UnsuitableFile,
+    path_text,
+    read_file,
+    read_json,
+    remove_file,
+    remove_temporary_files,
+    write_file,
+)
 
 from fractus_agent.redirector.nft_maps import Endpoint
 from fractus_agent.store import Changed, Deleted, LinkEnd, Listed, Object, Store, WatchEvent
@@ -56,13 +64,12 @@ class DirectLinkStore:
     def restore(self) -> None:
         """Read the files, and remove temporary ones."""
         self._directory.mkdir(parents=True, exist_ok=True, mode=0o700)
-        for temporary in self._directory.glob(".*.tmp"):
-            temporary.unlink()
+        remove_temporary_files(self._directory)
         for path in self._directory.glob("*.json"):
             try:
-                self._read(json.loads(path.read_bytes()))
-            except (OSError, ValueError, RecursionError) as error:
-                log.warning("links: stored DirectLink skipped (file=%s error=%s)", path, error)
+                self._read(read_json(path))
+            except (OSError, ValueError) as error:
+                log.warning("links: stored DirectLink skipped (file=%s error=%s)", path_text(path), error)
         if self._links:
             log.info("links: restored from disk (links=%d)", len(self._links))
             self._on_change()
@@ -92,7 +99,7 @@ class DirectLinkStore:
         content = json.dumps(kept, sort_keys=True, indent=1).encode() + b"\n"
         path = self._file(name)
         try:
-            if not path.exists() or path.read_bytes() != content:
+            if not _contains(path, content):
                 write_file(path, content)
         except OSError as error:
             log.warning("links: DirectLink not stored (link=%s error=%s)", name, error)
@@ -118,6 +125,13 @@ class DirectLinkStore:
 
     def _file(self, name: str) -> Path:
         return self._directory / f"{name}.json"
+
+
+def _contains(path: Path, content: bytes) -> bool:
+    try:
+        return read_file(path) == content
+    except (FileNotFoundError, UnsuitableFile):
+        return False
 
 
 def virtual_endpoint(service: LinkedService) -> Endpoint | None:

@@ -17,6 +17,9 @@ from pathlib import Path
 from typing import Any
 
 from fractus_core.api.names import node_identity, node_server_name
+from fractus_runtime.files import check_regular
+
+from fractus_agent.certificates import CERTIFICATE_FILES
 
 PAIRING_PORT = 46811
 HANDSHAKE_TIMEOUT_S = 3.0
@@ -54,6 +57,7 @@ def client_context(directory: Path) -> ssl.SSLContext:
         OSError: A file is missing.
         ssl.SSLError: The files do not belong together.
     """
+    _check_files(directory)
     context = ssl.create_default_context(cafile=str(directory / "ca.crt"))
     context.minimum_version = ssl.TLSVersion.TLSv1_3
     context.load_cert_chain(directory / "tls.crt", directory / "tls.key")
@@ -62,11 +66,17 @@ def client_context(directory: Path) -> ssl.SSLContext:
 
 def server_context(directory: Path) -> ssl.SSLContext:
     """Return the TLS context of the end that accepts pairing. It requires a client certificate."""
+    _check_files(directory)
     context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH, cafile=str(directory / "ca.crt"))
     context.minimum_version = ssl.TLSVersion.TLSv1_3
     context.verify_mode = ssl.CERT_REQUIRED
     context.load_cert_chain(directory / "tls.crt", directory / "tls.key")
     return context
+
+
+def _check_files(directory: Path) -> None:
+    for name in CERTIFICATE_FILES:
+        check_regular(directory / name)
 
 
 def authenticated_node(writer: asyncio.StreamWriter) -> str:

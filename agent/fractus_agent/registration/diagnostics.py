@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-import json
 import re
 from pathlib import Path
+
+from fractus_runtime.files import path_text, read_file, read_json
 
 _HEAD = re.compile(r"[a-z0-9-]{1,63}:\d{1,15}:[0-9a-f]{64}")
 
 MAX_PROBLEM_BYTES = 500
+_MAX_BYTES = 64 * 1024
 
 
 def read_audit_heads(directory: Path) -> list[str]:
@@ -16,9 +18,9 @@ def read_audit_heads(directory: Path) -> list[str]:
     heads = []
     for path in sorted(directory.glob("*.checkpoint")):
         try:
-            checkpoint = json.loads(path.read_bytes())
+            checkpoint = read_json(path, _MAX_BYTES)
             head = f"{checkpoint['log']}:{checkpoint['seq']}:{checkpoint['hash']}"
-        except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        except (OSError, ValueError, KeyError, TypeError):
             continue
         if _HEAD.fullmatch(head):
             heads.append(head)
@@ -30,9 +32,9 @@ def read_recording_problems(state: Path) -> list[str]:
     problems = []
     for path in sorted(state.glob("*/recording.problem")):
         try:
-            problem = path.read_bytes()[:MAX_PROBLEM_BYTES].decode(errors="replace").strip()
+            problem = read_file(path, _MAX_BYTES)[:MAX_PROBLEM_BYTES].decode(errors="replace").strip()
         except OSError:
             continue
         if problem:
-            problems.append(f"{path.parent.name}: {problem}")
+            problems.append(f"{path_text(path.parent.name)}: {problem}")
     return problems

@@ -10,7 +10,7 @@ from pathlib import Path
 from fractus_core.api.conditions import ConditionUpdate
 from fractus_core.api.model import InvalidObject
 from fractus_core.api.nodes import Drone, EdgeNode
-from fractus_runtime.files import remove_temporary, write_file
+from fractus_runtime.files import UnsuitableFile, open_regular, read_file, read_json, remove_temporary, write_file
 
 log = logging.getLogger(__name__)
 
@@ -33,9 +33,9 @@ class NodeObjectFile:
     def read(self) -> Drone | EdgeNode | None:
         """Return the stored object, None if it is missing or invalid."""
         try:
-            body = json.loads(self._path.read_bytes())
+            body = read_json(self._path)
             return Drone.from_body(body) if body["kind"] == "Drone" else EdgeNode.from_body(body)
-        except (OSError, ValueError, KeyError, TypeError, RecursionError, InvalidObject):
+        except (OSError, ValueError, KeyError, TypeError, InvalidObject):
             return None
 
     def write(self, resource: Drone | EdgeNode) -> None:
@@ -43,7 +43,7 @@ class NodeObjectFile:
         content = serialize_node_object(resource)
         problem = self._camera_problem(resource)
         try:
-            if not self._path.exists() or self._path.read_bytes() != content:
+            if not self._contains(content):
                 self._path.parent.mkdir(parents=True, exist_ok=True)
                 write_file(self._path, content)
                 log.info("registration: node object stored for the services (file=%s)", self._path)
@@ -63,11 +63,29 @@ class NodeObjectFile:
         """
         try:
             self._path.parent.mkdir(parents=True, exist_ok=True)
-            with self._path.open("wb") as file:  # in place, because a file can be truncated on a full disk
-                os.fsync(file.fileno())
+            self._truncate()
         except OSError as error:
             log.warning("registration: cannot empty the node object file (file=%s error=%s)", self._path, error)
         self._set_condition(problem)
+
+    def _contains(self, content: bytes) -> bool:
+        try:
+            return read_file(self._path) == content
+        except (FileNotFoundError, UnsuitableFile):
+            return False
+
+    def _truncate(self) -> None:
+        """Empty the file in place, because a file can be truncated on a full disk."""
+        try:
+            descriptor = open_regular(self._path, os.O_WRONLY | os.O_CREAT, 0o600)
+        except UnsuitableFile:
+            write_file(self._path, b"")
+            return
+        try:
+            os.ftruncate(descriptor, 0)
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
 
     def _set_condition(self, problem: str) -> None:
         condition = ConditionUpdate("CameraDescribed", "False", "ViewUnknown", problem) if problem else None

@@ -16,6 +16,7 @@ from fractus_core.api.conditions import ConditionUpdate
 from fractus_core.api.model import GROUP, InvalidObject
 from fractus_core.api.names import CLASS_LABEL
 from fractus_core.api.nodes import Drone, EdgeNode, InvalidDescription, parse_description
+from fractus_runtime.files import read_file
 
 from fractus_agent.registration.node_object_file import NodeObjectFile
 from fractus_agent.store import Invalid, KubeError, Object, Store
@@ -206,7 +207,7 @@ class Registration:
 
     def _read_description(self) -> Drone | EdgeNode | None:
         try:
-            described = parse_node_description(self._path.read_text(encoding="utf-8"), self._node)
+            described = parse_node_description(read_file(self._path).decode(), self._node)
         except FileNotFoundError:
             self.description_problem = None
             return None

@@ -10,6 +10,7 @@ from typing import Any
 
 from fractus_core.policy.decision_types import CaptureArgs
 from fractus_proto.v1 import camera_pb2, camera_pb2_grpc
+from fractus_runtime.files import UnsuitableFile, open_file
 from grpc.aio import ServicerContext
 
 from fractus_services.auth import Caller
@@ -101,8 +102,8 @@ async def _read_blocks(source: bytes | Path, name: str) -> AsyncIterator[bytes]:
         yield source
         return
     try:
-        file = await asyncio.to_thread(source.open, "rb")
-    except FileNotFoundError:
+        file = await asyncio.to_thread(open_file, source)
+    except (FileNotFoundError, UnsuitableFile):
         raise NoSuchImage(f"image {name[:64]!r} was deleted") from None
     with file:
         while block := await asyncio.to_thread(file.read, READ_BYTES):

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from fractus_core.policy.decision_types import Filter, Situation
-from fractus_runtime.files import write_file
+from fractus_runtime.files import UnsuitableFile, read_json, write_file
 
 from fractus_services.camera.pose import Pose
 from fractus_services.errors import NotFound, ResourceExhausted
@@ -156,10 +156,10 @@ class ImageStore:
         records = []
         for path in sorted(self._owner_directory(owner).glob("*.json")):
             try:
-                records.append(ImageRecord.from_json(json.loads(path.read_bytes())))
+                records.append(ImageRecord.from_json(read_json(path)))
             except FileNotFoundError:
                 continue
-            except ValueError as error:
+            except (UnsuitableFile, ValueError) as error:
                 log.warning("images: damaged record skipped (file=%s error=%s)", path, error)
         return tuple(records)
 
@@ -208,10 +208,10 @@ class ImageStore:
         """
         path = self._record_path(owner, name)
         try:
-            return ImageRecord.from_json(json.loads(path.read_bytes()))
+            return ImageRecord.from_json(read_json(path))
         except FileNotFoundError:
             raise _not_found(name) from None
-        except ValueError as error:
+        except (UnsuitableFile, ValueError) as error:
             log.warning("images: image with damaged record not returned (image=%s error=%s)", name, error)
             raise NoSuchImage(
                 f"the record of image {name!r} is damaged, so the image is not returned; DeleteImage removes it"
@@ -282,8 +282,8 @@ class ImageStore:
             if not _NAME.fullmatch(record_path.with_suffix(".jpg").name):
                 continue
             try:
-                ImageRecord.from_json(json.loads(record_path.read_bytes()))
-            except ValueError as error:
+                ImageRecord.from_json(read_json(record_path))
+            except (UnsuitableFile, ValueError) as error:
                 log.warning("images: removing damaged record and its image (file=%s error=%s)", record_path, error)
                 record_path.unlink(missing_ok=True)
             except OSError as error:
@@ -291,7 +291,8 @@ class ImageStore:
         for path in self._directory.glob("*/*"):
             orphan = path.suffix == ".jpg" and not path.with_suffix(".json").exists()
             if orphan or path.suffix == ".tmp":
-                path.unlink(missing_ok=True)
+                with contextlib.suppress(OSError):
+                    path.unlink(missing_ok=True)
 
 
 def _file_sizes(paths: Iterable[Path]) -> list[int]:

@@ -10,6 +10,7 @@ from pathlib import Path
 from fractus_core.policy.decision_types import Call, Situation, Verdict
 from fractus_core.policy.picture_rules import remaining_filters
 from fractus_runtime import tracing
+from fractus_runtime.files import read_file
 
 from fractus_services.background import Background
 from fractus_services.camera.face_detection import FaceDetector
@@ -17,7 +18,7 @@ from fractus_services.camera.fair_queue import FairQueue
 from fractus_services.camera.filter_pipeline import FilterPlan, apply_filters
 from fractus_services.camera.image_authorization import ImageAuthorizer, situation_of
 from fractus_services.camera.image_store import ImageRecord, ImageStore, owner_of
-from fractus_services.camera.pixels import decode_image, encode_jpeg
+from fractus_services.camera.pixels import MAX_BYTES, decode_image, encode_jpeg
 from fractus_services.camera.pose import PoseProvider, is_upright
 from fractus_services.errors import PolicyDenied
 from fractus_services.grant_files import ActiveGrant
@@ -118,7 +119,7 @@ class StoredImages:
 
     async def _filter(self, owner: str, path: Path, plan: FilterPlan, record: ImageRecord) -> bytes:
         def render() -> bytes:
-            picture = decode_image(path.read_bytes())
+            picture = decode_image(read_file(path, MAX_BYTES))
             upright = is_upright(record.poses)
             return encode_jpeg(apply_filters([picture], plan, self._detector, record.face_px, upright=upright))
 

@@ -10,6 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any
 
+from fractus_runtime.files import open_file
 from mcap.records import Channel, McapRecord, Message, Schema
 from mcap.stream_reader import StreamReader
 from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
@@ -155,7 +156,7 @@ def rebuild_index(path: Path) -> Iterator[None]:
         OSError: The disk is full or failed.
     """
     part = path.with_suffix(PART_SUFFIX)
-    with path.open("rb") as file:
+    with open_file(path) as file:
         size = file.seek(0, os.SEEK_END)
         file.seek(max(size - len(MCAP0_MAGIC), 0))
         if size > len(MCAP0_MAGIC) and file.read() == MCAP0_MAGIC:

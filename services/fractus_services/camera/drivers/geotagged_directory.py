@@ -9,11 +9,12 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 from fractus_core.geo import LocalFrame
+from fractus_runtime.files import open_file, path_text, read_file
 from PIL import Image
 from PIL.ExifTags import GPS, IFD
 
 from fractus_services.camera.drivers.driver import CameraFailed, CaptureRequest
-from fractus_services.camera.pixels import InvalidImage, Pixels, decode_image
+from fractus_services.camera.pixels import MAX_BYTES, InvalidImage, Pixels, decode_image
 
 log = logging.getLogger(__name__)
 
@@ -50,10 +51,10 @@ class GeotaggedDirectory:
         vertical_m = np.nan_to_num(self._positions[:, 2] - amsl_m, nan=0.0)
         nearest = int(np.argmin(np.square(horizontal_m).sum(axis=1) + np.square(vertical_m)))
         try:
-            return decode_image(self._files[nearest].read_bytes())
+            return decode_image(read_file(self._files[nearest], MAX_BYTES))
         except (OSError, InvalidImage) as error:
             self._modified_ns = None
-            raise CameraFailed(f"cannot read {self._files[nearest]}: {error}") from None
+            raise CameraFailed(f"cannot read {path_text(self._files[nearest])}: {error}") from None
 
     def close(self) -> None:
         """See `CameraDriver`."""
@@ -64,7 +65,6 @@ class GeotaggedDirectory:
             if modified_ns == self._modified_ns:
                 return
             images = (path for path in self._path.iterdir() if path.suffix.lower() in _SUFFIXES)
-            # Skip named pipes, because opening one would block.
             files = sorted(path for path in images if path.is_file())[:_MAX_FILES]
         except OSError as error:
             raise CameraFailed(f"cannot read {self._path}: {error.strerror or error}") from None
@@ -84,7 +84,7 @@ def read_position(file: Path) -> tuple[float, float, float] | None:
         position.
     """
     try:
-        with Image.open(file) as picture:
+        with open_file(file) as opened, Image.open(opened) as picture:
             tags = picture.getexif().get_ifd(IFD.GPSInfo)
         lat = _to_degrees(tags[GPS.GPSLatitude])
         lon = _to_degrees(tags[GPS.GPSLongitude])
@@ -94,7 +94,7 @@ def read_position(file: Path) -> tuple[float, float, float] | None:
         # Cameras write the reference as a number or as a byte. 1 means below sea level.
         below_sea_level = tags.get(GPS.GPSAltitudeRef) in {1, b"\x01"}
     except _EXIF_ERRORS as error:
-        log.debug("camera: image without position skipped (file=%s error=%s)", file, error)
+        log.debug("camera: image without position skipped (file=%s error=%s)", path_text(file), error)
         return None
     if not (-90 <= lat <= 90 and -180 <= lon <= 180):
         return None

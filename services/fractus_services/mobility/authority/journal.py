@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from fractus_core.control import ControlState, Mission, Outcome, OutcomeKind
-from fractus_runtime.files import remove_temporary, write_file
+from fractus_runtime.files import read_json, remove_temporary, write_file
 
 log = logging.getLogger(__name__)
 
@@ -67,10 +67,7 @@ def _stored(mission: Mission) -> dict[str, Any]:
 
 
 def _read(path: Path) -> JournalContent:
-    try:
-        stored = json.loads(path.read_bytes())
-    except RecursionError:
-        raise ValueError("nested too deeply") from None
+    stored = read_json(path)
     missions = {m["key"]: _mission(m) for m in stored["missions"]}
     # Earlier releases did not record who armed.
     return JournalContent(missions, stored["active"], bool(stored.get("armed_by_others", False)))

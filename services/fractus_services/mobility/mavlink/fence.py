@@ -13,7 +13,7 @@ from pathlib import Path
 import shapely
 from fractus_core.api.grants import GrantSpec
 from fractus_core.geo import LocalFrame, area_center, area_polygon
-from fractus_runtime.files import remove_temporary, write_file
+from fractus_runtime.files import UnsuitableFile, read_json, remove_temporary, write_file
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fractus_services.errors import AutopilotError
@@ -359,7 +359,7 @@ class MissionFence:
     def _load(self) -> OwnerFence | None:
         remove_temporary(self._path)
         try:
-            stored = json.loads(self._path.read_bytes())
+            stored = read_json(self._path)
             items = tuple(MissionItem(**item) for item in stored["items"])
             mission_items = None
             if stored.get("mission_items") is not None:
@@ -367,7 +367,7 @@ class MissionFence:
             return OwnerFence(dict(stored["parameters"]), items, stored.get("raised", {}), mission_items)
         except FileNotFoundError:
             return None
-        except (ValueError, KeyError, TypeError) as error:
+        except (UnsuitableFile, ValueError, KeyError, TypeError, AttributeError) as error:
             log.critical(
                 "fence: cannot restore the owner's fence, its file is invalid (file=%s, error=%s)", self._path, error
             )

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from fractus_core.policy.return_route import ReturnBounds
-from fractus_runtime.files import write_file
+from fractus_runtime.files import UnsuitableFile, read_json, write_file
 
 from fractus_services.errors import AutopilotError
 from fractus_services.mobility.mavlink.mavlink_autopilot import MavlinkAutopilot
@@ -105,10 +105,10 @@ class RtlParameters:
 
     def _load(self) -> dict[str, float]:
         try:
-            return {str(name): float(value) for name, value in json.loads(self._path.read_bytes()).items()}
+            return {str(name): float(value) for name, value in read_json(self._path).items()}
         except FileNotFoundError:
             return {}
-        except (ValueError, AttributeError, TypeError) as error:
+        except (UnsuitableFile, ValueError, AttributeError, TypeError) as error:
             log.critical(
                 "rtl: cannot read the owner's parameters, they are lost (file=%s, error=%s)", self._path, error
             )

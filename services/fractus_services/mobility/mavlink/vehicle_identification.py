@@ -11,7 +11,7 @@ import logging
 import math
 from pathlib import Path
 
-from fractus_runtime.files import write_file
+from fractus_runtime.files import read_json, write_file
 from fractus_runtime.mavlink_codec import Message
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
@@ -67,7 +67,7 @@ def _is_autopilot_heartbeat(message: Message) -> bool:
 def read_known_vehicle(path: Path) -> tuple[str, Source] | None:
     """Return the URL and the ids of the drone's own vehicle from a file; None if they are unknown."""
     try:
-        stored = json.loads(path.read_bytes())
+        stored = read_json(path)
         return str(stored["link"]), (int(stored["system"]), int(stored["component"]))
     except FileNotFoundError:
         return None

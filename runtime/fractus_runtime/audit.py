@@ -22,6 +22,7 @@ from fractus_runtime.audit_chain import (
     PRUNED,
     ChainEntry,
     canonical,
+    complete_length,
     digest,
     first_sequence,
     last_entry,
@@ -126,7 +127,7 @@ class AuditLog:
         self._end = ChainEntry()
         # A path that cannot be read or written is reported when the first entry is written.
         with contextlib.suppress(OSError):
-            whole, size = _complete_length(path)
+            whole, size = complete_length(path)
             torn = size - whole
             self._sound_bytes = whole if torn else None
             self._end = _end_of_chain(path)
@@ -364,7 +365,7 @@ def _acquire(path: Path) -> tuple[int, int | None, ChainEntry]:
     """
     lock = _locked(path.with_name(f".{path.stem}.lock"))
     try:
-        whole, size = _complete_length(path)
+        whole, size = complete_length(path)
         return lock, whole if size > whole else None, _end_of_chain(path)
     except OSError:
         os.close(lock)
@@ -398,22 +399,3 @@ def _chained(batch: Iterable[_PendingEntry], end: ChainEntry) -> tuple[bytes, Ch
         end = ChainEntry(sequence, entry["hash"])
         lines.append(canonical(entry) + b"\n")
     return b"".join(lines), end
-
-
-def _complete_length(path: Path) -> tuple[int, int]:
-    """Return the length of the complete lines of a file, and its size. A crash may leave an incomplete last line."""
-    try:
-        size = path.stat().st_size
-    except FileNotFoundError:
-        return 0, 0
-    with open_file(path) as file:
-        end = size
-        while end > 0:
-            start = max(end - 65536, 0)
-            file.seek(start)
-            newline = file.read(end - start).rfind(b"\n")
-            if newline >= 0:
-                end = start + newline + 1
-                break
-            end = start
-    return end, size

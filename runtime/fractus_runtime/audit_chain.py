@@ -10,7 +10,7 @@ import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from fractus_runtime.files import open_file
 
@@ -18,7 +18,7 @@ GENESIS = "0" * 64
 PRUNED = "pruned"
 """Kind of the entry that records which segments were removed to free space."""
 
-_TAIL_BYTES = 1_000_000
+_BLOCK_BYTES = 65_536
 _SEGMENT = re.compile(r"^(?P<name>.+)\.(?P<first>\d{12})$")
 
 
@@ -50,17 +50,43 @@ def last_entry(path: Path) -> ChainEntry | None:
         ValueError: The last complete line is not an audit entry.
     """
     with contextlib.suppress(FileNotFoundError), open_file(path) as file:
-        file.seek(0, os.SEEK_END)
-        file.seek(max(file.tell() - _TAIL_BYTES, 0))
-        tail = file.read()
-        lines = tail[: tail.rfind(b"\n") + 1].splitlines()
-        if lines:
-            try:
-                entry = json.loads(lines[-1])
-                return ChainEntry(int(entry["seq"]), str(entry["hash"]))
-            except (KeyError, TypeError, RecursionError) as error:
-                raise ValueError(f"not an audit entry: {error}") from None
+        end = _line_begin(file, file.seek(0, os.SEEK_END))
+        if end == 0:
+            return None
+        begin = _line_begin(file, end - 1)
+        file.seek(begin)
+        try:
+            entry = json.loads(file.read(end - begin))
+            return ChainEntry(int(entry["seq"]), str(entry["hash"]))
+        except (KeyError, TypeError, RecursionError) as error:
+            raise ValueError(f"not an audit entry: {error}") from None
     return None
+
+
+def complete_length(path: Path) -> tuple[int, int]:
+    """Return the length of the complete lines of a file, and its size. A crash may leave an incomplete last line.
+
+    Raises:
+        OSError: The file cannot be read. A missing file has no lines.
+    """
+    try:
+        with open_file(path) as file:
+            size = file.seek(0, os.SEEK_END)
+            return _line_begin(file, size), size
+    except FileNotFoundError:
+        return 0, 0
+
+
+def _line_begin(file: IO[bytes], end: int) -> int:
+    """Return the offset after the last newline before `end`, or 0. Lines may have any length."""
+    while end > 0:
+        begin = max(end - _BLOCK_BYTES, 0)
+        file.seek(begin)
+        newline = file.read(end - begin).rfind(b"\n")
+        if newline >= 0:
+            return begin + newline + 1
+        end = begin
+    return 0
 
 
 def segment_path(path: Path, first: int) -> Path:

@@ -129,6 +129,29 @@ async def test_audit_log_removes_an_incomplete_last_line_and_records_it(tmp_path
     assert json.loads(lines[4])["n"] == 4
 
 
+@pytest.mark.parametrize("length", [65_535, 65_536, 1_000_001, 5_000_000])
+@pytest.mark.parametrize("byte", [b"\0", b"x"], ids=["zeros", "text"])
+async def test_audit_chain_continues_after_an_incomplete_last_line_of_any_length(
+    tmp_path: Path, byte: bytes, length: int
+) -> None:
+    torn = byte * length
+    path = tmp_path / "audit.jsonl"
+    lines = await written(path, 2)
+    path.write_bytes(b"".join(lines) + torn)
+    lines = await written(path, 1, 2)
+    assert (verify(lines).entries, verify(lines).problem) == (4, "")
+    assert json.loads(lines[2])["torn_bytes"] == len(torn)
+
+
+async def test_audit_chain_continues_after_an_entry_of_any_length(tmp_path: Path) -> None:
+    path = tmp_path / "audit.jsonl"
+    log = AuditLog(path, lambda: 0.0)
+    log.append("call", {"reason": "x" * 3_000_000})
+    await log.close()
+    lines = await written(path, 1)
+    assert (verify(lines).entries, verify(lines).problem) == (2, "")
+
+
 async def test_audit_log_keeps_entries_until_a_full_disk_has_space(tmp_path: Path) -> None:
     folder = tmp_path / "log"
     path = folder / "audit.jsonl"

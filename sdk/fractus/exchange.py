@@ -3,8 +3,11 @@
 When traffic moves to another network path, connections break: a request may arrive twice, or its response may be lost.
 Each request therefore has an id, and its repetitions have the same id. The responder stores its responses for some time.
 If a request is repeated, it returns the stored response instead of calling the handler again. A repetition may reach
-another instance than the first attempt. A component that collects results must therefore drop requests whose `Request.id`
-it already received (`StoredResponses` does).
+another instance than the first attempt. A component that collects results must therefore drop results with a `Request.id` that
+it already received.
+
+An id is valid for one client. Each `Requester` identifies itself by a random secret, so that no other client can use up its ids
+or read the responses to them. The network address does not identify a client, because it changes with the path.
 
 The connections are not encrypted.
 """
@@ -19,7 +22,7 @@ import signal
 import uuid
 from collections import OrderedDict
 from collections.abc import Awaitable, Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Self
 
 import grpc
@@ -33,6 +36,7 @@ log = logging.getLogger(__name__)
 SERVICE = "fractus.exchange"
 ID_HEADER = "fractus-request-id"
 ATTEMPT_HEADER = "fractus-attempt"
+CLIENT_HEADER = "fractus-client"
 MAX_BODY_BYTES = 16 * 2**20
 TIMEOUT_S = 30.0
 ATTEMPT_TIMEOUT_S = 5.0
@@ -73,19 +77,22 @@ class Request:
     """A request to a component.
 
     Attributes:
-        id: Unique id, the same in every repetition. An id with another body is refused.
+        id: Id, unique for its client and the same in every repetition. An id with another body is refused.
         method: Name of the requested method.
         body: Content in a format that the components agree on.
         attempt: Number of the attempt, from 1.
+        client: Secret of the `Requester` that sends the request. Empty if it has none, as in earlier releases.
     """
 
     id: str
     method: str
     body: bytes
     attempt: int = 1
+    client: str = field(default="", repr=False)
 
 
 Handler = Callable[[Request], Awaitable[bytes]]
+_Key = tuple[str, str, str]
 
 
 class _StoredResponse(NamedTuple):
@@ -94,7 +101,7 @@ class _StoredResponse(NamedTuple):
 
 
 class StoredResponses:
-    """Stored responses by method and request id, so that no request is processed twice. The oldest are removed first.
+    """Stored responses by client, method and request id, so that no request is processed twice. The oldest are removed first.
 
     Args:
         count: Maximum number of stored responses.
@@ -104,11 +111,11 @@ class StoredResponses:
     def __init__(self, count: int = MAX_STORED_RESPONSES, size: int = MAX_STORED_BYTES) -> None:
         self._count = count
         self._free_bytes = size
-        self._stored: OrderedDict[tuple[str, str], _StoredResponse] = OrderedDict()
+        self._stored: OrderedDict[_Key, _StoredResponse] = OrderedDict()
         self.repeated = 0
 
     async def once(self, request: Request, handler: Handler) -> bytes:
-        """Return the response of `handler`. It is called only for the first request with this method and id.
+        """Return the response of `handler`. It is called only for the first request with this client, method and id.
 
         If the handler raises, the request counts as not processed, and a repetition calls the handler again. A running
         handler continues when the connection breaks.
@@ -116,7 +123,7 @@ class StoredResponses:
         Raises:
             ValueError: An earlier request with this id had another body.
         """
-        key = (request.method, request.id)
+        key = (request.client, request.method, request.id)
         digest = hashlib.sha256(request.body).digest()
         stored = self._stored.get(key)
         if stored is None:
@@ -128,7 +135,7 @@ class StoredResponses:
             self.repeated += 1
         return await asyncio.shield(stored.task)
 
-    def _ended(self, key: tuple[str, str], task: asyncio.Task[bytes]) -> None:
+    def _ended(self, key: _Key, task: asyncio.Task[bytes]) -> None:
         if task.cancelled() or task.exception() is not None:
             self._stored.pop(key, None)
             return
@@ -160,6 +167,7 @@ class Requester:
         self.address = address
         self.repeated = 0
         self._attempt_timeout_s = attempt_timeout_s
+        self._client = uuid.uuid4().hex
         self._channel: Any = None
         self._connecting: asyncio.Task[None] | None = None
 
@@ -172,8 +180,8 @@ class Requester:
             method: Name of the requested method.
             body: Content, at most 16 MiB.
             timeout_s: Seconds after which the request fails.
-            request_id: Id of the received request that causes this one; by default a new id. All requests with one id
-                must have the same body.
+            request_id: Id of the received request that causes this one. All requests of this `Requester` with one id
+                must have the same body. Default: a new id.
 
         Raises:
             InvalidRequest: The other component refused the request.
@@ -202,7 +210,7 @@ class Requester:
             self._channel = grpc.aio.insecure_channel(self.address, options=_CLIENT)
             self._connecting = asyncio.create_task(_keep_connected(self._channel))
         call = self._channel.unary_unary(f"/{SERVICE}/{method}")
-        metadata = ((ID_HEADER, request_id), (ATTEMPT_HEADER, str(attempt)))
+        metadata = ((ID_HEADER, request_id), (ATTEMPT_HEADER, str(attempt)), (CLIENT_HEADER, self._client))
         response: bytes = await call(body, timeout=min(remaining_s, self._attempt_timeout_s), metadata=metadata)
         return response
 
@@ -308,8 +316,11 @@ class Responder:
             attempt = str(metadata.get(ATTEMPT_HEADER, ""))
             if not 0 < len(request_id) <= _MAX_ID_LENGTH:
                 await context.abort(grpc.StatusCode.INVALID_ARGUMENT, f"{ID_HEADER} is missing or too long")
+            client = str(metadata.get(CLIENT_HEADER, ""))
+            if len(client) > _MAX_ID_LENGTH:
+                await context.abort(grpc.StatusCode.INVALID_ARGUMENT, f"{CLIENT_HEADER} is too long")
             valid_attempt = attempt.isdecimal() and len(attempt) <= _MAX_ATTEMPT_LENGTH
-            request = Request(request_id, name, body, int(attempt) if valid_attempt else 1)
+            request = Request(request_id, name, body, int(attempt) if valid_attempt else 1, client)
             try:
                 return await self.responses.once(request, handler)
             except ValueError as error:

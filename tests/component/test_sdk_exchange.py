@@ -9,7 +9,16 @@ from contextlib import asynccontextmanager, suppress
 import grpc
 import pytest
 from fractus.errors import InvalidRequest, Unavailable
-from fractus.exchange import ATTEMPT_HEADER, ID_HEADER, SERVICE, Request, Requester, Responder, StoredResponses
+from fractus.exchange import (
+    ATTEMPT_HEADER,
+    CLIENT_HEADER,
+    ID_HEADER,
+    SERVICE,
+    Request,
+    Requester,
+    Responder,
+    StoredResponses,
+)
 
 
 class Worker:
@@ -93,6 +102,20 @@ async def test_repeated_request_returns_first_response() -> None:
     assert worker.done == ["r1"]
 
 
+async def test_request_id_is_scoped_to_its_client() -> None:
+    """Another client can neither use up an id nor read the response to it."""
+    worker = Worker()
+    async with worker.serving() as responder:
+        address = f"127.0.0.1:{responder.port}"
+        async with Requester(address) as asking, Requester(address) as other:
+            assert await other.request("work", b"poison", request_id="r1") == b"did poison"
+            assert await asking.request("work", b"this", request_id="r1") == b"did this"
+            assert await other.request("work", b"this", request_id="r2") == b"did this"
+            assert await asking.request("work", b"this", request_id="r2") == b"did this"
+        assert responder.responses.repeated == 0
+    assert worker.done == ["r1", "r1", "r2", "r2"]
+
+
 async def test_request_id_is_scoped_to_its_method() -> None:
     answers = StoredResponses()
     worker = Worker()
@@ -160,7 +183,8 @@ async def test_request_without_response_fails_at_its_timeout() -> None:
 async def test_request_without_id_is_refused() -> None:
     worker = Worker()
     async with worker.serving() as responder, grpc.aio.insecure_channel(f"127.0.0.1:{responder.port}") as channel:
-        for metadata in ((), ((ID_HEADER, "x" * 300),)):
+        too_long = "x" * 300
+        for metadata in ((), ((ID_HEADER, too_long),), ((ID_HEADER, "r1"), (CLIENT_HEADER, too_long))):
             with pytest.raises(grpc.aio.AioRpcError) as caught:
                 await channel.unary_unary(f"/{SERVICE}/work")(b"x", metadata=metadata)
             assert caught.value.code() is grpc.StatusCode.INVALID_ARGUMENT

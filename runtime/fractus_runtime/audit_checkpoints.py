@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import json
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,7 +16,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from fractus_core.api.names import node_identity
 
 from fractus_runtime.audit_chain import ChainEntry, canonical
-from fractus_runtime.files import read_file
+from fractus_runtime.files import parse_json, read_file
 
 _CONTEXT = b"fractus.dev audit checkpoint 1\n"
 _NODES = node_identity("")
@@ -84,7 +83,7 @@ def read_checkpoint(data: bytes, authorities: Sequence[x509.Certificate] = ()) -
         InvalidCheckpoint: The checkpoint is malformed, or its signature or certificate is not valid.
     """
     try:
-        content = json.loads(data)
+        content = parse_json(data)
         signature = base64.b64decode(content.pop("signature"), validate=True)
         certificate = x509.load_pem_x509_certificate(content["certificate"].encode())
         names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
@@ -93,7 +92,7 @@ def read_checkpoint(data: bytes, authorities: Sequence[x509.Certificate] = ()) -
         entry = ChainEntry(int(content["seq"]), str(content["hash"]))
         moment = datetime.fromisoformat(content["time"])
         key = certificate.public_key()
-    except (ValueError, TypeError, KeyError, AttributeError, RecursionError, x509.ExtensionNotFound):
+    except (ValueError, TypeError, KeyError, AttributeError, x509.ExtensionNotFound):
         raise InvalidCheckpoint("is not a checkpoint; use a copy of a .checkpoint file of the log") from None
     if len(nodes) != 1 or not isinstance(key, ec.EllipticCurvePublicKey):
         raise InvalidCheckpoint("is not signed by a node")

@@ -87,7 +87,7 @@ def read_json(path: Path, max_bytes: int = MAX_FILE_BYTES) -> Any:
     return parse_json(read_file(path, max_bytes))
 
 
-def parse_json(content: bytes) -> Any:
+def parse_json(content: bytes | str) -> Any:
     """Return a JSON value from a file or a peer.
 
     Raises:

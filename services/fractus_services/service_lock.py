@@ -16,6 +16,8 @@ from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 
+from fractus_runtime.files import parse_json
+
 from fractus_services.options import CannotServe
 
 log = logging.getLogger(__name__)
@@ -167,7 +169,7 @@ def _is_still(path: Path, identity: tuple[int, int]) -> bool:
 def _read_holder(handle: int) -> dict[str, object]:
     """Read the holder from a lock file. The result is empty if the holder could not write it."""
     with suppress(OSError, ValueError):
-        holder = json.loads(os.pread(handle, 4096, 0))
+        holder = parse_json(os.pread(handle, 4096, 0))
         if isinstance(holder, dict):
             return holder
     return {}

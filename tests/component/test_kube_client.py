@@ -205,6 +205,23 @@ async def test_request_after_close_raises(used: bool) -> None:
         assert not await client.ready()
 
 
+@pytest.mark.parametrize(
+    "line", [b"[" * 50_000, b"[]", b"1", b'{"type": "ADDED"}'], ids=["deep", "list", "number", "no-object"]
+)
+async def test_watch_with_a_line_that_is_no_event_raises(line: bytes) -> None:
+    async with client_of(Server(CHUNKED + chunk(line + b"\n"))) as client:
+        with pytest.raises(KubeError) as raised:
+            await anext(events(client))
+    assert (raised.value.status, raised.value.reason) == (0, "Unreachable")
+
+
+@pytest.mark.parametrize("status", [200, 500])
+async def test_response_that_is_nested_too_deeply_raises(status: int) -> None:
+    async with client_of(Server(response(b"[" * 50_000, status))) as client:
+        with pytest.raises(KubeError):
+            await client.get(ZONE, "a")
+
+
 async def test_response_without_json_raises() -> None:
     async with client_of(Server(response(b"<html>"))) as client:
         with pytest.raises(KubeError, match="JSONDecodeError"):

@@ -232,6 +232,16 @@ def test_session_with_a_peer_that_sends_no_routes_is_lost(monkeypatch: pytest.Mo
         asyncio.run(drone_controller()._run_session(cast(Session, SilentSession())))
 
 
+def test_session_with_a_peer_that_returns_no_heartbeats_is_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(drone_link_controller, "ACKNOWLEDGEMENT_TIMEOUT_S", 0.05)
+
+    class DeafSession(FakeCollaborator):
+        latency_ms = None
+
+    with pytest.raises(LinkLost, match="returns no heartbeats"):
+        asyncio.run(drone_controller()._run_session(cast(Session, DeafSession())))
+
+
 @pytest.mark.parametrize(("mbps", "probes"), [(16.0, {2, 3}), (8.5, {2, 3}), (2.0, {5, 6})])
 def test_link_is_probed_only_if_its_traffic_leaves_capacity(
     mbps: float, probes: set[int], monkeypatch: pytest.MonkeyPatch

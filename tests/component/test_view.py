@@ -122,7 +122,9 @@ def test_invalid_messages_are_skipped(tmp_path: Path) -> None:
     invalid = [
         Record("location", "foxglove.LocationFix", START_NS, {"latitude": "north", "longitude": 1}),
         Record("location", "foxglove.LocationFix", START_NS, {"latitude": 91.0, "longitude": 1.0}),
+        Record("location", "foxglove.LocationFix", START_NS, {"latitude": 10**400, "longitude": 1.0}),
         Record("zones", "foxglove.GeoJSON", START_NS, {"geojson": "{"}),
+        Record("zones", "foxglove.GeoJSON", START_NS, {"geojson": "[" * 50_000}),
         Record("attitude", "fractus.Attitude", START_NS, {"yaw_rad": None}),
     ]
     with path.open("wb") as file:

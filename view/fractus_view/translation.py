@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterator, Mapping
 from typing import Any, cast
+
+from fractus_runtime.files import parse_json
 
 from fractus_view.events import Areas, Event, Feature, Fix, Note, Picture, State, Verdict
 from fractus_view.mcap_tail import RecordedMessage
@@ -109,7 +110,7 @@ def _verdict(node: str, time_ms: int, content: Mapping[str, Any]) -> Verdict:
 
 def _areas(node: str, time_ms: int, content: Mapping[str, Any]) -> Iterator[Areas]:
     try:
-        features = json.loads(content["geojson"])["features"]
+        features = parse_json(content["geojson"])["features"]
     except (ValueError, KeyError, TypeError):
         return
     if isinstance(features, list):
@@ -129,6 +130,10 @@ def _text(value: object) -> str:
 
 def _number(value: object) -> float | None:
     """Return a finite number, or None for other values."""
-    if isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value):
-        return float(value)
-    return None
+    if not isinstance(value, int | float) or isinstance(value, bool):
+        return None
+    try:
+        number = float(value)
+    except OverflowError:  # an integer above 1e308
+        return None
+    return number if math.isfinite(number) else None

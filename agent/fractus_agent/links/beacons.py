@@ -12,6 +12,7 @@ import socket
 from collections.abc import Callable
 
 from fractus_core.api.names import is_subdomain
+from fractus_runtime.files import parse_json
 
 log = logging.getLogger(__name__)
 
@@ -47,8 +48,8 @@ def encode(node: str) -> bytes:
 def decode(data: bytes) -> str | None:
     """Return the node name in a beacon, None for any other datagram."""
     try:
-        content = json.loads(data)
-    except (ValueError, RecursionError):
+        content = parse_json(data)
+    except ValueError:
         return None
     node = content.get("node") if isinstance(content, dict) and content.get("fractus") == 1 else None
     return node if isinstance(node, str) and is_subdomain(node) else None

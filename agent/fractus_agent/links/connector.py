@@ -91,21 +91,30 @@ class Connector:
         self._on_change(link, reason)
 
     async def _connect(self, peer: str, description: Mapping[str, Any]) -> None:
-        address = self._address_of(peer)
-        flush = asyncio.get_running_loop().call_later(ARP_FLUSH_S, self._flush_arp, address)
         try:
-            session = await pair(self._node, peer, address, self._directory, description)
+            session = await self._pair(peer, description)
         except (PairingFailed, OSError) as error:
             self._set(NO_LINK, str(error))
             return
-        finally:
-            flush.cancel()
+        except Exception:
+            # Every failure must end the phase CONNECTING, or no peer would be tried again.
+            log.exception("links: pairing failed (peer=%s)", peer)
+            self._set(NO_LINK, "internal error during pairing")
+            return
         try:
             self._set(LinkState(LinkPhase.UP, peer, time.monotonic()), "paired")
             # The loss is reported before the session is closed, because closing takes a while on a lost link.
             self._set(NO_LINK, await self._hold(session))
         finally:
             await session.close()
+
+    async def _pair(self, peer: str, description: Mapping[str, Any]) -> Session:
+        address = self._address_of(peer)
+        flush = asyncio.get_running_loop().call_later(ARP_FLUSH_S, self._flush_arp, address)
+        try:
+            return await pair(self._node, peer, address, self._directory, description)
+        finally:
+            flush.cancel()
 
     async def _hold(self, session: Session) -> str:
         """Keep a session until it ends, and return the reason of its end."""

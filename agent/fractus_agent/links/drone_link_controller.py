@@ -37,7 +37,7 @@ from fractus_agent.links.decisions import ApplicationTraffic, LinkActions, LinkS
 from fractus_agent.links.device_addresses import link_address
 from fractus_agent.links.direct_link_store import allowed_callers, route_key, virtual_endpoints
 from fractus_agent.links.link_status import DroneLinkReport
-from fractus_agent.links.pairing import LinkLost, Session
+from fractus_agent.links.pairing import ACKNOWLEDGEMENT_TIMEOUT_S, LinkLost, Session
 from fractus_agent.links.traffic_rates import CONFIRMING_SHARE, MAX_CONFIRMATIONS, WINDOW_S, TrafficRates
 from fractus_agent.redirector.netlink import NetlinkError
 from fractus_agent.redirector.nft_maps import Endpoint, RedirectFailed
@@ -246,7 +246,7 @@ class DroneLinkController:
         """Receive the peer's routes and measure the link while a session lasts.
 
         Raises:
-            LinkLost: The peer keeps the session, but sends no routes.
+            LinkLost: The peer keeps the session, but returns no heartbeats or sends no routes.
         """
 
         def on_message(message: Mapping[str, Any]) -> None:
@@ -259,8 +259,12 @@ class DroneLinkController:
         confirmations = MAX_CONFIRMATIONS
         try:
             while True:
-                while session.latency_ms is None:  # noqa: ASYNC110 (the session has no event for it)
-                    await asyncio.sleep(0.01)
+                try:
+                    async with asyncio.timeout(ACKNOWLEDGEMENT_TIMEOUT_S):
+                        while session.latency_ms is None:  # noqa: ASYNC110 (the session has no event for it)
+                            await asyncio.sleep(0.01)
+                except TimeoutError:
+                    raise LinkLost(f"{session.peer} returns no heartbeats") from None
                 peak_mbps = self._rates.peak_mbps
                 confirmed = peak_mbps >= CONFIRMING_SHARE * probed_mbps
                 confirmations = confirmations + 1 if confirmed else MAX_CONFIRMATIONS + 1

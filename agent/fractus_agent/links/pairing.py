@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import math
 import ssl
 import time
 from collections.abc import Callable, Mapping
@@ -17,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from fractus_core.api.names import node_identity, node_server_name
-from fractus_runtime.files import check_regular
+from fractus_runtime.files import check_regular, parse_json
 
 from fractus_agent.certificates import CERTIFICATE_FILES
 
@@ -40,6 +41,10 @@ size is repeated, because one burst may have competed with a picture.
 ACKNOWLEDGEMENT_TIMEOUT_S = 2.0
 BURST_LIMIT_S = 0.15
 SMOOTHING = 0.2
+MAX_ECHO_AGE_S = 60.0
+"""Maximum age of an echoed heartbeat. An older or future one was not sent in this session."""
+MAX_REASON_CHARS = 200
+"""Maximum length of the peer's reason for a refusal, which is logged and audited."""
 
 
 class PairingFailed(Exception):
@@ -137,7 +142,7 @@ class Session:
             if not reading.done():
                 raise LinkLost(f"{self.peer} has been silent for {timeout_s:g} s")
             line = reading.result()
-            message = json.loads(line) if line else None
+            message = parse_json(line) if line else None
         except (OSError, ValueError) as error:
             raise LinkLost(f"the session with {self.peer} broke: {error}") from error
         finally:
@@ -170,13 +175,12 @@ class Session:
     async def _receive_messages(self) -> None:
         while True:
             message = await self.receive(LOSS_TIMEOUT_S)
-            if isinstance(sent := message.get("beat"), int | float):
-                await self.send({"echo": sent})
-            elif isinstance(sent := message.get("echo"), int | float):
-                latency_ms = max(time.monotonic() - sent, 0.0) / 2 * 1e3
-                self._min_latency_ms = min(self._min_latency_ms or latency_ms, latency_ms)
-                previous = self.latency_ms
-                self.latency_ms = latency_ms if previous is None else previous + SMOOTHING * (latency_ms - previous)
+            if "beat" in message:
+                sent_s = _seconds(message["beat"])
+                if sent_s is not None:
+                    await self.send({"echo": sent_s})
+            elif "echo" in message:
+                self._measure_latency(_seconds(message["echo"]))
             elif "probe" in message:
                 await self.send({"arrived": True})
             elif "arrived" in message:
@@ -184,6 +188,16 @@ class Session:
                     self._probe_acknowledged.set_result(None)
             else:
                 self.on_message(message)
+
+    def _measure_latency(self, sent_s: float | None) -> None:
+        """Update the latency by an echoed heartbeat. Ignore an echo of a time at which no heartbeat was sent."""
+        round_trip_s = time.monotonic() - sent_s if sent_s is not None else math.inf
+        if not 0 <= round_trip_s <= MAX_ECHO_AGE_S:
+            return
+        latency_ms = round_trip_s / 2 * 1e3
+        self._min_latency_ms = min(self._min_latency_ms or latency_ms, latency_ms)
+        previous = self.latency_ms
+        self.latency_ms = latency_ms if previous is None else previous + SMOOTHING * (latency_ms - previous)
 
     async def probe(self) -> float:
         """Measure the bandwidth towards the other end in Mbit/s, by a few short bursts.
@@ -227,6 +241,17 @@ class Session:
             self._writer.transport.abort()
 
 
+def _seconds(value: object) -> float | None:
+    """Return a time of a message, or None if it is not a finite number."""
+    if not isinstance(value, int | float) or isinstance(value, bool):
+        return None
+    try:
+        seconds = float(value)
+    except OverflowError:
+        return None
+    return seconds if math.isfinite(seconds) else None
+
+
 def _ignore_message(_message: Mapping[str, Any]) -> None:
     """Ignore a message that arrived before a handler is set."""
 
@@ -263,10 +288,14 @@ async def pair(node: str, peer: str, address: IPv4Address, directory: Path, link
         await session.send({"pair": node, "link": dict(link)})
         response = await session.receive(HANDSHAKE_TIMEOUT_S)
         if response.get("accepted") is not True:
-            raise PairingFailed(f"{peer} refused: {response.get('reason') or 'no reason given'}")
+            reason = str(response.get("reason") or "no reason given")[:MAX_REASON_CHARS]
+            raise PairingFailed(f"{peer} refused: {reason}")
     except (LinkLost, PairingFailed) as error:
         await session.close()
         if isinstance(error, PairingFailed):
             raise
         raise PairingFailed(str(error)) from error
+    except BaseException:
+        session.abort()
+        raise
     return session

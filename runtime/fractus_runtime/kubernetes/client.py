@@ -178,6 +178,8 @@ class Client(Connection):
                 async for line in _lines(response.content, silence_s):
                     if line.endswith(b"\n") and line.strip():
                         event = json.loads(line)
+                        if not isinstance(event, dict) or not event.keys() >= {"type", "object"}:
+                            raise ValueError("the line is not a watch event")
                         if event["type"] == "ERROR":
                             raise from_status(500, event["object"])
                         yield event["type"], event["object"]

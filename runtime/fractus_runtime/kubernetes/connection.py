@@ -229,12 +229,12 @@ def translated(request: str) -> Iterator[None]:
     """Raise connection errors as KubeError."""
     try:
         yield
-    except (*_FAILURES, ValueError) as error:
+    except (*_FAILURES, ValueError, RecursionError) as error:
         raise unreachable(f"{request}: {type(error).__name__}: {error}") from error
 
 
 def _refusal(code: int, content: bytes) -> KubeError:
     try:
         return from_status(code, json.loads(content))
-    except ValueError:
+    except (ValueError, RecursionError):
         return from_status(code, content.decode(errors="replace"))

@@ -11,6 +11,7 @@ from typing import Any, TypeVar
 
 import click
 from fractus_runtime import logs
+from fractus_runtime.open_files import TooFewOpenFiles, raise_open_files
 
 from fractus_services.camera.settings import CameraSettings
 from fractus_services.options import CannotServe, MobilityOptions, ServiceOptions
@@ -71,6 +72,11 @@ def until_signalled(
         logs.configure(level.upper(), os.environ.get("FRACTUS_LOG_FORMAT") or "text")
     except ValueError as error:
         raise click.ClickException(f"FRACTUS_LOG_LEVEL, FRACTUS_LOG_FORMAT: {error}") from None
+
+    try:
+        raise_open_files()
+    except TooFewOpenFiles as error:
+        raise click.ClickException(str(error)) from None
 
     async def main() -> None:
         stop = asyncio.Event()

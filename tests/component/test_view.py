@@ -24,6 +24,7 @@ from fractus_services.recording.messages import Record
 from fractus_services.recording.segment_writer import McapWriter
 from fractus_view import command, server
 from fractus_view.command import ServerOptions, view
+from fractus_view.connections import ConnectionLimit
 from fractus_view.events import Event, Fix, Problem, State, Verdict
 from fractus_view.hub import RECENT, TRAIL, Hub, Trail
 from fractus_view.mcap_tail import DamagedFile, Tail
@@ -255,6 +256,62 @@ async def served(recording: Path) -> AsyncIterator[tuple[str, ViewServer]]:
     await site.start()
     yield f"http://127.0.0.1:{runner.addresses[0][1]}", live_view
     await runner.cleanup()
+
+
+@pytest.fixture
+async def limited(recording: Path) -> AsyncIterator[tuple[int, ViewServer]]:
+    """Serve at most 20 connections."""
+    live_view = ViewServer(Replay([recording]), frozenset())
+    runner = web.AppRunner(live_view.application(), shutdown_timeout=0.1)
+    await runner.setup()
+    assert runner.server is not None
+    limit = ConnectionLimit(runner.server, 20)
+    server = await asyncio.get_running_loop().create_server(limit, "127.0.0.1", 0)
+    yield server.sockets[0].getsockname()[1], live_view
+    server.close()
+    await runner.cleanup()
+
+
+async def test_idle_connections_shut_nobody_out(limited: tuple[int, ViewServer]) -> None:
+    port, live_view = limited
+    live_view.source = Hub()  # type: ignore[assignment]
+    bearer = {hdrs.AUTHORIZATION: f"Bearer {live_view.token}"}
+    address = f"http://127.0.0.1:{port}"
+    async with (
+        asyncio.timeout(20),
+        ClientSession() as session,
+        session.get(f"{address}/stream", headers=bearer) as page,
+    ):
+        await page.content.readuntil(b"\n\n")
+        idle = [await asyncio.open_connection("127.0.0.1", port) for _ in range(100)]
+        for path, status in (("/healthz", 200), ("/", 401)):
+            async with session.get(address + path) as response:
+                assert response.status == status
+        async with session.get(address, headers=bearer) as response:
+            assert response.status == 200
+        # The limit closed the oldest idle connections, but not the open page.
+        closed = [await reader.read(1) for reader, _ in idle[:70]]
+        assert closed == [b""] * 70
+        assert not page.content.at_eof()
+        for _, writer in idle:
+            writer.close()
+
+
+async def test_connection_without_authorized_request_is_closed(
+    limited: tuple[int, ViewServer], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("fractus_view.connections.UNAUTHORIZED_TIMEOUT_S", 0.2)
+    port, live_view = limited
+    async with asyncio.timeout(20):
+        reader, writer = await asyncio.open_connection("127.0.0.1", port)
+        writer.write(b"GET /healthz HTTP/1.1\r\nHost: 127.0.0.1\r\n")  # never completed
+        assert await reader.read() == b""
+        writer.close()
+        bearer = {hdrs.AUTHORIZATION: f"Bearer {live_view.token}"}
+        async with ClientSession(headers=bearer) as session, session.get(f"http://127.0.0.1:{port}/") as response:
+            await asyncio.sleep(0.4)
+            assert response.status == 200
+            assert await response.read()
 
 
 async def test_requests_without_token_are_refused(served: tuple[str, ViewServer]) -> None:

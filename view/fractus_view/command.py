@@ -16,9 +16,11 @@ from aiohttp import web
 from fractus_runtime.files import open_file, path_text, read_file
 from fractus_runtime.kubernetes import Client, KubeError, Unconfigured, from_environment, kubeconfig
 from fractus_runtime.metrics import serve_metrics
+from fractus_runtime.open_files import TooFewOpenFiles, raise_open_files
 from prometheus_client import Metric
 
 from fractus_view.cluster import ClusterSource
+from fractus_view.connections import ConnectionLimit
 from fractus_view.mcap_tail import MAGIC
 from fractus_view.server import ViewServer
 from fractus_view.sources import GrowingRecordings, Replay, Source
@@ -210,6 +212,10 @@ async def _serve_cluster(config: Path | None, context: str | None, namespace: st
 
 
 async def _serve(source: Source, options: ServerOptions, metrics: Callable[[], Iterable[Metric]] = tuple) -> None:
+    try:
+        raise_open_files()
+    except TooFewOpenFiles as error:
+        raise click.ClickException(str(error)) from None
     stopped = asyncio.Event()
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -222,15 +228,16 @@ async def _serve(source: Source, options: ServerOptions, metrics: Callable[[], I
     port = options.port
     runner = web.AppRunner(server.application(), access_log=None, handle_signals=False, shutdown_timeout=1.0)
     await runner.setup()
+    assert runner.server is not None
+    listener: asyncio.Server | None = None
     try:
-        site = web.TCPSite(runner, host, port)
         try:
-            await site.start()
+            listener = await loop.create_server(ConnectionLimit(runner.server), host, port, backlog=128)
         except OSError as error:
             raise click.ClickException(
                 f"cannot listen on {host}:{port}: {error.strerror or error}; choose another with --listen"
             ) from error
-        actual_port = runner.addresses[0][1]
+        actual_port = listener.sockets[0].getsockname()[1]
         url_host = f"[{host}]" if ":" in host else host
         # Do not print the token of a file: the user knows it, and other people may read the log.
         token = server.token if token_file is None else "..."
@@ -247,6 +254,8 @@ async def _serve(source: Source, options: ServerOptions, metrics: Callable[[], I
         if token_task is not None:
             token_task.cancel()
     finally:
+        if listener is not None:
+            listener.close()
         await runner.cleanup()
 
 

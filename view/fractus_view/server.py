@@ -16,6 +16,7 @@ from aiohttp import hdrs, web
 from fractus_runtime.metrics import gauge
 from prometheus_client import Counter, Metric
 
+from fractus_view.connections import mark_authorized
 from fractus_view.sources import Source
 
 log = logging.getLogger(__name__)
@@ -142,7 +143,10 @@ class ViewServer:
                 _cookie(request), self.token, httponly=True, secure=_uses_tls(request), samesite="Strict", path="/"
             )
             return response
-        if request.path == HEALTH_PATH or self._is_authorized(request):
+        if self._is_authorized(request):
+            mark_authorized(request)
+            return await handler(request)
+        if request.path == HEALTH_PATH:
             return await handler(request)
         return web.Response(status=401, text="open the address that `fractus view` printed; it contains the token\n")
 

@@ -95,6 +95,7 @@ class GrantFiles:
         self._loaded: dict[Path, ActiveGrant | None] = {}
         self._problems: dict[Path, str] = {}
         """Reported reason why each file cannot be read now. These files are read again at each scan."""
+        self._directory_listed = False
         self._directory_problem = ""
         self._active: dict[str, ActiveGrant] = {}
         self._listeners: list[Listener] = []
@@ -192,12 +193,15 @@ class GrantFiles:
         except OSError as error:
             stamps = {}
             complete = False
-            if self._directory_problem != str(error):
+            # Before the first start, the directory does not exist yet.
+            expected = isinstance(error, FileNotFoundError) and not self._directory_listed
+            if self._directory_problem != str(error) and not expected:
                 log.critical(
                     "grants: cannot read directory, nothing is granted (directory=%s error=%s)", self._directory, error
                 )
             self._directory_problem = str(error)
         else:
+            self._directory_listed = True
             self._directory_problem = ""
         return stamps, complete
 

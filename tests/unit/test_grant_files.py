@@ -323,3 +323,38 @@ def test_removed_grant_is_revoked_for_good_beside_a_file_that_cannot_be_read(tmp
     (tmp_path / "g.json").write_text(granted)
     files.scan()
     assert not files.active
+
+
+def test_missing_directory_is_reported_once_and_only_after_it_existed(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    directory = tmp_path / "grants"
+    files = grant_files(directory)
+    files.scan()
+    assert not caplog.messages
+    directory.mkdir()
+    files.scan()
+    directory.rmdir()
+    for _ in range(3):
+        files.scan()
+    assert [message.split(" (")[0] for message in caplog.messages] == [
+        "grants: cannot read directory, nothing is granted"
+    ]
+
+
+def test_grants_in_a_directory_that_cannot_be_listed_are_not_taken_for_removed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "g.json").write_text(body())
+    files = grant_files(tmp_path)
+    files.scan()
+
+    def fail(_path: Path) -> None:
+        raise PermissionError(13, "Permission denied")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("fractus_services.grant_files.os.scandir", fail)
+        files.scan()
+        assert not files.active
+    files.scan()
+    assert files.active, "the Grant was not revoked for good"

@@ -42,9 +42,9 @@ from fractus.mission import Mission as Mission
 from fractus.mission import MissionProgress as MissionProgress
 from fractus.mission import Waypoint as Waypoint
 from fractus.mission import orbit as orbit
-from fractus.mission import read_plan as read_plan
 from fractus.pictures import Camera as Camera
 from fractus.pictures import camera as camera
+from fractus.plan_file import read_plan as read_plan
 from fractus.runner import run as run
 from fractus.telemetry import Battery as Battery
 from fractus.telemetry import Fix as Fix

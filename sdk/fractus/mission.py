@@ -3,34 +3,18 @@
 from __future__ import annotations
 
 import asyncio
-import json
 import logging
 import math
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from fractus.control import Control, Motion, OnProgress
 from fractus.errors import InvalidRequest, PolicyDenied
-from fractus.values import AltitudeReference, Position, Progress
+from fractus.values import Position, Progress
 
 EARTH_M = 6_371_008.8
 """Mean radius in metres. The error on an orbit of one kilometre is a few metres at most."""
-
-# Values of MAV_CMD.
-_NAV_WAYPOINT = 16
-_NAV_RETURN = 20
-_NAV_LAND = 21
-_NAV_TAKEOFF = 22
-_NAV_LAST = 95
-_DO_CHANGE_SPEED = 178
-_REFERENCES = {
-    **dict.fromkeys((0, 5), AltitudeReference.AMSL),
-    **dict.fromkeys((3, 6), AltitudeReference.HOME),
-    **dict.fromkeys((10, 11), AltitudeReference.TERRAIN),
-}
-"""Altitude references by MAV_FRAME."""
 
 _log = logging.getLogger("fractus")
 
@@ -215,51 +199,3 @@ def orbit(
         position = Position(lat, lon, center.alt, center.reference)
         waypoints.append(Waypoint(position, (math.degrees(angle) + 180.0) % 360.0, speed_mps))
     return tuple(waypoints)
-
-
-def read_plan(path: str | Path) -> tuple[Waypoint, ...]:
-    """Return the waypoints of a QGroundControl plan (.plan) with speeds, headings and stays, including surveys.
-
-    Takeoff, landing and return are omitted, because the program takes off and the system flies home. Commands for cameras
-    and gimbals are omitted with a warning, because pictures are taken through the camera service.
-
-    Raises:
-        InvalidRequest: The file is not a plan, or contains a command that cannot be flown.
-    """
-    try:
-        plan = json.loads(Path(path).read_bytes())
-        return tuple(_waypoints(_simple(plan["mission"]["items"]), str(path)))
-    except OSError as error:
-        raise InvalidRequest(f"{path}: {error.strerror}") from None
-    except (ValueError, KeyError, TypeError, IndexError) as error:
-        raise InvalidRequest(f"{path}: not a QGroundControl plan ({type(error).__name__}: {error})") from None
-
-
-def _simple(items: Sequence[Any]) -> Iterator[Any]:
-    """Yield the items of a plan, including those inside surveys and corridor scans."""
-    for item in items:
-        if item["type"] == "ComplexItem":
-            yield from _simple(item.get("TransectStyleComplexItem", item)["Items"])
-        else:
-            yield item
-
-
-def _waypoints(items: Iterator[Any], path: str) -> Iterator[Waypoint]:
-    speed_mps: float | None = None
-    for number, item in enumerate(items, start=1):
-        command = item["command"]
-        params = item["params"]
-        if command == _NAV_WAYPOINT:
-            if item["frame"] not in _REFERENCES:
-                raise InvalidRequest(
-                    f"{path}: item {number} has the unsupported frame {item['frame']}; use altitudes above home or AMSL"
-                )
-            stay_s, radius_m, _, yaw_deg, lat, lon, alt = params
-            position = Position(float(lat), float(lon), float(alt), _REFERENCES[item["frame"]])
-            yield Waypoint(position, yaw_deg, speed_mps, float(radius_m or 0.0), float(stay_s or 0.0))
-        elif command == _DO_CHANGE_SPEED:
-            speed_mps = float(params[1]) if params[1] and params[1] > 0 else speed_mps
-        elif command > _NAV_LAST:
-            _log.warning("mission: plan item omitted (file=%s item=%d MAV_CMD=%d)", path, number, command)
-        elif command not in {_NAV_TAKEOFF, _NAV_RETURN, _NAV_LAND}:
-            raise InvalidRequest(f"{path}: item {number} (MAV_CMD {command}) cannot be flown; remove it from the plan")

@@ -21,7 +21,7 @@ _READERS: dict[str, Callable[[str, Collection[str]], formats.Imported]] = {
     "qgc-plan": formats.read_qgc_plan,
     "ed269": formats.read_ed269,
 }
-_DROPPING = {"geojson": formats.read_geojson, "kml": formats.read_kml}
+_DROPPING = {"geojson": formats.read_geojson, "kml": formats.read_kml, "ed269": formats.read_ed269}
 _WRITERS: dict[str, Callable[[Iterable[Zone]], formats.Exported]] = {
     "geojson": formats.write_geojson,
     "kml": formats.write_kml,
@@ -44,12 +44,12 @@ def import_(file: pathlib.Path, source: str, prefix: str, without: tuple[str, ..
     """Print a Zone manifest for each zone in a file.
 
     A feature is rejected if a Zone cannot represent its area, altitudes or schedule exactly. Correct it, or skip it with
-    --leave-out. Other properties that cannot be converted are listed on standard error. A property whose name suggests an
-    altitude or a schedule is rejected unless it is ignored with --drop (geojson, kml).
+    --leave-out. Other properties that cannot be converted are listed on standard error. A property that may state a size,
+    an altitude or a time is rejected unless it is ignored with --drop (geojson, kml, ed269).
     """
     read = _READERS[source]
     if drop and source not in _DROPPING:
-        raise click.ClickException(f"--drop requires --from {' or '.join(_DROPPING)}")
+        raise click.ClickException(f"--drop requires --from {', '.join(_DROPPING)}")
     if drop:
         read = functools.partial(_DROPPING[source], drop=drop)
     try:

@@ -11,6 +11,7 @@ from typing import Any
 from fractus_core.api import InvalidObject, Zone
 from fractus_core.api.geometry import AltitudeBand
 from fractus_core.api.schedules import ActiveTime
+from fractus_core.geo.formats.unknown_properties import EMPTY
 from fractus_core.geo.formats.zone_builder import (
     Exported,
     Imported,
@@ -29,7 +30,14 @@ from fractus_core.geo.formats.zone_builder import (
 _UNITS_M = {"M": 1.0, "FT": 0.3048}
 _DAYS = {"MON": "Mon", "TUE": "Tue", "WED": "Wed", "THU": "Thu", "FRI": "Fri", "SAT": "Sat", "SUN": "Sun"}
 _REFERENCES = {"AGL": "terrain", "AMSL": "amsl"}
-_USED = frozenset({"identifier", "name", "message", "restriction", "applicability", "geometry"})
+_DESCRIBED = ("name", "restriction", "restrictionConditions", "message", "otherReasonInfo")
+_OF_FEATURE = frozenset({"identifier", "applicability", "geometry", *_DESCRIBED})
+_WITHOUT_EFFECT = frozenset(
+    {"country", "type", "region", "reason", "regulationExemption", "uSpaceClass", "zoneAuthority"}
+)
+"""Fields of a feature that state neither area nor altitude nor time. They are noted."""
+_TRANSLATIONS = frozenset({"localizedMessages"})
+_OF_FILE = frozenset({"title", "description", "features"})
 _OF_VOLUME = frozenset(
     {
         "uomDimensions", "lowerLimit", "lowerVerticalReference", "upperLimit", "upperVerticalReference",
@@ -45,12 +53,13 @@ _TIME = re.compile(
 _DAY_MIN = 1440
 
 
-def read_ed269(text: str, without: Collection[str] = ()) -> Imported:
+def read_ed269(text: str, without: Collection[str] = (), drop: Collection[str] = ()) -> Imported:
     """Read zones from features: identifier, name, message, restriction (in the description), applicability, geometry.
 
     Args:
         text: Content of the file.
         without: Identifiers of features to leave out.
+        drop: Names of unknown fields to leave out although they may state the size, altitude or time of a zone.
 
     Raises:
         InvalidObject: The text is not an ED-269 file, a geometry is broken, or a feature cannot be represented exactly.
@@ -58,7 +67,8 @@ def read_ed269(text: str, without: Collection[str] = ()) -> Imported:
     document = parse_json(text)
     if "features" not in document:
         raise InvalidObject("features", "is missing; this is not an ED-269 file")
-    builder = ZoneBuilder(without)
+    builder = ZoneBuilder(without, drop)
+    builder.properties("the file", document, _OF_FILE, "")
     for i, feature in enumerate(object_list(document["features"], "features")):
         field = f"features[{i}]"
         title = str(feature.get("identifier") or feature.get("name") or field)
@@ -67,9 +77,16 @@ def read_ed269(text: str, without: Collection[str] = ()) -> Imported:
 
 
 def _read_feature(builder: ZoneBuilder, title: str, feature: dict[str, Any], field: str) -> None:
-    parts = [str(feature[key]) for key in ("name", "restriction", "message") if feature.get(key)]
+    parts = [_joined(feature[key]) for key in _DESCRIBED if feature.get(key)]
     spec: dict[str, Any] = {"description": builder.described(title, ": ".join(parts))} if parts else {}
-    builder.unmapped(title, (key for key, value in feature.items() if value not in (None, "", [], {})), _USED)
+    without_effect = sorted(key for key in _WITHOUT_EFFECT if feature.get(key) not in EMPTY)
+    if without_effect:
+        builder.note(title, f"{', '.join(without_effect)} cannot be imported; left out")
+    builder.properties(title, feature, _OF_FEATURE | _WITHOUT_EFFECT | {"extendedProperties"}, field)
+    extended = feature.get("extendedProperties")
+    if not isinstance(extended, dict):
+        extended = {"extendedProperties": extended}
+    builder.properties(title, extended, _TRANSLATIONS, f"{field}.extendedProperties")
     if feature.get("restriction"):
         builder.note(title, f"a Zone forbids nothing by itself; add a policy for restriction {feature['restriction']}")
     schedule = _schedule(feature, field)
@@ -83,6 +100,10 @@ def _read_feature(builder: ZoneBuilder, title: str, feature: dict[str, Any], fie
         reject_unknown_fields(volume, _OF_VOLUME, path)
         band = _band(volume, path)
         builder.add(title, {**spec, "area": _area(builder, volume, path), **({"altitude": band} if band else {})}, path)
+
+
+def _joined(value: Any) -> str:
+    return ", ".join(map(str, value)) if isinstance(value, list) else str(value)
 
 
 def _area(builder: ZoneBuilder, volume: dict[str, Any], field: str) -> dict[str, Any]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import json
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Iterator
 from typing import Any
 
 from fractus_core.api import InvalidObject, Zone
@@ -19,13 +19,23 @@ from fractus_core.geo.formats.zone_builder import (
     optional_object,
     parse_json,
     parse_point,
+    reject_outlines,
     reject_unknown_fields,
     unsupported_parts,
 )
 
-_KNOWN = frozenset({"name", "title", "description", "radius", "altitude", "schedule"})
+_KNOWN = frozenset({"description", "radius", "altitude", "schedule"})
+_OF_FEATURE = frozenset({"type", "id", "geometry", "properties", "bbox", "crs"})
+_OF_COLLECTION = _OF_FEATURE | {
+    "features", "name", "title", "description", "generator", "copyright", "license", "attribution", "links", "timestamp", "timeStamp",
+    "totalFeatures", "numberMatched", "numberReturned", "xy_coordinate_resolution", "exceededTransferLimit",
+}  # fmt: skip
+"""Members of a FeatureCollection that do not affect zones: those of GeoJSON, and those that map servers add."""
 _OF_GEOMETRY = frozenset({"type", "coordinates", "geometries", "bbox", "crs"})
 _AREAS = frozenset({"Polygon", "MultiPolygon", "GeometryCollection"})
+_STYLE = frozenset({"fill", "fill-opacity", "stroke", "stroke-width", "stroke-opacity", "marker-color"})
+_LINES = frozenset({"LineString", "MultiLineString"})
+_POINTS = frozenset({"Point", "MultiPoint"})
 _WGS84 = frozenset(
     {
         "urn:ogc:def:crs:OGC:1.3:CRS84",
@@ -35,8 +45,7 @@ _WGS84 = frozenset(
         "urn:ogc:def:crs:EPSG::4326",
     }
 )
-"""Names of WGS 84 in GeoJSON files of 2008, which may name a reference system. All of them mean lon before lat."""
-_STYLE = frozenset({"fill", "fill-opacity", "stroke", "stroke-width", "stroke-opacity", "marker-color"})
+"""Names of WGS 84. GeoJSON of 2008 may name a reference system, and has lon before lat for each of these names."""
 
 
 def read_geojson(text: str, without: Collection[str] = (), drop: Collection[str] = ()) -> Imported:
@@ -45,7 +54,7 @@ def read_geojson(text: str, without: Collection[str] = (), drop: Collection[str]
     Args:
         text: Content of the file.
         without: Titles of features to leave out.
-        drop: Names of properties to leave out although they seem to state the altitude or time of a zone.
+        drop: Names of properties to leave out although they may state the size, altitude or time of a zone.
 
     Raises:
         InvalidObject: The text is not GeoJSON, a geometry is broken, or a feature cannot be represented exactly.
@@ -65,13 +74,20 @@ def read_geojson(text: str, without: Collection[str] = (), drop: Collection[str]
     else:
         raise InvalidObject("type", f"{kind!r} is not GeoJSON of zones; expected a FeatureCollection of polygons")
     builder = ZoneBuilder(without, drop)
+    if kind == "FeatureCollection":
+        builder.properties("the file", document, _OF_COLLECTION, "")
     for i, feature in enumerate(features):
         path = field.format(i)
         properties = feature.get("properties")
         stated = properties if isinstance(properties, dict) else {}
-        title = str(stated.get("name") or stated.get("title") or feature.get("id") or f"zone {i}")
+        title = str(stated.get(_title_property(stated)) or feature.get("id") or f"zone {i}")
         builder.take(title, functools.partial(_read_feature, builder, title, feature, path))
     return builder.result()
+
+
+def _title_property(properties: dict[str, Any]) -> str:
+    """Return the name of the property that names a feature."""
+    return "name" if properties.get("name") else "title"
 
 
 def _check_system(value: dict[str, Any], field: str) -> None:
@@ -95,10 +111,16 @@ def _read_feature(builder: ZoneBuilder, title: str, feature: dict[str, Any], fie
     spec = {k: properties[k] for k in known if properties.get(k) is not None and properties[k] != ""}
     if isinstance(spec.get("description"), str):
         spec["description"] = builder.described(title, spec["description"])
-    builder.properties(title, properties, _KNOWN | _STYLE, f"{inside}properties")
+    builder.properties(title, feature, _OF_FEATURE, field)
+    builder.properties(title, properties, _KNOWN | _STYLE | {_title_property(properties)}, f"{inside}properties")
     geometry = optional_object(feature.get("geometry"), f"{inside}geometry")
+    for owner, path in ((feature, f"{inside}bbox"), (geometry, f"{inside}geometry.bbox")):
+        box = owner.get("bbox")
+        if isinstance(box, list) and len(box) == 6 and (box[2] or box[5]):
+            raise InvalidObject(path, "has heights; remove them and state them in the altitude of the zone")
     if properties.get("radius") is not None and geometry.get("type") != "Point":
         raise InvalidObject(f"{inside}properties.radius", "is valid for a Point only; draw other areas as polygons")
+    _check_lines(geometry, f"{inside}geometry")
     _read_geometry(builder, title, geometry, spec | {"radius": properties.get("radius")}, f"{inside}geometry")
 
 
@@ -130,8 +152,44 @@ def _read_geometry(
         case "GeometryCollection":
             for j, part in enumerate(object_list(geometry.get("geometries"), f"{field}.geometries")):
                 _read_geometry(builder, title, part, stated, f"{field}.geometries[{j}]")
-        case other:
+        case other if other in _LINES or other in _POINTS:
             builder.note(title, f"a geometry of type {other} is not a zone; left out")
+        case None:
+            raise InvalidObject(field, "is missing; draw the zone, or leave the feature out")
+        case other:
+            raise InvalidObject(
+                f"{field}.type", f"{other!r:.40} is not a geometry of GeoJSON; draw the zone as a Polygon"
+            )
+
+
+def _check_lines(geometry: dict[str, Any], field: str) -> None:
+    """Reject lines that enclose an area, and lines beside polygons, which belong to a zone but have no area.
+
+    Raises:
+        InvalidObject: A line may be part of a zone, or its coordinates are invalid.
+    """
+    parts = list(_simple_geometries(geometry, field))
+    lines = []
+    for part, path in parts:
+        kind = part.get("type")
+        if kind in _LINES:
+            drawn = part.get("coordinates") if kind == "MultiLineString" else [part.get("coordinates")]
+            if not isinstance(drawn, list) or not all(isinstance(line, list) for line in drawn):
+                raise InvalidObject(f"{path}.coordinates", "must be a list of positions")
+            flat = [[parse_point(_flat(position), f"{path}.coordinates") for position in line] for line in drawn]
+            lines += [[(point.lon, point.lat) for point in line] for line in flat]
+            if any(other.get("type") in _AREAS for other, _ in parts):
+                raise InvalidObject(path, "is a line beside polygons; draw its area as a polygon, or remove it")
+    reject_outlines(lines, field)
+
+
+def _simple_geometries(geometry: dict[str, Any], field: str) -> Iterator[tuple[dict[str, Any], str]]:
+    """Yield the geometries of a collection, each with its path, or the geometry itself."""
+    if geometry.get("type") != "GeometryCollection":
+        yield geometry, field
+        return
+    for i, part in enumerate(object_list(geometry.get("geometries"), f"{field}.geometries")):
+        yield from _simple_geometries(part, f"{field}.geometries[{i}]")
 
 
 def _heights(coordinates: Any) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import re
 from collections.abc import Collection, Iterable
+from typing import Any
 from xml.etree import ElementTree
 from xml.sax.saxutils import escape
 
@@ -14,17 +15,35 @@ from fractus_core.geo.formats.zone_builder import (
     Imported,
     ZoneBuilder,
     cut_rings,
+    parse_point,
     parse_ring,
+    reject_outlines,
     unsupported_parts,
 )
 
-_KNOWN = frozenset({"name", "description", "Polygon", "MultiGeometry"})
-_LOOK = frozenset({"Style", "StyleMap", "styleUrl", "visibility", "open", "Snippet", "LookAt", "Camera"})
-_DATA = frozenset({"ExtendedData"})
+_LOOK = frozenset(
+    {
+        "Style",
+        "StyleMap",
+        "styleUrl",
+        "visibility",
+        "balloonVisibility",
+        "open",
+        "LookAt",
+        "Camera",
+        "Region",
+        "drawOrder",
+    }
+)
+_DATA = frozenset({"ExtendedData", "Metadata"})
 _AROUND_DATA = _DATA | {"SchemaData", "displayName", "value"}
-_HOLDERS = frozenset({"Document", "Folder", "NetworkLink"})
+_HOLDERS = frozenset({"kml", "Document", "Folder", "Update", "Create", "Change"})
 _TIMES = frozenset({"TimeSpan", "TimeStamp"})
-_OTHERS = ("Point", "LineString", "LinearRing", "Model", "Track")
+_OF_HOLDER = _HOLDERS | _LOOK | _TIMES | {"name", "Placemark", "Schema", "NetworkLink", "GroundOverlay"}
+_OF_POLYGON = frozenset({"outerBoundaryIs", "innerBoundaryIs", "altitudeMode", "extrude", "tessellate"})
+_LINES = frozenset({"LineString", "LinearRing"})
+_OTHERS = frozenset({"Point", *_LINES, "Model", "Track", "MultiTrack"})
+_OF_PLACEMARK = _LOOK | _DATA | _TIMES | _OTHERS | {"name", "description", "Polygon", "MultiGeometry"}
 
 
 def read_kml(text: str, without: Collection[str] = (), drop: Collection[str] = ()) -> Imported:
@@ -33,7 +52,7 @@ def read_kml(text: str, without: Collection[str] = (), drop: Collection[str] = (
     Args:
         text: Content of the file.
         without: Names of placemarks to leave out.
-        drop: Names of placemark data to leave out although they seem to state the altitude or time of a zone.
+        drop: Names of placemark data to leave out although they may state the size, altitude or time of a zone.
 
     Raises:
         InvalidObject: The text is not KML, a polygon is broken, or a placemark cannot be represented exactly.
@@ -46,18 +65,46 @@ def read_kml(text: str, without: Collection[str] = (), drop: Collection[str] = (
         raise InvalidObject("", f"this is not XML ({error})") from None
     if _tag(root) != "kml":
         raise InvalidObject("", f"the root element is {_tag(root)}, not kml")
+    builder = ZoneBuilder(without, drop)
     for holder in (e for e in root.iter() if _tag(e) in _HOLDERS):
         title = _text(holder, "name") or _tag(holder)
-        if _tag(holder) == "NetworkLink":
-            raise InvalidObject(
-                title, "a NetworkLink refers to another file, which is not imported; save everything in one file"
-            )
         _check_always(holder, title)
-    builder = ZoneBuilder(without, drop)
-    for count, placemark in enumerate(e for e in root.iter() if _tag(e) == "Placemark"):
-        title = _text(placemark, "name") or f"placemark {count + 1}"
-        builder.take(title, functools.partial(_read_placemark, builder, title, placemark))
+        _check_elements(builder, title, holder, _OF_HOLDER)
+    count = 0
+    for element in root.iter():
+        tag = _tag(element)
+        if tag == "NetworkLink":
+            raise InvalidObject(
+                _text(element, "name") or tag,
+                "a NetworkLink refers to another file, which is not imported; save everything in one file",
+            )
+        count += tag == "Placemark"
+        title = _text(element, "name") or f"{tag} {count}".lower()
+        if tag == "Placemark":
+            builder.take(title, functools.partial(_read_placemark, builder, title, element))
+        elif tag == "GroundOverlay":
+            builder.take(title, functools.partial(_reject_overlay, title))
     return builder.result()
+
+
+def _reject_overlay(title: str) -> None:
+    raise InvalidObject(title, "a GroundOverlay is a picture, which is not imported; draw its area as a polygon")
+
+
+def _check_elements(
+    builder: ZoneBuilder, title: str, element: ElementTree.Element, known: Collection[str], field: str = ""
+) -> None:
+    """Note unknown elements and data, and reject those that may state the size, altitude or time of a zone."""
+    unknown = {_tag(child): _contents(child) for child in element if _tag(child) not in known | _DATA}
+    builder.properties(title, unknown, (), field)
+    builder.properties(title, _data(element), (), "ExtendedData")
+
+
+def _contents(element: ElementTree.Element) -> Any:
+    """Return the attributes, texts and child elements of an element, by name."""
+    text = (element.text or "").strip()
+    children = [{_tag(child): _contents(child)} for child in element]
+    return [*element.attrib.values(), *([text] if text else []), *children]
 
 
 def _check_always(element: ElementTree.Element, field: str) -> None:
@@ -68,33 +115,67 @@ def _check_always(element: ElementTree.Element, field: str) -> None:
 def _read_placemark(builder: ZoneBuilder, title: str, placemark: ElementTree.Element) -> None:
     described = builder.described(title, _text(placemark, "description"))
     polygons = [e for e in placemark.iter() if _tag(e) == "Polygon"]
-    others = sorted({_tag(e) for e in placemark.iter()} & set(_OTHERS) - ({"LinearRing"} if polygons else set()))
+    _check_elements(builder, title, placemark, _OF_PLACEMARK)
+    for collection in (e for e in placemark.iter() if _tag(e) == "MultiGeometry"):
+        _check_elements(builder, title, collection, _OF_PLACEMARK, "MultiGeometry")
+    others = _other_geometries(placemark)
     if others:
-        builder.note(title, f"{', '.join(others)} is not a zone; left out")
-    builder.unmapped(title, map(_tag, placemark), _KNOWN | _LOOK | _DATA | set(_OTHERS))
-    builder.properties(title, _data(placemark), (), "ExtendedData")
+        builder.note(title, f"{', '.join(sorted(set(map(_tag, others))))} is not a zone; left out")
+    lines = [e for e in others if _tag(e) in _LINES]
+    if lines and polygons:
+        raise InvalidObject(_tag(lines[0]), "is a line beside polygons; draw its area as a polygon, or remove it")
+    reject_outlines([_line(e) for e in lines], _tag(lines[0]) if lines else "")
+    if not polygons and not others:
+        raise InvalidObject("", "has no geometry; draw the zone as a Polygon, or leave it out")
     if polygons:
         _check_always(placemark, "")
     for i, shape in enumerate(polygons):
         field = f"Polygon[{i}]"
+        _check_elements(builder, title, shape, _OF_POLYGON, field)
         exterior = _rings(shape, "outerBoundaryIs", field)
         holes = _rings(shape, "innerBoundaryIs", field)
         if len(exterior) != 1:
             raise InvalidObject(f"{field}.outerBoundaryIs", "a polygon has exactly one")
-        mode = _text(shape, "altitudeMode")
-        if mode not in {"", "clampToGround"}:
-            raise InvalidObject(
-                f"{field}.altitudeMode",
-                f"{mode} uses heights, which cannot be imported; clamp the polygon to the ground",
-            )
+        for mode in (e.text or "" for e in shape if _tag(e) == "altitudeMode"):
+            if mode.strip() not in {"", "clampToGround"}:
+                raise InvalidObject(
+                    f"{field}.altitudeMode",
+                    f"{mode.strip()} uses heights, which cannot be imported; clamp the polygon to the ground",
+                )
         area = {"polygon": {"exterior": exterior[0]} | ({"holes": holes} if holes else {})}
         builder.add(title, {"area": area} | ({"description": described} if described else {}), field)
 
 
-def _data(placemark: ElementTree.Element) -> dict[str, str]:
-    """Return the custom data of a placemark by name."""
-    data = (e for child in placemark if _tag(child) in _DATA for e in child.iter() if _tag(e) not in _AROUND_DATA)
-    return {e.get("name") or _tag(e): "".join(e.itertext()).strip() for e in data}
+def _other_geometries(element: ElementTree.Element) -> list[ElementTree.Element]:
+    """Return the geometries below an element that are not polygons. Rings of polygons are no geometries of their own."""
+    found = []
+    for child in element:
+        if _tag(child) in _OTHERS:
+            found.append(child)
+        elif _tag(child) == "MultiGeometry":
+            found += _other_geometries(child)
+    return found
+
+
+def _line(element: ElementTree.Element) -> list[tuple[float, float]]:
+    """Return the points of a line or ring as lon, lat. A ring without the repetition of its first point is closed."""
+    tag = _tag(element)
+    field = f"{tag}.coordinates"
+    points = [parse_point(pair, field) for pair in _positions(_text(element, "coordinates"), field)]
+    if tag == "LinearRing":
+        points += points[:1]
+    return [(point.lon, point.lat) for point in points]
+
+
+def _data(element: ElementTree.Element) -> dict[str, Any]:
+    """Return the custom data of an element by name. A displayed name is a part of the value."""
+    data = (e for child in element if _tag(child) in _DATA for e in child.iter() if _tag(e) not in _AROUND_DATA)
+    values: dict[str, Any] = {}
+    for e in data:
+        text = " ".join(part.text.strip() for part in e.iter() if part.text and _tag(part) != "displayName").strip()
+        shown = _text(e, "displayName")
+        values.setdefault(e.get("name") or _tag(e), []).append({shown: text} if shown and text else text)
+    return values
 
 
 def _rings(shape: ElementTree.Element, boundary: str, field: str) -> list[list[dict[str, float]]]:
@@ -104,12 +185,15 @@ def _rings(shape: ElementTree.Element, boundary: str, field: str) -> list[list[d
 
 
 def _ring(text: str, field: str) -> list[dict[str, float]]:
+    return parse_ring(_positions(text, field), field)
+
+
+def _positions(text: str, field: str) -> list[list[float]]:
+    """Return pairs of lon, lat. Heights are ignored because zones are clamped to the ground."""
     try:
-        # Heights are ignored because the polygon is clamped to the ground.
-        positions = [[float(v) for v in group.split(",")][:2] for group in text.split()]
+        return [[float(v) for v in group.split(",")][:2] for group in text.split()]
     except ValueError:
-        raise InvalidObject(field, "must be lon,lat[,alt] groups") from None
-    return parse_ring(positions, field)
+        raise InvalidObject(field, "must be lon,lat[,alt] groups, separated by spaces") from None
 
 
 def _tag(element: ElementTree.Element) -> str:

@@ -5,14 +5,18 @@ from __future__ import annotations
 import itertools
 import math
 import re
+import shlex
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeGuard
+
+import shapely
 
 from fractus_core.api import API_VERSION, InvalidObject, Zone
 from fractus_core.api.geometry import MAX_RING_POINTS, Area, Circle, Point, Polygon
 from fractus_core.documents import BadDocument, parse_documents
 from fractus_core.geo.areas import area_center, area_polygon, multipolygon_geojson
+from fractus_core.geo.formats.unknown_properties import EMPTY, may_state_limit
 from fractus_core.local_frame import LocalFrame
 
 DESCRIPTION_LENGTH = 1024
@@ -29,6 +33,9 @@ points."""
 MAX_POINTS = 300_000
 """Maximum number of points of all rings of a file, including intermediate points. Long edges in a small file may need
 millions of intermediate points."""
+
+_CLOSED = 0.05
+"""Largest distance of the ends of a line around an area, as a share of its length."""
 
 CORNERS = 64
 """Corners of the polygon that replaces a circle in formats without circles."""
@@ -74,7 +81,7 @@ class ZoneBuilder:
 
     Args:
         without: Titles of features that are left out.
-        drop: Names of properties that are left out although they seem to state the altitude or time of a zone.
+        drop: Names of properties that are left out although they may state the size, altitude or time of a zone.
     """
 
     def __init__(self, without: Collection[str] = (), drop: Collection[str] = ()) -> None:
@@ -143,29 +150,25 @@ class ZoneBuilder:
         return {"polygon": {"exterior": exterior} | ({"holes": holes} if holes else {})}
 
     def properties(self, title: str, properties: Mapping[str, Any], known: Collection[str], field: str) -> None:
-        """Note the properties that a Zone cannot represent, and reject properties that state its altitude or time.
+        """Note the properties that a Zone cannot represent, and reject those that may state its size, altitude or time.
 
         Raises:
-            InvalidObject: A property states altitude or time and is not in `drop`.
+            InvalidObject: A property may state size, altitude or time and is not in `drop`.
         """
         self._dropped.update(set(properties) & set(self._drop))
-        stated = {name for name, value in properties.items() if value not in (None, "", [], {})}
-        for name in sorted(stated - set(known) - set(self._drop)):
-            if suggests_altitude_or_time(name):
-                raise InvalidObject(
-                    f"{field}.{name}",
-                    "seems to state the altitude or time of the zone; write it as altitude or schedule in the form of a Zone,"
-                    " or drop it (--drop)",
-                )
-        unknown = sorted(set(properties) - set(known))
+        unknown = sorted(name for name in set(properties) - set(known) if properties[name] not in EMPTY)
+        limits = [name for name in unknown if name not in self._drop and may_state_limit(name, properties[name])]
+        if limits:
+            first, *others = limits
+            also = f" (also {', '.join(others)})" if others else ""
+            drops = " ".join(f"--drop {shlex.quote(name)}" for name in limits)
+            raise InvalidObject(
+                f"{field}.{first}" if field else first,
+                f"may state the size, altitude or time of the zone{also}; draw the size or give a Point its radius in metres,"
+                f" write the others as altitude or schedule in the form of a Zone, or drop it ({drops})",
+            )
         if unknown:
             self.note(title, f"properties {', '.join(unknown)} cannot be imported; left out")
-
-    def unmapped(self, title: str, fields: Iterable[str], known: Iterable[str]) -> None:
-        """Note the fields that a Zone cannot represent."""
-        unknown = sorted(set(fields) - set(known))
-        if unknown:
-            self.note(title, f"{', '.join(unknown)} cannot be imported; left out")
 
     def note(self, title: str, problem: str) -> None:
         """Note a part of a zone that is not imported."""
@@ -247,7 +250,7 @@ def reject_unknown_fields(fields: Mapping[str, Any], known: Collection[str], fie
         InvalidObject: An unknown field has a value.
     """
     for key, value in fields.items():
-        if key not in known and value not in (None, "", [], {}):
+        if key not in known and value not in EMPTY:
             raise InvalidObject(
                 f"{field}.{key}", "a Zone cannot represent this field; remove it if it does not affect the zone"
             )
@@ -330,6 +333,22 @@ def _along_degrees(sides: Iterable[tuple[Point, Point]]) -> Iterator[Point]:
             yield Point(lat=round(lat_deg, 9), lon=round(lon_deg, 9))
 
 
+def reject_outlines(lines: Iterable[Sequence[tuple[float, float]]], field: str) -> None:
+    """Reject lines of lon, lat that enclose an area, such as the outline of a zone that was drawn as a path.
+
+    Outlines that were drawn by hand do not close exactly: the ends of a line meet if their distance is at most 5 % of its
+    length.
+
+    Raises:
+        InvalidObject: A line, or several lines joined at their ends, enclose an area.
+    """
+    drawn = [shapely.LineString(line) for line in lines if len(line) > 1]
+    for line in shapely.get_parts(shapely.line_merge(shapely.MultiLineString(drawn))):
+        ends = shapely.Point(line.coords[0]).distance(shapely.Point(line.coords[-1]))
+        if len(line.coords) > 3 and ends <= _CLOSED * line.length:
+            raise InvalidObject(field, "is a line around an area; draw the area as a polygon")
+
+
 def circle_area(centre: Point, radius_m: Any, field: str) -> dict[str, Any]:
     """Return a circle as an area.
 
@@ -402,24 +421,3 @@ def unsupported_parts(zones: Iterable[Zone], *parts: str) -> list[str]:
         if "circle" in parts and spec.area.circle is not None:
             notes.append(f"{zone.name}: the circle is written as a polygon of {CORNERS} corners around it")
     return notes
-
-
-_WORD = re.compile(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])")
-_ALTITUDE_OR_TIME = re.compile(
-    r"""(
-    alt | altitudes? | heights? | elevation | levels? | floor | ceiling | lower | upper | bottom | top | base | vertical |
-    agl | [am]msl | asl | msl | fl | feet | ft |
-    times? | timespan | dates? | datetime | starts? | begins? | ends? | from | until | valid | validity | active |
-    activation | applicability | periods? | hours? | days? | weekdays? | months? | season | expires | expiry | expiration |
-    effective | permanent | temporary | when | duration | schedules?
-    )""",
-    re.VERBOSE,
-)
-
-
-def suggests_altitude_or_time(name: str) -> bool:
-    """Return True if the name of a property contains a word for altitude or time.
-
-    Such names are `upperLimit`, `VALID_FROM` and `height (AGL)`.
-    """
-    return any(_ALTITUDE_OR_TIME.fullmatch(word.lower()) for word in _WORD.findall(name))

@@ -20,13 +20,21 @@ _READERS: dict[str, Callable[[str, Collection[str]], formats.Imported]] = {
     "kml": formats.read_kml,
     "qgc-plan": formats.read_qgc_plan,
     "ed269": formats.read_ed269,
+    "ed318": formats.read_ed318,
 }
-_DROPPING = {"geojson": formats.read_geojson, "kml": formats.read_kml, "ed269": formats.read_ed269}
+_DROPPING = {
+    "geojson": formats.read_geojson,
+    "kml": formats.read_kml,
+    "ed269": formats.read_ed269,
+    "ed318": formats.read_ed318,
+}
 _WRITERS: dict[str, Callable[[Iterable[Zone]], formats.Exported]] = {
     "geojson": formats.write_geojson,
     "kml": formats.write_kml,
     "ed269": formats.write_ed269,
 }
+_ZIP = b"PK\x03\x04"
+"""First bytes of a ZIP archive."""
 
 
 @click.group()
@@ -45,7 +53,7 @@ def import_(file: pathlib.Path, source: str, prefix: str, without: tuple[str, ..
 
     A feature is rejected if a Zone cannot represent its area, altitudes or schedule exactly. Correct it, or skip it with
     --leave-out. Other properties that cannot be converted are listed on standard error. A property that may state a size,
-    an altitude or a time is rejected unless it is ignored with --drop (geojson, kml, ed269).
+    an altitude or a time is rejected unless it is ignored with --drop (all formats but qgc-plan).
     """
     read = _READERS[source]
     if drop and source not in _DROPPING:
@@ -56,15 +64,19 @@ def import_(file: pathlib.Path, source: str, prefix: str, without: tuple[str, ..
         content = read_file(file)
     except BadManifest as error:
         raise click.ClickException(str(error)) from None
+    if content.startswith(_ZIP):
+        raise click.ClickException(
+            f"{file}: this is a ZIP archive, such as a KMZ file; unpack it and import the file inside (doc.kml)"
+        )
     try:
         imported = read(content.decode("utf-8-sig"), without)
         zones = [_renamed(zone, prefix) for zone in imported.zones]
         for zone in zones:
             check_zone(zone)
     except UnicodeDecodeError:
-        raise click.ClickException(f"{file}: not a UTF-8 text file") from None
+        raise click.ClickException(f"{file}: not a UTF-8 text file; convert it to UTF-8") from None
     except formats.InexactFeatures as error:
-        *notes, last = (f"{_where(file, content, problem)}: {problem}" for problem in error.every)
+        *notes, last = _located(file, content, error.every)
         _print_notes(notes)
         raise click.ClickException(last) from None
     except InvalidObject as error:
@@ -75,18 +87,20 @@ def import_(file: pathlib.Path, source: str, prefix: str, without: tuple[str, ..
     click.echo(dump_documents(map(_manifest, zones)), nl=False)
 
 
-def _where(file: pathlib.Path, content: bytes, problem: InvalidObject) -> str:
-    """Return the file of a problem, with the line of its field for JSON formats."""
+def _located(file: pathlib.Path, content: bytes, problems: Iterable[InvalidObject]) -> list[str]:
+    """Return a message for each problem, with the file and, for JSON formats, the line of its field."""
     try:
         documents = parse_documents(content, str(file), is_json=True)
     except BadDocument:
-        return str(file)
-    return documents.where(documents.values[0], problem.field) if documents.values else str(file)
+        return [f"{file}: {problem}" for problem in problems]
+    return [f"{documents.where(documents.values[0], problem.field)}: {problem}" for problem in problems]
 
 
 @zones.command("export")
 @click.argument("paths", type=click.Path(exists=True, path_type=pathlib.Path), nargs=-1, required=True)
-@click.option("--to", "target", type=click.Choice(sorted(_READERS)), required=True, help="Output format.")
+@click.option(
+    "--to", "target", type=click.Choice(sorted({*_WRITERS, "qgc-plan"})), required=True, help="Output format."
+)
 @click.option("--inclusion", is_flag=True, help="For qgc-plan: write inclusion fences instead of exclusion fences.")
 def export(paths: tuple[pathlib.Path, ...], target: str, inclusion: bool) -> None:
     """Print the Zones of manifests in another format. Properties that cannot be converted are listed on standard error."""

@@ -17,7 +17,7 @@ with atheris.instrument_imports(
     from fractus_core.geo import formats
     from fractus_core.validation import check_zone
 
-READERS = [formats.read_geojson, formats.read_kml, formats.read_qgc_plan, formats.read_ed269]
+READERS = [formats.read_geojson, formats.read_kml, formats.read_qgc_plan, formats.read_ed269, formats.read_ed318]
 WRITERS = [formats.write_geojson, formats.write_kml, formats.write_qgc_plan, formats.write_ed269]
 EXAMPLE = Path(__file__).parents[2] / "examples" / "traffic-monitoring" / "zones.yaml"
 ZONES = [Zone.from_body(body) for body in parse_documents(EXAMPLE.read_bytes(), EXAMPLE.name).values]
@@ -28,8 +28,9 @@ HELD = {
         "schedule": [{"days": ["Mon"], "start": "08:00", "end": "17:00"}],
     },
 }  # fmt: skip
-TEXTS = [write([*ZONES, Zone.from_body(HELD)]).text for write in WRITERS]
-"""Zones of the example in each format."""
+ED318 = Path(__file__).parents[1] / "imported" / "ed318.json"
+TEXTS = [*(write([*ZONES, Zone.from_body(HELD)]).text for write in WRITERS), ED318.read_text()]
+"""The example's zones in each format that is written, and a file of the format that is only read."""
 
 SPLICES = [
     "", "0", "-", "1e999", "NaN", "null", "true", "[]", "{}", '""', "180", "-180", "90", "9" * 20, "<", "&amp;", "&x;",

@@ -106,7 +106,7 @@ NO = {"permanent": "NO"}
         ([], {"upperVerticalReference": "WGS84"}, "geometry[0].upperVerticalReference: must be AGL or AMSL, not 'WGS84'"),
         ([], {"upperVerticalReference": None}, "geometry[0].upperVerticalReference: must be AGL or AMSL, not None"),
         ([], {"lowerLimit": 30, "upperVerticalReference": "AMSL"}, "geometry[0].lowerVerticalReference: differs from"),
-        ([], {"upperLimit": 1e6}, "geometry[0]: altitude.upper: must be less than or equal to 20000"),
+        ([], {"lowerLimit": 1e6, "upperVerticalReference": "AGL"}, "geometry[0]: altitude.lower: must be less than or equal to 20000"),
         ([], {"layer": 3}, "geometry[0].layer: a Zone cannot represent this field; remove it if it does not"),
         (
             [],

@@ -1,14 +1,17 @@
 """Import of files as authorities and users publish them: all zones are imported exactly, or the import fails with a remedy."""
 
 import json
+import math
+import time
 from pathlib import Path
 
 import pytest
+import shapely
 import yaml
 from click.testing import CliRunner
 from fractus_cli.zones import zones as command
 from fractus_core.api import InvalidObject
-from fractus_core.geo import formats
+from fractus_core.geo import LocalFrame, area_polygon, formats
 from test_zone_formats import SQUARE, feature, kml
 
 FILES = Path(__file__).parents[1] / "imported"
@@ -34,6 +37,7 @@ def import_file(path, source, *options):
         ("geo-polygon-buffer.geojson", ["properties.buffer: may state", "properties.Bufferzone: may state"]),
         ("geo-radius-string.geojson", ["properties.radius: must be 0 to 200000 metres, not '2000'"]),
         ("kml-gx.kml", ["altitudeMode: relativeToSeaFloor uses heights, which cannot be imported; clamp"]),
+        ("kml-kmz.kmz", ["this is a ZIP archive, such as a KMZ file; unpack it and import the file inside (doc.kml)"]),
         ("kml-latin1.kml", ["not a UTF-8 text file"]),
         ("kml-latlonquad-hole-outside.kml", ["the hole must lie inside the exterior"]),
         ("kml-mixed.kml", ["LineString: is a line beside polygons; draw its area as a polygon, or remove it"]),
@@ -52,12 +56,12 @@ def import_file(path, source, *options):
     ],
 )  # fmt: skip
 def test_published_file_that_zones_cannot_represent_is_refused(name, sentences):
-    code, manifests, said = import_file(FILES / name, SOURCES[name.partition("-")[0]])
+    code, manifests, said = import_file(FILES / name, SOURCES[name.partition(".")[0].partition("-")[0]])
     assert (code, manifests) == (1, [])
     assert [sentence for sentence in sentences if sentence not in said] == [], said
 
 
-SOURCES = {"geo": "geojson", "kml": "kml", "ed269": "ed269"}
+SOURCES = {"geo": "geojson", "kml": "kml", "ed269": "ed269", "ed318": "ed318"}
 
 
 @pytest.mark.parametrize(
@@ -71,12 +75,15 @@ SOURCES = {"geo": "geojson", "kml": "kml", "ed269": "ed269"}
         ("ed269-html.json", ["p1"]),
         ("ed269-low99999.json", ["b1", "b2", "b3"]),
         ("ed269-night.json", ["i1", "i2"]),
+        ("ed269-no-ceiling.json", ["a1", "a2", "a3", "a4"]),
+        ("ed318-name-only.json", ["t3"]),
+        ("ed318.json", ["t1", "t2", "t3"]),
         ("ed269-no-dates.json", ["m1", "m2"]),
         ("ed269-upper-absent.json", ["d1", "d2", "d3"]),
     ],
 )
 def test_published_file_is_imported_with_every_zone(name, titles):
-    code, manifests, said = import_file(FILES / name, SOURCES[name.partition("-")[0]])
+    code, manifests, said = import_file(FILES / name, SOURCES[name.partition(".")[0].partition("-")[0]])
     assert code == 0, said
     assert [manifest["metadata"]["name"] for manifest in manifests] == titles
 
@@ -260,3 +267,127 @@ def test_ed269_conditions_of_a_restriction_are_kept_in_the_description():
     document["features"][0] |= {"restrictionConditions": ["below 50 m only", "by day"]}
     (zone,) = formats.read_ed269(json.dumps(document)).zones
     assert "below 50 m only, by day" in zone.spec.description
+
+
+@pytest.mark.parametrize("name", ["ed318.json", "ed318-name-only.json"])
+@pytest.mark.parametrize("source", ["geojson", "ed269"])
+def test_ed318_file_is_recognised_in_other_formats(name, source):
+    code, _, said = import_file(FILES / name, source)
+    assert code == 1
+    assert "--from ed318" in said
+
+
+def test_ed269_limits_that_no_aircraft_reaches_count_as_no_limit():
+    zones = formats.read_ed269((FILES / "ed269-no-ceiling.json").read_text())
+    assert [zone.spec.altitude and zone.spec.altitude.upper for zone in zones.zones] == [None, None, None, 120]
+    assert "A1: its upper limit of 99999 M AMSL counts as no limit" in zones.notes
+    deep = json.loads((FILES / "ed269-no-ceiling.json").read_text())
+    deep["features"][3]["geometry"][0] |= {"lowerLimit": -9999, "lowerVerticalReference": "AMSL"}
+    assert formats.read_ed269(json.dumps(deep)).zones[3].spec.altitude.lower is None
+
+
+def test_ed269_reads_the_list_of_either_name():
+    document = json.loads((FILES / "ed269-html.json").read_text())
+    published = {"formatVersion": "1.0.0", "createdAt": "2026-10-01T00:00:00Z", "UASZoneList": document["features"]}
+    assert formats.read_ed269(json.dumps(published)).zones == formats.read_ed269(json.dumps(document)).zones
+    with pytest.raises(InvalidObject, match="is also UASZoneList"):
+        formats.read_ed269(json.dumps(published | document))
+
+
+def ed318(geometry, **properties):
+    """Return an ED-318 file of one feature."""
+    known = {
+        "identifier": "T1",
+        "country": "XXX",
+        "name": [{"text": "Port"}],
+        "type": "PROHIBITED",
+        "variant": "COMMON",
+    }
+    return json.dumps({"type": "FeatureCollection", "features": [feature(geometry, properties=known | properties)]})
+
+
+LAYER = {"upper": 400, "upperReference": "AGL", "lower": 100, "lowerReference": "AGL", "uom": "ft"}
+CIRCLE = {"subType": "Circle", "radius": 250}
+
+
+def test_ed318_reads_each_geometry_with_its_own_layer():
+    parts = [
+        {**FLAT, "layer": LAYER},
+        {"type": "MultiPolygon", "coordinates": [[SQUARE]], "layer": LAYER | {"upper": 99999, "uom": "m"}},
+        {**POINT, "extent": CIRCLE},
+    ]
+    conditions = {"restrictionConditions": {"maxNoise": 60}, "message": [{"text": "call the tower", "lang": "en"}]}
+    found = formats.read_ed318(ed318({"type": "GeometryCollection", "geometries": parts}, **conditions))
+    first, second, third = (zone.spec for zone in found.zones)
+    assert (first.altitude.lower, first.altitude.upper, first.altitude.reference) == (30.48, 121.92, "terrain")
+    assert (second.altitude.lower, second.altitude.upper) == (100, None)
+    assert (third.altitude, third.area.circle.radius) == (None, 250)
+    assert first.description == "Port: PROHIBITED: maxNoise 60: call the tower"
+    assert "T1: country, variant cannot be imported; left out" in found.notes
+
+
+@pytest.mark.parametrize(
+    ("geometry", "properties", "sentence"),
+    [
+        (POINT, {}, "geometry.extent.subType: must be Circle"),
+        ({**POINT, "extent": {**CIRCLE, "uom": "NM"}}, {}, "geometry.extent.uom: a Zone cannot represent"),
+        ({**POINT, "extent": CIRCLE | {"radius": "5"}}, {}, "geometry.extent.radius: must be 0 to 200000 metres"),
+        ({**FLAT, "layer": LAYER | {"uom": "FL"}}, {}, "geometry.layer.uom: must be M or FT"),
+        ({**FLAT, "layer": LAYER | {"lowerReference": "WGS84"}}, {}, "geometry.layer.lowerReference: must be AGL or AMSL"),
+        ({**FLAT, "layer": LAYER | {"to": 9}}, {}, "geometry.layer.to: a Zone cannot represent"),
+        ({**FLAT, "layer": LAYER | {"upper": "400"}}, {}, "geometry.layer.upper: must be a number"),
+        ({"type": "LineString", "coordinates": SQUARE}, {}, "geometry.type: must be a Polygon"),
+        ({"type": "GeometryCollection", "geometries": []}, {}, "geometry.geometries: is empty"),
+        ({"type": "GeometryCollection", "geometries": [FLAT], "layer": LAYER}, {}, "geometry.layer: a Zone cannot"),
+        (None, {}, "geometry.type: must be a Polygon"),
+        (FLAT, {"radius": 500}, "properties.radius: may state the size"),
+        (FLAT, {"extendedProperties": {"buffer": 5}}, "properties.extendedProperties.buffer: may state the size"),
+        (FLAT, {"limitedApplicability": [{"schedule": [{"day": ["ANY"], "startEvent": "SR"}]}]}, "properties.limitedApplicability[0].schedule[0].startEvent: a Zone"),
+    ],
+)  # fmt: skip
+def test_ed318_rejects_features_a_zone_cannot_represent(geometry, properties, sentence):
+    with pytest.raises(InvalidObject) as refused:
+        formats.read_ed318(ed318(geometry, **properties))
+    assert str(refused.value).startswith(f"features[0].{sentence}")
+    assert str(refused.value).endswith(" (in T1)")
+
+
+def test_import_reports_many_refused_features_of_a_large_file_in_seconds(tmp_path):
+    source = tmp_path / "many.geojson"
+    ring = around(60)
+    many = [feature({"type": "Polygon", "coordinates": [ring]}, properties={"upperLimit": 120}) for _ in range(300)]
+    source.write_text(json.dumps({"type": "FeatureCollection", "features": many}))
+    start_s = time.process_time()
+    code, _, said = import_file(source, "geojson")
+    assert code == 1
+    assert len(said.splitlines()) == 300
+    assert time.process_time() - start_s < 30, "each message parsed the whole file"
+
+
+def around(count, *, bend=0.0):
+    """Return a ring of that many points around a circle of 5 km. Every second point is moved inwards by a share."""
+    radii = [0.05 * (1 - bend * (i % 2)) for i in range(count)]
+    angles = [2 * math.pi * i / count for i in range(count)]
+    ring = [[4 + r * math.cos(a), 50 + r * math.sin(a)] for r, a in zip(radii, angles, strict=True)]
+    return [*ring, ring[0]]
+
+
+def test_import_simplifies_a_ring_with_too_many_points_by_half_a_metre():
+    ring = around(10_100)
+    coordinates = " ".join(f"{lon},{lat}" for lon, lat in ring)
+    edge = f"<outerBoundaryIs><LinearRing><coordinates>{coordinates}</coordinates></LinearRing></outerBoundaryIs>"
+    frame = LocalFrame(50, 4)
+    meant = shapely.Polygon([frame.xy(lat, lon) for lon, lat in ring])
+    for found in (
+        formats.read_geojson(json.dumps(feature({"type": "Polygon", "coordinates": [ring]}, id="a"))),
+        formats.read_kml(kml(f"<Polygon>{edge}</Polygon>")),
+    ):
+        outline = area_polygon(frame, found.zones[0].spec.area)
+        assert shapely.hausdorff_distance(outline.exterior, meant.exterior) < 0.51
+        assert "a ring of 10101 points is simplified to" in found.notes[0]
+
+
+def test_import_refuses_a_ring_that_needs_too_many_points():
+    whole = feature({"type": "Polygon", "coordinates": [around(10_100, bend=0.1)]})
+    with pytest.raises(InvalidObject, match="has 10100 points, more than 10000; simplify the ring, or split the area"):
+        formats.read_geojson(json.dumps(whole))

@@ -11,10 +11,11 @@ from fractus_core.api.rules import Violation, one_of, rule
 
 Latitude = Annotated[float, Field(ge=-90, le=90, description="Latitude in degrees (WGS 84), -90 to 90.")]
 Longitude = Annotated[float, Field(ge=-180, le=180, description="Longitude in degrees (WGS 84), -180 to 180.")]
-Altitude = Annotated[float, Field(ge=-1000, le=20000)]
-"""Altitude in metres above any datum. The lower bound of -1000 m permits flights below mean sea level (the lowest
-dry land is at -430 m), and flights in a valley below a home on a mountain. Controlled airspace ends at 20 km (flight
-level 660)."""
+MIN_ALTITUDE_M = -1000
+MAX_ALTITUDE_M = 20_000
+Altitude = Annotated[float, Field(ge=MIN_ALTITUDE_M, le=MAX_ALTITUDE_M)]
+"""Altitude in metres above any datum. The lower bound of -1000 m is below all terrain relative to a home on a mountain
+and to mean sea level (the lowest dry land is at -430 m). Controlled airspace ends at 20 km (flight level 660)."""
 Reference = Literal["home", "amsl", "terrain"]
 
 

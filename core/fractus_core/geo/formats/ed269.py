@@ -6,10 +6,10 @@ import functools
 import json
 import re
 from collections.abc import Collection, Iterable
-from typing import Any
+from typing import Any, NamedTuple
 
 from fractus_core.api import InvalidObject, Zone
-from fractus_core.api.geometry import AltitudeBand
+from fractus_core.api.geometry import MAX_ALTITUDE_M, MIN_ALTITUDE_M, AltitudeBand
 from fractus_core.api.schedules import ActiveTime
 from fractus_core.geo.formats.unknown_properties import EMPTY
 from fractus_core.geo.formats.zone_builder import (
@@ -37,7 +37,9 @@ _WITHOUT_EFFECT = frozenset(
 )
 """Fields of a feature that state neither area nor altitude nor time. They are noted."""
 _TRANSLATIONS = frozenset({"localizedMessages"})
-_OF_FILE = frozenset({"title", "description", "features"})
+_LISTS = ("features", "UASZoneList")
+"""Names of the list of features. Authorities publish both."""
+_OF_FILE = frozenset({"title", "description", "formatVersion", "createdAt", *_LISTS})
 _OF_VOLUME = frozenset(
     {
         "uomDimensions", "lowerLimit", "lowerVerticalReference", "upperLimit", "upperVerticalReference",
@@ -53,6 +55,19 @@ _TIME = re.compile(
 _DAY_MIN = 1440
 
 
+class LimitNames(NamedTuple):
+    """Names of the fields with the altitude limits of a volume, their datums and their unit."""
+
+    lower: str
+    lower_datum: str
+    upper: str
+    upper_datum: str
+    unit: str
+
+
+_LIMITS = LimitNames("lowerLimit", "lowerVerticalReference", "upperLimit", "upperVerticalReference", "uomDimensions")
+
+
 def read_ed269(text: str, without: Collection[str] = (), drop: Collection[str] = ()) -> Imported:
     """Read zones from features: identifier, name, message, restriction (in the description), applicability, geometry.
 
@@ -65,12 +80,17 @@ def read_ed269(text: str, without: Collection[str] = (), drop: Collection[str] =
         InvalidObject: The text is not an ED-269 file, a geometry is broken, or a feature cannot be represented exactly.
     """
     document = parse_json(text)
-    if "features" not in document:
-        raise InvalidObject("features", "is missing; this is not an ED-269 file")
+    lists = [name for name in _LISTS if name in document]
+    if len(lists) != 1:
+        raise InvalidObject(
+            "features", "is missing; this is not an ED-269 file" if not lists else "is also UASZoneList"
+        )
+    if document.get("type") == "FeatureCollection":
+        raise InvalidObject("type", "this is GeoJSON, not ED-269; import it with --from ed318 or --from geojson")
     builder = ZoneBuilder(without, drop)
     builder.properties("the file", document, _OF_FILE, "")
-    for i, feature in enumerate(object_list(document["features"], "features")):
-        field = f"features[{i}]"
+    for i, feature in enumerate(object_list(document[lists[0]], lists[0])):
+        field = f"{lists[0]}[{i}]"
         title = str(feature.get("identifier") or feature.get("name") or field)
         builder.take(title, functools.partial(_read_feature, builder, title, feature, field))
     return builder.result()
@@ -89,7 +109,7 @@ def _read_feature(builder: ZoneBuilder, title: str, feature: dict[str, Any], fie
     builder.properties(title, extended, _TRANSLATIONS, f"{field}.extendedProperties")
     if feature.get("restriction"):
         builder.note(title, f"a Zone forbids nothing by itself; add a policy for restriction {feature['restriction']}")
-    schedule = _schedule(feature, field)
+    schedule = read_schedule(feature.get("applicability"), f"{field}.applicability")
     if schedule:
         spec["schedule"] = schedule
     volumes = object_list(feature.get("geometry"), f"{field}.geometry")
@@ -98,15 +118,16 @@ def _read_feature(builder: ZoneBuilder, title: str, feature: dict[str, Any], fie
     for j, volume in enumerate(volumes):
         path = f"{field}.geometry[{j}]"
         reject_unknown_fields(volume, _OF_VOLUME, path)
-        band = _band(volume, path)
-        builder.add(title, {**spec, "area": _area(builder, volume, path), **({"altitude": band} if band else {})}, path)
+        band = read_band(builder, title, volume, _LIMITS, path)
+        area = _area(builder, title, volume, path)
+        builder.add(title, {**spec, "area": area, **({"altitude": band} if band else {})}, path)
 
 
 def _joined(value: Any) -> str:
     return ", ".join(map(str, value)) if isinstance(value, list) else str(value)
 
 
-def _area(builder: ZoneBuilder, volume: dict[str, Any], field: str) -> dict[str, Any]:
+def _area(builder: ZoneBuilder, title: str, volume: dict[str, Any], field: str) -> dict[str, Any]:
     path = f"{field}.horizontalProjection"
     projection = optional_object(volume.get("horizontalProjection"), path)
     shape = projection.get("type")
@@ -114,48 +135,78 @@ def _area(builder: ZoneBuilder, volume: dict[str, Any], field: str) -> dict[str,
         raise InvalidObject(f"{path}.type", f"must be Polygon or Circle, not {shape!r}")
     reject_unknown_fields(projection, _OF_PROJECTION[shape], path)
     if shape == "Polygon":
-        return builder.rings(projection.get("coordinates"), f"{path}.coordinates")
+        return builder.rings(title, projection.get("coordinates"), f"{path}.coordinates")
     if volume.get("uomDimensions") not in (None, "M"):
         raise InvalidObject(f"{path}.radius", "may be metres or feet; give the volume in metres (uomDimensions M)")
     centre = parse_point(projection.get("center"), f"{path}.center")
     return circle_area(centre, projection.get("radius"), f"{path}.radius")
 
 
-def _band(volume: dict[str, Any], field: str) -> dict[str, Any]:
-    """Return the altitude band. A lower limit of 0 above ground means that it starts at the ground."""
-    unit = volume.get("uomDimensions") or "M"
-    if unit not in _UNITS_M:
-        raise InvalidObject(f"{field}.uomDimensions", f"must be M or FT, not {unit!r:.40}; convert the limits")
+def read_band(
+    builder: ZoneBuilder, title: str, volume: dict[str, Any], names: LimitNames, field: str
+) -> dict[str, Any]:
+    """Return the altitude band of a volume, empty if it has no limits.
+
+    A lower limit of 0 above ground means that the zone starts at the ground. Authorities write limits that no aircraft
+    reaches (99999) for a zone without a limit.
+
+    Args:
+        builder: Builder that receives notes.
+        title: Title of the feature.
+        volume: Fields with the limits.
+        names: Names of these fields.
+        field: Path of the volume in the file.
+
+    Raises:
+        InvalidObject: A limit is not a number, or its unit or datum is unknown.
+    """
+    unit = volume.get(names.unit) or "M"
+    metres = _UNITS_M.get(unit.upper()) if isinstance(unit, str) else None
+    if metres is None:
+        raise InvalidObject(f"{field}.{names.unit}", f"must be M or FT, not {unit!r:.40}; convert the limits")
     limits: dict[str, Any] = {}
     references = set()
-    for side in ("lower", "upper"):
-        value = volume.get(f"{side}Limit")
-        datum = volume.get(f"{side}VerticalReference")
+    for side, name, datum_name in (
+        ("lower", names.lower, names.lower_datum),
+        ("upper", names.upper, names.upper_datum),
+    ):
+        value = volume.get(name)
+        datum = volume.get(datum_name)
         if value is None:
             continue
         if not is_number(value):
-            raise InvalidObject(f"{field}.{side}Limit", f"must be a number, not {value!r:.40}")
+            raise InvalidObject(f"{field}.{name}", f"must be a number, not {value!r:.40}")
         if side == "lower" and value <= 0 and datum == "AGL":
             continue
         if datum not in _REFERENCES:
-            raise InvalidObject(
-                f"{field}.{side}VerticalReference", f"must be AGL or AMSL, not {datum!r:.40}; convert it"
-            )
-        limits[side] = round(value * _UNITS_M[unit], 3)
+            raise InvalidObject(f"{field}.{datum_name}", f"must be AGL or AMSL, not {datum!r:.40}; convert it")
+        limit_m = round(value * metres, 3)
+        if (side == "upper" and limit_m > MAX_ALTITUDE_M) or (side == "lower" and limit_m < MIN_ALTITUDE_M):
+            builder.note(title, f"its {side} limit of {value} {unit} {datum} counts as no limit")
+            continue
+        limits[side] = limit_m
         references.add(_REFERENCES[datum])
     if len(references) > 1:
         raise InvalidObject(
-            f"{field}.lowerVerticalReference",
+            f"{field}.{names.lower_datum}",
             "differs from that of the upper limit; convert one of them, or split the volume",
         )
     return limits | {"reference": references.pop()} if limits else {}
 
 
-def _schedule(feature: dict[str, Any], field: str) -> list[dict[str, Any]]:
-    """Return the active times of the zone. Empty means always."""
+def read_schedule(value: Any, field: str) -> list[dict[str, Any]]:
+    """Return the active times of the zone. Empty means always.
+
+    Args:
+        value: List of the periods in which the zone applies.
+        field: Its path in the file.
+
+    Raises:
+        InvalidObject: A period cannot be represented exactly.
+    """
     times: list[dict[str, Any]] = []
-    for i, period in enumerate(object_list(feature.get("applicability"), f"{field}.applicability")):
-        path = f"{field}.applicability[{i}]"
+    for i, period in enumerate(object_list(value, field)):
+        path = f"{field}[{i}]"
         reject_unknown_fields(period, _OF_PERIOD, path)
         valid = {
             key: period[ed269_key]

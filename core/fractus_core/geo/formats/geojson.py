@@ -8,6 +8,7 @@ from collections.abc import Collection, Iterable, Iterator
 from typing import Any
 
 from fractus_core.api import InvalidObject, Zone
+from fractus_core.geo.formats.ed318 import is_ed318
 from fractus_core.geo.formats.zone_builder import (
     Exported,
     Imported,
@@ -73,6 +74,8 @@ def read_geojson(text: str, without: Collection[str] = (), drop: Collection[str]
         field = ""
     else:
         raise InvalidObject("type", f"{kind!r} is not GeoJSON of zones; expected a FeatureCollection of polygons")
+    if is_ed318(features):
+        raise InvalidObject("", "this is an ED-318 file; import it with --from ed318")
     builder = ZoneBuilder(without, drop)
     if kind == "FeatureCollection":
         builder.properties("the file", document, _OF_COLLECTION, "")
@@ -80,14 +83,18 @@ def read_geojson(text: str, without: Collection[str] = (), drop: Collection[str]
         path = field.format(i)
         properties = feature.get("properties")
         stated = properties if isinstance(properties, dict) else {}
-        title = str(stated.get(_title_property(stated)) or feature.get("id") or f"zone {i}")
+        title = _title(stated.get(_title_property(stated))) or _title(feature.get("id")) or f"zone {i}"
         builder.take(title, functools.partial(_read_feature, builder, title, feature, path))
     return builder.result()
 
 
+def _title(value: Any) -> str:
+    return str(value) if value and isinstance(value, (str, int, float)) else ""
+
+
 def _title_property(properties: dict[str, Any]) -> str:
     """Return the name of the property that names a feature."""
-    return "name" if properties.get("name") else "title"
+    return "name" if _title(properties.get("name")) else "title"
 
 
 def _check_system(value: dict[str, Any], field: str) -> None:
@@ -138,12 +145,12 @@ def _read_geometry(
         coordinates = _flat(coordinates)
     match geometry.get("type"):
         case "Polygon":
-            builder.add(title, {**spec, "area": builder.rings(coordinates, path)}, field)
+            builder.add(title, {**spec, "area": builder.rings(title, coordinates, path)}, field)
         case "MultiPolygon":
             if not isinstance(coordinates, list):
                 raise InvalidObject(path, "must be a list of polygons")
             for j, part in enumerate(coordinates):
-                builder.add(title, {**spec, "area": builder.rings(part, f"{path}[{j}]")}, f"{path}[{j}]")
+                builder.add(title, {**spec, "area": builder.rings(title, part, f"{path}[{j}]")}, f"{path}[{j}]")
         case "Point" if stated["radius"] is not None:
             radius = f"{field.removesuffix('geometry')}properties.radius"
             builder.add(

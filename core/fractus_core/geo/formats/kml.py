@@ -16,7 +16,6 @@ from fractus_core.geo.formats.zone_builder import (
     ZoneBuilder,
     cut_rings,
     parse_point,
-    parse_ring,
     reject_outlines,
     unsupported_parts,
 )
@@ -132,8 +131,8 @@ def _read_placemark(builder: ZoneBuilder, title: str, placemark: ElementTree.Ele
     for i, shape in enumerate(polygons):
         field = f"Polygon[{i}]"
         _check_elements(builder, title, shape, _OF_POLYGON, field)
-        exterior = _rings(shape, "outerBoundaryIs", field)
-        holes = _rings(shape, "innerBoundaryIs", field)
+        exterior = _rings(builder, title, shape, "outerBoundaryIs", field)
+        holes = _rings(builder, title, shape, "innerBoundaryIs", field)
         if len(exterior) != 1:
             raise InvalidObject(f"{field}.outerBoundaryIs", "a polygon has exactly one")
         for mode in (e.text or "" for e in shape if _tag(e) == "altitudeMode"):
@@ -178,14 +177,13 @@ def _data(element: ElementTree.Element) -> dict[str, Any]:
     return values
 
 
-def _rings(shape: ElementTree.Element, boundary: str, field: str) -> list[list[dict[str, float]]]:
+def _rings(
+    builder: ZoneBuilder, title: str, shape: ElementTree.Element, boundary: str, field: str
+) -> list[list[dict[str, float]]]:
     """Return all rings of a polygon's boundaries of one kind. Some programs write several rings into one boundary."""
     texts = [e.text or "" for b in shape if _tag(b) == boundary for e in b.iter() if _tag(e) == "coordinates"]
-    return [_ring(text, f"{field}.{boundary}.coordinates") for text in texts]
-
-
-def _ring(text: str, field: str) -> list[dict[str, float]]:
-    return parse_ring(_positions(text, field), field)
+    path = f"{field}.{boundary}.coordinates"
+    return [builder.ring(title, _positions(text, path), path) for text in texts]
 
 
 def _positions(text: str, field: str) -> list[list[float]]:

@@ -15,7 +15,7 @@ import shapely
 from fractus_core.api import API_VERSION, InvalidObject, Zone
 from fractus_core.api.geometry import MAX_RING_POINTS, Area, Circle, Point, Polygon
 from fractus_core.documents import BadDocument, parse_documents
-from fractus_core.geo.areas import area_center, area_polygon, multipolygon_geojson
+from fractus_core.geo.areas import area_center, area_polygon, center_of, multipolygon_geojson
 from fractus_core.geo.formats.unknown_properties import EMPTY, may_state_limit
 from fractus_core.local_frame import LocalFrame
 
@@ -129,7 +129,7 @@ class ZoneBuilder:
             self.note(title, f"its description is cut after {DESCRIPTION_LENGTH} characters")
         return text[:DESCRIPTION_LENGTH]
 
-    def rings(self, value: Any, field: str) -> dict[str, Any]:
+    def rings(self, title: str, value: Any, field: str) -> dict[str, Any]:
         """Return the rings of a GeoJSON polygon as an area.
 
         Raises:
@@ -137,17 +137,28 @@ class ZoneBuilder:
         """
         if not isinstance(value, (list, tuple)) or not value:
             raise InvalidObject(field, "must be a list of rings")
-        rings = []
-        for i, item in enumerate(value):
-            rings.append(parse_ring(item, f"{field}[{i}]", planar=True))
-            self._points += len(rings[-1])
-            if self._points > MAX_POINTS:
-                raise _TooLarge(
-                    f"{field}[{i}]",
-                    f"the file needs more than {MAX_POINTS} points, including points added on long sides; split it",
-                )
-        exterior, *holes = rings
+        exterior, *holes = [self.ring(title, item, f"{field}[{i}]", planar=True) for i, item in enumerate(value)]
         return {"polygon": {"exterior": exterior} | ({"holes": holes} if holes else {})}
+
+    def ring(self, title: str, value: Any, field: str, *, planar: bool = False) -> list[dict[str, float]]:
+        """Return a ring of lon, lat as in `parse_ring`. A ring with too many points for a Zone is simplified with a note.
+
+        Raises:
+            InvalidObject: The ring is invalid, or the file has too many points.
+        """
+        points = value
+        if isinstance(value, (list, tuple)) and len(value) > MAX_RING_POINTS:
+            points = _simplified(value, field)
+            if len(points) < len(value):
+                self.note(
+                    title,
+                    f"a ring of {len(value)} points is simplified to {len(points)}, at most {MAX_BEND_M} m beside it",
+                )
+        ring = parse_ring(points, field, planar=planar)
+        self._points += len(ring)
+        if self._points > MAX_POINTS:
+            raise _TooLarge(field, f"the file needs more than {MAX_POINTS} points, for long sides some more; split it")
+        return ring
 
     def properties(self, title: str, properties: Mapping[str, Any], known: Collection[str], field: str) -> None:
         """Note the properties that a Zone cannot represent, and reject those that may state its size, altitude or time.
@@ -308,12 +319,32 @@ def parse_ring(value: Any, field: str, *, lat_first: bool = False, planar: bool 
         raise InvalidObject(field, "a ring needs at least three points")
     if planar and any(abs(a.lon - b.lon) > 180 for a, b in itertools.pairwise([*points, points[0]])):
         raise InvalidObject(field, "crosses the antimeridian; cut it there, into two polygons (RFC 7946)")
-    if planar and len(points) <= MAX_RING_POINTS:  # a longer ring is refused later
+    if len(points) > MAX_RING_POINTS:
+        raise InvalidObject(
+            field, f"has {len(points)} points, more than {MAX_RING_POINTS}; simplify the ring, or split the area"
+        )
+    if planar:
         sides = list(itertools.pairwise([*points, points[0]]))
         if sum(_pieces(*side) for side in sides) > MAX_RING_POINTS:
             raise InvalidObject(field, f"has sides so long that they need more than {MAX_RING_POINTS} points; split it")
         points = list(_along_degrees(sides))
     return [p.to_dict() for p in points]
+
+
+def _simplified(ring: Sequence[Any], field: str) -> list[tuple[float, float]]:
+    """Return the points of a ring of lon, lat without those that lie within `MAX_BEND_M` of the ring of the others.
+
+    Algorithm: Douglas-Peucker (GEOS), O(n log n), in metres around the middle of the ring.
+
+    Raises:
+        InvalidObject: A point is invalid.
+    """
+    points = [parse_point(position, f"{field}[{i}]") for i, position in enumerate(ring)]
+    frame = LocalFrame.at(center_of(points))
+    places = [frame.xy(point.lat, point.lon) for point in points]
+    kept = shapely.simplify(shapely.Polygon(places), MAX_BEND_M, preserve_topology=True)
+    by_place = dict(zip(places, ((point.lon, point.lat) for point in points), strict=True))
+    return [by_place[place] for place in kept.exterior.coords]
 
 
 def _pieces(start: Point, end: Point) -> int:

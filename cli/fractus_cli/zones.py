@@ -46,7 +46,7 @@ def zones() -> None:
 @click.argument("file", type=click.Path(exists=True, dir_okay=False, path_type=pathlib.Path))
 @click.option("--from", "source", type=click.Choice(sorted(_READERS)), required=True, help="Format of the file.")
 @click.option("--prefix", default="", help="Prefix for the names of all Zones.")
-@click.option("--leave-out", "without", multiple=True, metavar="NAME", help="Feature to skip. May be repeated.")
+@click.option("--leave-out", "without", multiple=True, metavar="NAME", help="Feature or Zone to skip. May be repeated.")
 @click.option("--drop", multiple=True, metavar="PROPERTY", help="Property to ignore. May be repeated.")
 def import_(file: pathlib.Path, source: str, prefix: str, without: tuple[str, ...], drop: tuple[str, ...]) -> None:
     """Print a Zone manifest for each zone in a file.
@@ -130,7 +130,10 @@ def _renamed(zone: Zone, prefix: str) -> Zone:
 def _manifest(zone: Zone) -> dict[str, object]:
     body = zone.to_dict()
     spec = {key: value for key, value in body["spec"].items() if value not in ("", [])}
-    return {"apiVersion": body["apiVersion"], "kind": body["kind"], "metadata": {"name": zone.name}, "spec": spec}
+    metadata: dict[str, object] = {"name": zone.name}
+    if zone.metadata.annotations:
+        metadata["annotations"] = dict(zone.metadata.annotations)
+    return {"apiVersion": body["apiVersion"], "kind": body["kind"], "metadata": metadata, "spec": spec}
 
 
 def _print_notes(notes: Iterable[str]) -> None:

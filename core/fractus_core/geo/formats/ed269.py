@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import functools
+import hashlib
 import json
 import re
+import string
 from collections.abc import Collection, Iterable
 from typing import Any, NamedTuple
 
@@ -14,6 +16,7 @@ from fractus_core.api.schedules import ActiveTime
 from fractus_core.geo.formats.unknown_properties import EMPTY
 from fractus_core.geo.formats.zone_builder import (
     Exported,
+    FeatureName,
     Imported,
     ZoneBuilder,
     circle_area,
@@ -91,12 +94,15 @@ def read_ed269(text: str, without: Collection[str] = (), drop: Collection[str] =
     builder.properties("the file", document, _OF_FILE, "")
     for i, feature in enumerate(object_list(document[lists[0]], lists[0])):
         field = f"{lists[0]}[{i}]"
-        title = str(feature.get("identifier") or feature.get("name") or field)
-        builder.take(title, functools.partial(_read_feature, builder, title, feature, field))
+        identifier = str(feature.get("identifier") or "")
+        given = str(feature.get("name") or "")
+        name = FeatureName(identifier or given or field, given, identifier)
+        builder.take(name, feature.get("geometry"), functools.partial(_read_feature, builder, name, feature, field))
     return builder.result()
 
 
-def _read_feature(builder: ZoneBuilder, title: str, feature: dict[str, Any], field: str) -> None:
+def _read_feature(builder: ZoneBuilder, name: FeatureName, feature: dict[str, Any], field: str) -> None:
+    title = name.title
     parts = [_joined(feature[key]) for key in _DESCRIBED if feature.get(key)]
     spec: dict[str, Any] = {"description": builder.described(title, ": ".join(parts))} if parts else {}
     without_effect = sorted(key for key in _WITHOUT_EFFECT if feature.get(key) not in EMPTY)
@@ -117,10 +123,17 @@ def _read_feature(builder: ZoneBuilder, title: str, feature: dict[str, Any], fie
         raise InvalidObject(f"{field}.geometry", "is missing; give at least one volume")
     for j, volume in enumerate(volumes):
         path = f"{field}.geometry[{j}]"
-        reject_unknown_fields(volume, _OF_VOLUME, path)
-        band = read_band(builder, title, volume, _LIMITS, path)
-        area = _area(builder, title, volume, path)
-        builder.add(title, {**spec, "area": area, **({"altitude": band} if band else {})}, path)
+        build = functools.partial(_volume_spec, builder, title, volume, path, spec)
+        builder.add(name, volume, path, build)
+
+
+def _volume_spec(
+    builder: ZoneBuilder, title: str, volume: dict[str, Any], field: str, spec: dict[str, Any]
+) -> dict[str, Any]:
+    reject_unknown_fields(volume, _OF_VOLUME, field)
+    band = read_band(builder, title, volume, _LIMITS, field)
+    area = _area(builder, title, volume, field)
+    return {**spec, "area": area, **({"altitude": band} if band else {})}
 
 
 def _joined(value: Any) -> str:
@@ -278,9 +291,9 @@ def write_ed269(zones: Iterable[Zone], *, country: str = "XXX", restriction: str
     zones = tuple(zones)
     notes = unsupported_parts(zones)
     features = []
-    for i, zone in enumerate(zones):
+    for zone in zones:
         feature = {
-            "identifier": f"FX{i + 1:05d}",
+            "identifier": _identifier(zone.name),
             "country": country,
             "name": zone.name,
             "type": "COMMON",
@@ -297,6 +310,13 @@ def write_ed269(zones: Iterable[Zone], *, country: str = "XXX", restriction: str
         notes.append(f"every zone: zoneAuthority is unknown; restriction is {restriction}, country {country}")
     document = {"title": "Zones", "description": "", "features": features}
     return Exported(json.dumps(document, indent=1) + "\n", tuple(notes))
+
+
+def _identifier(name: str) -> str:
+    """Return an identifier of 7 letters and digits, the maximum of ED-269, that depends on the name alone."""
+    number = int.from_bytes(hashlib.sha256(name.encode()).digest())
+    characters = string.digits + string.ascii_uppercase
+    return "F" + "".join(characters[number // 36**i % 36] for i in range(6))
 
 
 def _volumes(zone: Zone, notes: list[str]) -> list[dict[str, Any]]:

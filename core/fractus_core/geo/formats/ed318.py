@@ -10,6 +10,7 @@ from fractus_core.api import InvalidObject
 from fractus_core.geo.formats.ed269 import LimitNames, read_band, read_schedule
 from fractus_core.geo.formats.unknown_properties import EMPTY
 from fractus_core.geo.formats.zone_builder import (
+    FeatureName,
     Imported,
     ZoneBuilder,
     circle_area,
@@ -57,8 +58,10 @@ def read_ed318(text: str, without: Collection[str] = (), drop: Collection[str] =
         field = f"features[{i}]"
         stated = feature.get("properties")
         properties = stated if isinstance(stated, dict) else {}
-        title = str(properties.get("identifier") or _text(properties.get("name")) or feature.get("id") or field)
-        builder.take(title, functools.partial(_read_feature, builder, title, feature, field))
+        identifier = str(properties.get("identifier") or "")
+        given = _text(properties.get("name"))
+        name = FeatureName(identifier or given or field, given, identifier)
+        builder.take(name, feature.get("geometry"), functools.partial(_read_feature, builder, name, feature, field))
     return builder.result()
 
 
@@ -82,7 +85,8 @@ def _text(value: Any) -> str:
     return "" if value is None else str(value)
 
 
-def _read_feature(builder: ZoneBuilder, title: str, feature: dict[str, Any], field: str) -> None:
+def _read_feature(builder: ZoneBuilder, name: FeatureName, feature: dict[str, Any], field: str) -> None:
+    title = name.title
     path = f"{field}.properties"
     builder.properties(title, feature, _OF_FEATURE, field)
     properties = optional_object(feature.get("properties"), path)
@@ -100,45 +104,57 @@ def _read_feature(builder: ZoneBuilder, title: str, feature: dict[str, Any], fie
     if schedule:
         spec["schedule"] = schedule
     _read_geometry(
-        builder, title, optional_object(feature.get("geometry"), f"{field}.geometry"), spec, f"{field}.geometry"
+        builder, name, optional_object(feature.get("geometry"), f"{field}.geometry"), spec, f"{field}.geometry"
     )
 
 
 def _read_geometry(
-    builder: ZoneBuilder, title: str, geometry: dict[str, Any], spec: dict[str, Any], field: str
+    builder: ZoneBuilder, name: FeatureName, geometry: dict[str, Any], spec: dict[str, Any], field: str
 ) -> None:
     """Add the zones of a geometry, each with the altitudes of its own layer."""
-    kind = geometry.get("type")
-    if kind == "GeometryCollection":
+    coordinates = geometry.get("coordinates")
+    if geometry.get("type") == "GeometryCollection":
         reject_unknown_fields(geometry, ("type", "geometries", "bbox"), field)
         parts = object_list(geometry.get("geometries"), f"{field}.geometries")
         if not parts:
             raise InvalidObject(f"{field}.geometries", "is empty; give at least one geometry")
         for i, part in enumerate(parts):
-            _read_geometry(builder, title, part, spec, f"{field}.geometries[{i}]")
-        return
-    layer = optional_object(geometry.get("layer"), f"{field}.layer")
-    reject_unknown_fields(layer, _LIMITS, f"{field}.layer")
-    band = read_band(builder, title, layer, _LIMITS, f"{field}.layer")
-    spec = spec | ({"altitude": band} if band else {})
-    coordinates = geometry.get("coordinates")
-    path = f"{field}.coordinates"
-    if kind == "Point":
-        reject_unknown_fields(geometry, _OF_GEOMETRY | {"extent"}, field)
-        extent = optional_object(geometry.get("extent"), f"{field}.extent")
-        reject_unknown_fields(extent, _OF_EXTENT, f"{field}.extent")
-        if extent.get("subType") != "Circle":
-            raise InvalidObject(f"{field}.extent.subType", "must be Circle; give the point a circle, or draw a Polygon")
-        area = circle_area(parse_point(coordinates, path), extent.get("radius"), f"{field}.extent.radius")
-        builder.add(title, {**spec, "area": area}, field)
-        return
-    reject_unknown_fields(geometry, _OF_GEOMETRY, field)
-    if kind not in ("Polygon", "MultiPolygon"):
-        raise InvalidObject(f"{field}.type", f"must be a Polygon, or a Point with a circle as extent, not {kind!r:.40}")
-    polygons = {path: coordinates}
-    if kind == "MultiPolygon":
+            _read_geometry(builder, name, part, spec, f"{field}.geometries[{i}]")
+    elif geometry.get("type") == "MultiPolygon":
+        path = f"{field}.coordinates"
         if not isinstance(coordinates, list) or not coordinates:
             raise InvalidObject(path, "must be a list of polygons")
-        polygons = {f"{path}[{i}]": polygon for i, polygon in enumerate(coordinates)}
-    for place, polygon in polygons.items():
-        builder.add(title, {**spec, "area": builder.rings(title, polygon, place)}, place)
+        for i, polygon in enumerate(coordinates):
+            part = geometry | {"type": "Polygon", "coordinates": polygon}
+            _add(builder, name, part, spec, field=field, path=f"{path}[{i}]")
+    else:
+        _add(builder, name, geometry, spec, field=field, path=f"{field}.coordinates")
+
+
+def _add(
+    builder: ZoneBuilder, name: FeatureName, geometry: dict[str, Any], spec: dict[str, Any], *, field: str, path: str
+) -> None:
+    def build() -> dict[str, Any]:
+        layer = optional_object(geometry.get("layer"), f"{field}.layer")
+        reject_unknown_fields(layer, _LIMITS, f"{field}.layer")
+        band = read_band(builder, name.title, layer, _LIMITS, f"{field}.layer")
+        area = _area(builder, name.title, geometry, field, path)
+        return {**spec, "area": area, **({"altitude": band} if band else {})}
+
+    builder.add(name, geometry, path, build)
+
+
+def _area(builder: ZoneBuilder, title: str, geometry: dict[str, Any], field: str, path: str) -> dict[str, Any]:
+    """Return the area of a polygon, or of a point with a circle as extent."""
+    kind = geometry.get("type")
+    if kind == "Polygon":
+        reject_unknown_fields(geometry, _OF_GEOMETRY, field)
+        return builder.rings(title, geometry.get("coordinates"), path)
+    if kind != "Point":
+        raise InvalidObject(f"{field}.type", f"must be a Polygon, or a Point with a circle as extent, not {kind!r:.40}")
+    reject_unknown_fields(geometry, _OF_GEOMETRY | {"extent"}, field)
+    extent = optional_object(geometry.get("extent"), f"{field}.extent")
+    reject_unknown_fields(extent, _OF_EXTENT, f"{field}.extent")
+    if extent.get("subType") != "Circle":
+        raise InvalidObject(f"{field}.extent.subType", "must be Circle; give the point a circle, or draw a Polygon")
+    return circle_area(parse_point(geometry.get("coordinates"), path), extent.get("radius"), f"{field}.extent.radius")

@@ -9,8 +9,10 @@ from typing import Any
 
 from fractus_core.api import InvalidObject, Zone
 from fractus_core.geo.formats.ed318 import is_ed318
+from fractus_core.geo.formats.unknown_properties import EMPTY
 from fractus_core.geo.formats.zone_builder import (
     Exported,
+    FeatureName,
     Imported,
     ZoneBuilder,
     circle_area,
@@ -25,7 +27,7 @@ from fractus_core.geo.formats.zone_builder import (
     unsupported_parts,
 )
 
-_KNOWN = frozenset({"description", "radius", "altitude", "schedule"})
+_KNOWN = frozenset({"identifier", "description", "radius", "altitude", "schedule"})
 _OF_FEATURE = frozenset({"type", "id", "geometry", "properties", "bbox", "crs"})
 _OF_COLLECTION = _OF_FEATURE | {
     "features", "name", "title", "description", "generator", "copyright", "license", "attribution", "links", "timestamp", "timeStamp",
@@ -46,7 +48,7 @@ _WGS84 = frozenset(
         "urn:ogc:def:crs:EPSG::4326",
     }
 )
-"""Names of WGS 84. GeoJSON of 2008 may name a reference system, and has lon before lat for each of these names."""
+"""Names of WGS 84 in GeoJSON files of 2008, which may name a reference system. All of them mean lon before lat."""
 
 
 def read_geojson(text: str, without: Collection[str] = (), drop: Collection[str] = ()) -> Imported:
@@ -83,18 +85,24 @@ def read_geojson(text: str, without: Collection[str] = (), drop: Collection[str]
         path = field.format(i)
         properties = feature.get("properties")
         stated = properties if isinstance(properties, dict) else {}
-        title = _title(stated.get(_title_property(stated))) or _title(feature.get("id")) or f"zone {i}"
-        builder.take(title, functools.partial(_read_feature, builder, title, feature, path))
+        given = _text(stated.get(_title_property(stated)))
+        title = given or _text(feature.get("id")) or f"zone {i}"
+        name = FeatureName(title, given, _text(stated.get("identifier")))
+        geometry = feature.get("geometry")
+        builder.take(
+            name, [geometry, stated.get("altitude")], functools.partial(_read_feature, builder, name, feature, path)
+        )
     return builder.result()
 
 
-def _title(value: Any) -> str:
-    return str(value) if value and isinstance(value, (str, int, float)) else ""
+def _text(value: Any) -> str:
+    """Return a name or number as text, and an empty string for other values."""
+    return str(value).strip() if value not in EMPTY and isinstance(value, (str, int, float)) else ""
 
 
 def _title_property(properties: dict[str, Any]) -> str:
     """Return the name of the property that names a feature."""
-    return "name" if _title(properties.get("name")) else "title"
+    return "name" if _text(properties.get("name")) else "title"
 
 
 def _check_system(value: dict[str, Any], field: str) -> None:
@@ -108,7 +116,8 @@ def _check_system(value: dict[str, Any], field: str) -> None:
         raise InvalidObject(field, f"must be WGS 84, not {name or 'an unnamed one'}; convert the file to OGC:CRS84")
 
 
-def _read_feature(builder: ZoneBuilder, title: str, feature: dict[str, Any], field: str) -> None:
+def _read_feature(builder: ZoneBuilder, name: FeatureName, feature: dict[str, Any], field: str) -> None:
+    title = name.title
     inside = f"{field}." if field else ""
     if feature.get("type") != "Feature":
         raise InvalidObject(f"{inside}type", f"must be Feature, not {feature.get('type')!r}")
@@ -128,13 +137,14 @@ def _read_feature(builder: ZoneBuilder, title: str, feature: dict[str, Any], fie
     if properties.get("radius") is not None and geometry.get("type") != "Point":
         raise InvalidObject(f"{inside}properties.radius", "is valid for a Point only; draw other areas as polygons")
     _check_lines(geometry, f"{inside}geometry")
-    _read_geometry(builder, title, geometry, spec | {"radius": properties.get("radius")}, f"{inside}geometry")
+    _read_geometry(builder, name, geometry, spec | {"radius": properties.get("radius")}, f"{inside}geometry")
 
 
 def _read_geometry(
-    builder: ZoneBuilder, title: str, geometry: dict[str, Any], stated: dict[str, Any], field: str
+    builder: ZoneBuilder, name: FeatureName, geometry: dict[str, Any], stated: dict[str, Any], field: str
 ) -> None:
     """Add zones of a geometry, each with the properties of the feature."""
+    title = name.title
     spec = {key: value for key, value in stated.items() if key != "radius"}
     coordinates = geometry.get("coordinates")
     path = f"{field}.coordinates"
@@ -143,22 +153,31 @@ def _read_geometry(
     if "altitude" in spec and _heights(coordinates):
         builder.note(title, "heights of its points are ignored; properties.altitude is used")
         coordinates = _flat(coordinates)
+
+    def add_polygon(rings: Any, place: str, location: str) -> None:
+        shape = [{"type": "Polygon", "coordinates": rings}, spec.get("altitude")]
+        builder.add(name, shape, location, lambda: {**spec, "area": builder.rings(title, rings, place)})
+
     match geometry.get("type"):
         case "Polygon":
-            builder.add(title, {**spec, "area": builder.rings(title, coordinates, path)}, field)
+            add_polygon(coordinates, path, field)
         case "MultiPolygon":
             if not isinstance(coordinates, list):
                 raise InvalidObject(path, "must be a list of polygons")
             for j, part in enumerate(coordinates):
-                builder.add(title, {**spec, "area": builder.rings(title, part, f"{path}[{j}]")}, f"{path}[{j}]")
+                add_polygon(part, f"{path}[{j}]", f"{path}[{j}]")
         case "Point" if stated["radius"] is not None:
             radius = f"{field.removesuffix('geometry')}properties.radius"
+            shape = [geometry, spec.get("altitude"), stated["radius"]]
             builder.add(
-                title, {**spec, "area": circle_area(parse_point(coordinates, path), stated["radius"], radius)}, field
+                name,
+                shape,
+                field,
+                lambda: {**spec, "area": circle_area(parse_point(coordinates, path), stated["radius"], radius)},
             )
         case "GeometryCollection":
             for j, part in enumerate(object_list(geometry.get("geometries"), f"{field}.geometries")):
-                _read_geometry(builder, title, part, stated, f"{field}.geometries[{j}]")
+                _read_geometry(builder, name, part, stated, f"{field}.geometries[{j}]")
         case other if other in _LINES or other in _POINTS:
             builder.note(title, f"a geometry of type {other} is not a zone; left out")
         case None:
@@ -233,7 +252,9 @@ def write_geojson(zones: Iterable[Zone]) -> Exported:
 def zone_feature(zone: Zone, notes: list[str]) -> dict[str, Any]:
     """Return a zone as a feature. Adds notes on differences between the zone and its polygon."""
     spec = zone.spec.to_dict()
-    properties = {"name": zone.name} | {k: spec[k] for k in ("altitude", "schedule", "description") if spec.get(k)}
+    properties = {"identifier": zone.name, "name": zone.name} | {
+        k: spec[k] for k in ("altitude", "schedule", "description") if spec.get(k)
+    }
     parts = cut_rings(zone, notes)
     geometry: dict[str, Any] = {"type": "MultiPolygon", "coordinates": parts}
     if len(parts) == 1:

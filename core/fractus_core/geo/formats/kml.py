@@ -12,6 +12,7 @@ from xml.sax.saxutils import escape
 from fractus_core.api import InvalidObject, Zone
 from fractus_core.geo.formats.zone_builder import (
     Exported,
+    FeatureName,
     Imported,
     ZoneBuilder,
     cut_rings,
@@ -78,12 +79,19 @@ def read_kml(text: str, without: Collection[str] = (), drop: Collection[str] = (
                 "a NetworkLink refers to another file, which is not imported; save everything in one file",
             )
         count += tag == "Placemark"
-        title = _text(element, "name") or f"{tag} {count}".lower()
+        given = _text(element, "name")
+        name = FeatureName(given or f"{tag} {count}".lower(), given, _identifier(element))
         if tag == "Placemark":
-            builder.take(title, functools.partial(_read_placemark, builder, title, element))
+            builder.take(name, _shape(element), functools.partial(_read_placemark, builder, name, element))
         elif tag == "GroundOverlay":
-            builder.take(title, functools.partial(_reject_overlay, title))
+            builder.take(name, None, functools.partial(_reject_overlay, name.title))
     return builder.result()
+
+
+def _identifier(element: ElementTree.Element) -> str:
+    """Return the identifier in the custom data of a placemark."""
+    values = _data(element).get("identifier", [])
+    return values[0] if len(values) == 1 and isinstance(values[0], str) else ""
 
 
 def _reject_overlay(title: str) -> None:
@@ -96,7 +104,7 @@ def _check_elements(
     """Note unknown elements and data, and reject those that may state the size, altitude or time of a zone."""
     unknown = {_tag(child): _contents(child) for child in element if _tag(child) not in known | _DATA}
     builder.properties(title, unknown, (), field)
-    builder.properties(title, _data(element), (), "ExtendedData")
+    builder.properties(title, _data(element), ("identifier",), "ExtendedData")
 
 
 def _contents(element: ElementTree.Element) -> Any:
@@ -111,7 +119,8 @@ def _check_always(element: ElementTree.Element, field: str) -> None:
         raise InvalidObject(field, "has a time, which cannot be imported; remove it and add a schedule to the Zone")
 
 
-def _read_placemark(builder: ZoneBuilder, title: str, placemark: ElementTree.Element) -> None:
+def _read_placemark(builder: ZoneBuilder, name: FeatureName, placemark: ElementTree.Element) -> None:
+    title = name.title
     described = builder.described(title, _text(placemark, "description"))
     polygons = [e for e in placemark.iter() if _tag(e) == "Polygon"]
     _check_elements(builder, title, placemark, _OF_PLACEMARK)
@@ -128,21 +137,35 @@ def _read_placemark(builder: ZoneBuilder, title: str, placemark: ElementTree.Ele
         raise InvalidObject("", "has no geometry; draw the zone as a Polygon, or leave it out")
     if polygons:
         _check_always(placemark, "")
-    for i, shape in enumerate(polygons):
+    for i, polygon in enumerate(polygons):
         field = f"Polygon[{i}]"
-        _check_elements(builder, title, shape, _OF_POLYGON, field)
-        exterior = _rings(builder, title, shape, "outerBoundaryIs", field)
-        holes = _rings(builder, title, shape, "innerBoundaryIs", field)
-        if len(exterior) != 1:
-            raise InvalidObject(f"{field}.outerBoundaryIs", "a polygon has exactly one")
-        for mode in (e.text or "" for e in shape if _tag(e) == "altitudeMode"):
-            if mode.strip() not in {"", "clampToGround"}:
-                raise InvalidObject(
-                    f"{field}.altitudeMode",
-                    f"{mode.strip()} uses heights, which cannot be imported; clamp the polygon to the ground",
-                )
-        area = {"polygon": {"exterior": exterior[0]} | ({"holes": holes} if holes else {})}
-        builder.add(title, {"area": area} | ({"description": described} if described else {}), field)
+        _check_elements(builder, title, polygon, _OF_POLYGON, field)
+        build = functools.partial(_spec, builder, title, polygon, field, described)
+        builder.add(name, _shape(polygon), field, build)
+
+
+def _shape(element: ElementTree.Element) -> list[list[Any]]:
+    """Return the coordinates below an element without heights, for stable names. Invalid ones stay texts."""
+    texts = [e.text or "" for e in element.iter() if _tag(e) == "coordinates"]
+    try:
+        return [_positions(text, "") for text in texts]
+    except InvalidObject:
+        return [text.split() for text in texts]
+
+
+def _spec(builder: ZoneBuilder, title: str, polygon: ElementTree.Element, field: str, described: str) -> dict[str, Any]:
+    exterior = _rings(builder, title, polygon, "outerBoundaryIs", field)
+    holes = _rings(builder, title, polygon, "innerBoundaryIs", field)
+    if len(exterior) != 1:
+        raise InvalidObject(f"{field}.outerBoundaryIs", "a polygon has exactly one")
+    for mode in (e.text or "" for e in polygon if _tag(e) == "altitudeMode"):
+        if mode.strip() not in {"", "clampToGround"}:
+            raise InvalidObject(
+                f"{field}.altitudeMode",
+                f"{mode.strip()} uses heights, which cannot be imported; clamp the polygon to the ground",
+            )
+    area = {"polygon": {"exterior": exterior[0]} | ({"holes": holes} if holes else {})}
+    return {"area": area} | ({"description": described} if described else {})
 
 
 def _other_geometries(element: ElementTree.Element) -> list[ElementTree.Element]:
@@ -223,6 +246,7 @@ def zone_placemark(zone: Zone, notes: list[str]) -> str:
     description = f"<description>{escape(zone.spec.description)}</description>" if zone.spec.description else ""
     return (
         f"<Placemark><name>{escape(zone.name)}</name>{description}\n"
+        f'<ExtendedData><Data name="identifier"><value>{escape(zone.name)}</value></Data></ExtendedData>\n'
         f"<MultiGeometry>{polygons}</MultiGeometry></Placemark>\n"
     )
 

@@ -10,6 +10,7 @@ from typing import Any
 from fractus_core.api import InvalidObject, Zone
 from fractus_core.geo.formats.zone_builder import (
     Exported,
+    FeatureName,
     Imported,
     ZoneBuilder,
     circle_area,
@@ -50,14 +51,14 @@ def read_qgc_plan(text: str, without: Collection[str] = ()) -> Imported:
     builder = ZoneBuilder(without)
     for i, item in enumerate(object_list(fence.get("polygons"), "geoFence.polygons")):
         field = f"geoFence.polygons[{i}]"
-        title = f"polygon {i + 1}"
         kind = _kind(item, field)
-        builder.take(f"{kind} {title}", functools.partial(_read_polygon, builder, f"{kind} {title}", item, field, kind))
+        name = FeatureName(f"{kind} polygon {i + 1}", f"{kind} polygon")
+        builder.take(name, item, functools.partial(_read_polygon, builder, name, item, field, kind))
     for i, item in enumerate(object_list(fence.get("circles"), "geoFence.circles")):
         field = f"geoFence.circles[{i}]"
-        title = f"circle {i + 1}"
         kind = _kind(item, field)
-        builder.take(f"{kind} {title}", functools.partial(_read_circle, builder, f"{kind} {title}", item, field, kind))
+        name = FeatureName(f"{kind} circle {i + 1}", f"{kind} circle")
+        builder.take(name, item, functools.partial(_read_circle, builder, name, item, field, kind))
     if optional_object(document.get("mission"), "mission").get("items"):
         builder.note("mission", "its items are not zones; left out")
     if optional_object(document.get("rallyPoints"), "rallyPoints").get("points"):
@@ -74,23 +75,28 @@ def _kind(item: dict[str, Any], field: str) -> str:
     return "inclusion" if value else "exclusion"
 
 
-def _read_polygon(builder: ZoneBuilder, title: str, item: dict[str, Any], field: str, kind: str) -> None:
+def _read_polygon(builder: ZoneBuilder, name: FeatureName, item: dict[str, Any], field: str, kind: str) -> None:
     reject_unknown_fields(item, ("polygon", "inclusion", "version"), field)
     exterior = parse_ring(item.get("polygon"), f"{field}.polygon", lat_first=True)
-    _add(builder, title, {"polygon": {"exterior": exterior}}, field, kind)
+    _add(builder, name, item, {"polygon": {"exterior": exterior}}, field=field, kind=kind)
 
 
-def _read_circle(builder: ZoneBuilder, title: str, item: dict[str, Any], field: str, kind: str) -> None:
+def _read_circle(builder: ZoneBuilder, name: FeatureName, item: dict[str, Any], field: str, kind: str) -> None:
     reject_unknown_fields(item, ("circle", "inclusion", "version"), field)
     circle = optional_object(item.get("circle"), f"{field}.circle")
     reject_unknown_fields(circle, ("center", "radius"), f"{field}.circle")
     centre = parse_point(circle.get("center"), f"{field}.circle.center", lat_first=True)
-    _add(builder, title, circle_area(centre, circle.get("radius"), f"{field}.circle.radius"), field, kind)
+    _add(
+        builder, name, item, circle_area(centre, circle.get("radius"), f"{field}.circle.radius"), field=field, kind=kind
+    )
 
 
-def _add(builder: ZoneBuilder, title: str, area: dict[str, object], field: str, kind: str) -> None:
-    builder.add(title, {"area": area, "description": f"From a QGroundControl plan, for {kind}."}, field)
-    builder.note(title, f"a Zone forbids nothing by itself; add a GeofenceControl policy of kind {kind}")
+def _add(
+    builder: ZoneBuilder, name: FeatureName, item: dict[str, Any], area: dict[str, object], *, field: str, kind: str
+) -> None:
+    spec = {"area": area, "description": f"From a QGroundControl plan, for {kind}."}
+    builder.add(name, item, field, lambda: spec)
+    builder.note(name.title, f"a Zone forbids nothing by itself; add a GeofenceControl policy of kind {kind}")
 
 
 def write_qgc_plan(zones: Iterable[Zone], *, inclusion: bool = False) -> Exported:

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import hashlib
 import itertools
+import json
 import math
 import re
 import shlex
+from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeGuard
 
 import shapely
 
-from fractus_core.api import API_VERSION, InvalidObject, Zone
+from fractus_core.api import API_VERSION, GROUP, InvalidObject, Zone
 from fractus_core.api.geometry import MAX_RING_POINTS, Area, Circle, Point, Polygon
 from fractus_core.documents import BadDocument, parse_documents
 from fractus_core.geo.areas import area_center, area_polygon, center_of, multipolygon_geojson
@@ -21,6 +24,9 @@ from fractus_core.local_frame import LocalFrame
 
 DESCRIPTION_LENGTH = 1024
 """Longest description of a zone, in characters."""
+
+IMPORTED_NAME = f"{GROUP}/imported-name"
+"""Annotation of an imported Zone: the name that it has in the file."""
 
 MAX_RADIUS_M = 200_000.0
 """Largest radius of a circle."""
@@ -73,14 +79,73 @@ class _TooLarge(InvalidObject):
     """The file as a whole is too large."""
 
 
+@dataclass(frozen=True, slots=True)
+class FeatureName:
+    """Names of a feature of a file.
+
+    Attributes:
+        title: Name in messages and for `--leave-out`. It may depend on the order of the file.
+        given: Name in the file. Several features may share it.
+        identifier: Identifier of the authority, which stays the same in later versions of the file.
+    """
+
+    title: str
+    given: str = ""
+    identifier: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class _Part:
+    """A zone of a feature, or the problem that prevents its import."""
+
+    feature: FeatureName
+    shape: Any
+    zone: Zone | None
+    problem: InvalidObject | None
+
+    def names(self) -> Iterator[str]:
+        """Yield names of the zone, the preferred one first.
+
+        They depend on the feature alone: in an updated file, a zone keeps its name when others are added, removed or
+        reordered, and another zone never gets its name.
+        """
+        feature = self.feature
+        stem = _slug(feature.identifier or feature.given or "zone")
+        if feature.identifier:
+            same = stem == feature.identifier.lower()
+            yield stem if same else f"{stem}-{_digest(feature.identifier)}"
+        known = feature.identifier or feature.given
+        yield f"{stem}-{_digest([known, self.shape])}"
+        spec = self.zone.spec.to_dict() if self.zone is not None else None
+        yield f"{stem}-{_digest([known, self.shape, spec])}"
+
+
+def _slug(text: str) -> str:
+    return re.sub(r"[^a-z0-9]+", "-", text.lower()).strip("-")[:45].strip("-") or "zone"
+
+
+def _digest(value: Any) -> str:
+    """Return a digest of a value. Numbers are rounded to 6 decimals (0.1 m), as programs write them differently."""
+    text = json.dumps(_rounded(value), sort_keys=True, default=str)
+    return hashlib.sha256(text.encode("utf-8", "surrogatepass")).hexdigest()[:10]
+
+
+def _rounded(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(key): _rounded(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_rounded(item) for item in value]
+    return round(float(value), 6) + 0.0 if is_number(value) and abs(value) < 1e15 else value
+
+
 class ZoneBuilder:
-    """Collects the zones of a file, gives each a unique name, and validates them.
+    """Collects the zones of a file, gives each a unique and stable name, and validates them.
 
     A zone has exactly the area, altitude and time of the file, or the import fails. A larger exclusion zone would keep out
     permitted drones, and a larger inclusion zone would let drones leave the permitted area.
 
     Args:
-        without: Titles of features that are left out.
+        without: Titles of features, and names of zones, that are left out.
         drop: Names of properties that are left out although they may state the size, altitude or time of a zone.
     """
 
@@ -89,39 +154,49 @@ class ZoneBuilder:
         self._drop = drop
         self._dropped: set[str] = set()
         self._points = 0
-        self._zones: list[Zone] = []
-        self._names: set[str] = set()
+        self._parts: list[_Part] = []
         self._without = without
         self._left_out: set[str] = set()
-        self._wrong: list[InvalidObject] = []
 
-    def take(self, title: str, read: Callable[[], None]) -> None:
-        """Read a feature, unless its title is in `without`. If it cannot be read, store the problem for `result`."""
-        if title in self._without:
-            self._left_out.add(title)
-            self.note(title, "left out as requested")
+    def take(self, feature: FeatureName, shape: Any, read: Callable[[], None]) -> None:
+        """Read a feature, unless its title is in `without`. If it cannot be read, store the problem for `result`.
+
+        Args:
+            feature: Names of the feature.
+            shape: Its geometry in the file, for its stable name.
+            read: Function that adds its zones.
+        """
+        if feature.title in self._without:
+            self._leave_out(feature.title, feature.title)
             return
         try:
             read()
         except _TooLarge:
             raise
         except InvalidObject as error:
-            self._wrong.append(InvalidObject(error.field, f"{error.problem} (in {title})"))
+            self._parts.append(_Part(feature, shape, None, error))
 
-    def add(self, title: str, spec: Mapping[str, Any], location: str) -> None:
-        """Add a zone.
+    def add(self, feature: FeatureName, shape: Any, location: str, build: Callable[[], Mapping[str, Any]]) -> None:
+        """Add a zone of a feature. If it cannot be built, store the problem for `result`.
 
-        Raises:
-            InvalidObject: Its area is broken, or a value is out of range.
+        Args:
+            feature: Names of the feature.
+            shape: Area and altitude of the zone in the file, for its stable name.
+            location: Path of the zone in the file.
+            build: Function that returns the spec of the Zone.
         """
-        name = self._name(title)
-        manifest = {"apiVersion": API_VERSION, "kind": "Zone", "metadata": {"name": name}, "spec": dict(spec)}
         try:
-            zone = Zone.from_body(manifest)
-            area_polygon(LocalFrame.at(area_center(zone.spec.area)), zone.spec.area)
+            zone = _zone(build(), location)
+        except _TooLarge:
+            raise
         except InvalidObject as error:
-            raise InvalidObject(location, f"{error.field.removeprefix('spec.')}: {error.problem}") from None
-        self._zones.append(zone)
+            self._parts.append(_Part(feature, shape, None, error))
+        else:
+            self._parts.append(_Part(feature, shape, zone, None))
+
+    def _leave_out(self, name: str, title: str) -> None:
+        self._left_out.add(name)
+        self.note(title, "left out as requested")
 
     def described(self, title: str, text: str) -> str:
         """Return the description of a zone, cut to the maximum length with a note."""
@@ -157,7 +232,9 @@ class ZoneBuilder:
         ring = parse_ring(points, field, planar=planar)
         self._points += len(ring)
         if self._points > MAX_POINTS:
-            raise _TooLarge(field, f"the file needs more than {MAX_POINTS} points, for long sides some more; split it")
+            raise _TooLarge(
+                field, f"the file needs more than {MAX_POINTS} points, including points added on long sides; split it"
+            )
         return ring
 
     def properties(self, title: str, properties: Mapping[str, Any], known: Collection[str], field: str) -> None:
@@ -192,25 +269,66 @@ class ZoneBuilder:
             InexactFeatures: Some features cannot be represented exactly.
             InvalidObject: A feature to leave out, or a property to drop, does not exist.
         """
-        if self._wrong:
-            raise InexactFeatures(self._wrong)
+        names = _stable_names(self._parts)
+        titles = Counter(part.feature.title for part in self._parts)
+        zones: dict[str, Zone] = {}
+        wrong: list[InvalidObject] = []
+        for name, part in zip(names, self._parts, strict=True):
+            title = part.feature.title
+            if name in self._without:
+                self._leave_out(name, f"{title} ({name})")
+            elif part.problem is not None:
+                where = title if titles[title] == 1 else f"{title}, --leave-out {name}"
+                wrong.append(InvalidObject(part.problem.field, f"{part.problem.problem} (in {where})"))
+            elif name in zones:
+                self.note(title, "occurs twice with the same area, altitude and times; imported once")
+            elif part.zone is not None:
+                zones[name] = _named(part.zone, name, part.feature)
+        if wrong:
+            raise InexactFeatures(wrong)
         missing = sorted(set(self._without) - self._left_out)
         if missing:
             raise InvalidObject("", f"there is no feature {missing[0]} to leave out; correct its name")
         absent = sorted(set(self._drop) - self._dropped)
         if absent:
             raise InvalidObject("", f"there is no property {absent[0]} to drop; correct its name")
-        return Imported(tuple(self._zones), tuple(self.notes))
+        return Imported(tuple(zones.values()), tuple(self.notes))
 
-    def _name(self, title: str) -> str:
-        stem = re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-")[:56].strip("-") or "zone"
-        name = stem
-        count = 1
-        while name in self._names:
-            count += 1
-            name = f"{stem}-{count}"
-        self._names.add(name)
-        return name
+
+def _stable_names(parts: Sequence[_Part]) -> list[str]:
+    """Return the name of each part: its first name that no other part has, or its last one."""
+    names = [""] * len(parts)
+    pending = {i: list(part.names()) for i, part in enumerate(parts)}
+    while pending:
+        counts = Counter(choices[0] for choices in pending.values())
+        for i, choices in tuple(pending.items()):
+            if counts[choices[0]] == 1 or len(choices) == 1:
+                names[i] = choices[0]
+                del pending[i]
+            else:
+                del choices[0]
+    return names
+
+
+def _zone(spec: Mapping[str, Any], location: str) -> Zone:
+    """Return a Zone without its final name.
+
+    Raises:
+        InvalidObject: Its area is broken, or a value is out of range.
+    """
+    manifest = {"apiVersion": API_VERSION, "kind": "Zone", "metadata": {"name": "zone"}, "spec": dict(spec)}
+    try:
+        zone = Zone.from_body(manifest)
+        area_polygon(LocalFrame.at(area_center(zone.spec.area)), zone.spec.area)
+    except InvalidObject as error:
+        raise InvalidObject(location, f"{error.field.removeprefix('spec.')}: {error.problem}") from None
+    return zone
+
+
+def _named(zone: Zone, name: str, feature: FeatureName) -> Zone:
+    annotations = {IMPORTED_NAME: feature.given[:DESCRIPTION_LENGTH]} if feature.given else {}
+    metadata = zone.metadata.model_copy(update={"name": name, "annotations": annotations})
+    return zone.model_copy(update={"metadata": metadata})
 
 
 def parse_json(text: str) -> dict[str, Any]:

@@ -12,6 +12,7 @@ from typing import IO, Any, cast
 from xml.sax.saxutils import escape
 
 from fractus_core.api import Zone
+from fractus_core.geo import cut_path
 from fractus_core.geo.formats.kml import kml_document, zone_placemark
 from fractus_services.recording.map_features import Feature, to_feature
 from fractus_services.recording.messages import audit_records, component_of, finite_number, location, sentence, zones
@@ -69,6 +70,17 @@ class _Path:
     times: list[int] = field(default_factory=list)
     points: list[tuple[float, float, float]] = field(default_factory=list)
 
+    def parts(self) -> list[list[tuple[float, ...]]]:
+        """Return the lines between crossings of the antimeridian.
+
+        A point is its longitude, latitude, altitude and time in nanoseconds after the first one.
+        """
+        # Nanoseconds since 1970 exceed the precision of floats.
+        after_ns = [float(time_ns - self.times[0]) for time_ns in self.times]
+        parts = cut_path([(*point, time_ns) for point, time_ns in zip(self.points, after_ns, strict=True)])
+        # A path that begins or ends at the antimeridian has a part of one point there.
+        return [part for part in parts if len(part) > 1] or parts[:1]
+
 
 @dataclass(slots=True)
 class _DroneFlights:
@@ -113,13 +125,13 @@ def write_geojson(export: Export, out: IO[bytes]) -> None:
     features: list[Feature] = []
     by_node = _flights_by_node(export.entries)
     for path in (path for flights in by_node.values() for path in flights.paths):
-        positions = [list(point) for point in path.points]
-        is_line = len(positions) > 1
+        line, times = _path_geometry(path)
         features.append({
             "type": "Feature",
-            "properties": {"kind": "path", "node": path.node, "begin": _iso(path.times[0]), "end": _iso(path.times[-1])}
-            | ({"times": [_iso(time_ns) for time_ns in path.times]}),
-            "geometry": {"type": "LineString" if is_line else "Point", "coordinates": positions if is_line else positions[0]},
+            "properties": {
+                "kind": "path", "node": path.node, "begin": _iso(path.times[0]), "end": _iso(path.times[-1]), "times": times,
+            },
+            "geometry": line,
         })  # fmt: skip
     for entry, at in (decision for flights in by_node.values() for decision in flights.decisions):
         geometry = {"type": "Point", "coordinates": list(at)} if at is not None else None
@@ -127,6 +139,18 @@ def write_geojson(export: Export, out: IO[bytes]) -> None:
     features += export.areas.features()
     document: dict[str, Any] = {"type": "FeatureCollection", "verified": not export.problems, "features": features}
     out.write(json.dumps(document, ensure_ascii=False, indent=1).encode() + b"\n")
+
+
+def _path_geometry(path: _Path) -> tuple[dict[str, Any], list[Any]]:
+    """Return the geometry of a path and the times of its positions: a list per line if it crosses the antimeridian."""
+    parts = path.parts()
+    lines = [[list(point[:3]) for point in part] for part in parts]
+    times = [[_iso(path.times[0] + round(point[3])) for point in part] for part in parts]
+    if len(lines) > 1:
+        return {"type": "MultiLineString", "coordinates": lines}, times
+    if len(lines[0]) > 1:
+        return {"type": "LineString", "coordinates": lines[0]}, times[0]
+    return {"type": "Point", "coordinates": lines[0][0]}, times[0]
 
 
 def _decision_properties(entry: Entry) -> dict[str, Any]:
@@ -155,10 +179,15 @@ def _folder(node: str, flights: _DroneFlights) -> str:
 def _line(path: _Path) -> str:
     begin = _iso(path.times[0])
     end = _iso(path.times[-1])
+    parts = path.parts()
+    lines = "".join(
+        f"<LineString><altitudeMode>absolute</altitudeMode><coordinates>{' '.join(map(_coordinates, part))}</coordinates>"
+        "</LineString>"
+        for part in parts
+    )
     return (
         f"<Placemark><name>flight {begin}</name><TimeSpan><begin>{begin}</begin><end>{end}</end></TimeSpan>"
-        f"<LineString><altitudeMode>absolute</altitudeMode><coordinates>{' '.join(map(_coordinates, path.points))}</coordinates>"
-        "</LineString></Placemark>\n"
+        f"{lines if len(parts) == 1 else f'<MultiGeometry>{lines}</MultiGeometry>'}</Placemark>\n"
     )
 
 
@@ -171,8 +200,8 @@ def _point(entry: Entry, at: tuple[float, float, float]) -> str:
     )
 
 
-def _coordinates(point: tuple[float, float, float]) -> str:
-    lon, lat, amsl = point
+def _coordinates(point: tuple[float, ...]) -> str:
+    lon, lat, amsl, *_ = point
     return f"{lon!r},{lat!r},{amsl:.2f}"
 
 

@@ -42,7 +42,10 @@ def entries() -> list[dict[str, Any]]:
 @pytest.fixture
 async def log(tmp_path: Path, entries: list[dict[str, Any]]) -> Path:
     """Audit log of a flight, written by AuditLog."""
-    path = tmp_path / "audit" / "mobility.jsonl"
+    return await write_log(tmp_path / "audit" / "mobility.jsonl", entries)
+
+
+async def write_log(path: Path, entries: list[dict[str, Any]]) -> Path:
     now = 0.0
     writer = AuditLog(path, lambda: now)
     for entry in entries:
@@ -81,6 +84,29 @@ def test_geojson_has_path_decisions_takeovers_and_zones(log: Path, entries: list
     assert takeover["properties"]["reason"] == "the driver left the zone"
     names = {f["properties"]["name"]: shapely.geometry.shape(f["geometry"]) for f in features_of["zone"]}
     assert names and all(shape.is_valid and shape.area > 0 for shape in names.values())
+
+
+async def test_path_across_the_antimeridian_is_cut_in_geojson_and_kml(
+    tmp_path: Path, entries: list[dict[str, Any]]
+) -> None:
+    middle = sum(e["lon"] for e in entries if e["kind"] == "state") / sum(e["kind"] == "state" for e in entries)
+    moved = [
+        entry | {"lon": (entry["lon"] - middle + 360.0) % 360.0 - 180.0} if "lon" in entry else entry
+        for entry in entries
+    ]
+    log = await write_log(tmp_path / "audit" / "mobility.jsonl", moved)
+    collection = json.loads(run("export", log, "--to", "geojson").stdout)
+    (path,) = (f for f in collection["features"] if f["properties"]["kind"] == "path")
+    assert path["geometry"]["type"] == "MultiLineString"
+    lines = path["geometry"]["coordinates"]
+    assert [len(times) for times in path["properties"]["times"]] == [len(line) for line in lines]
+    assert len({time for times in path["properties"]["times"] for time in times}) > 10
+    root = ElementTree.fromstring(run("export", log, "--to", "kml").stdout)
+    texts = [e.text or "" for e in root.iter("{http://www.opengis.net/kml/2.2}coordinates") if " " in (e.text or "")]
+    lines += [[list(map(float, group.split(","))) for group in text.split()] for text in texts]
+    assert len(lines) >= 4
+    for line in lines:
+        assert max(lon for lon, *_ in line) - min(lon for lon, *_ in line) < 1.0, "the line goes around the world"
 
 
 def test_monitor_decision_has_last_position_of_the_drone(log: Path, entries: list[dict[str, Any]]) -> None:

@@ -15,6 +15,7 @@ from fractus_core.geo import (
     center_of,
     corridor,
     count_crossings,
+    cut_path,
     geodesic_m,
     multipolygon_geojson,
 )
@@ -230,3 +231,24 @@ def test_geojson_rings_across_the_antimeridian_are_closed_without_repeated_corne
                 for ring in part:
                     assert ring[0] == ring[-1]
                     assert all(a != b for a, b in itertools.pairwise(ring))
+
+
+def test_path_across_the_antimeridian_is_cut_with_interpolated_values():
+    path = [(179.9, 10.0, 30.0), (-179.7, 10.4, 34.0), (-179.9, 10.0, 30.0), (179.9, 10.0, 30.0)]
+    first, second, third = cut_path(path)
+    assert first == [path[0], pytest.approx((180.0, 10.1, 31.0))]
+    assert second == [pytest.approx((-180.0, 10.1, 31.0)), *path[1:3], pytest.approx((-180.0, 10.0, 30.0))]
+    assert third == [pytest.approx((180.0, 10.0, 30.0)), path[3]]
+
+
+@pytest.mark.parametrize("edge", [180.0, -180.0])
+def test_path_that_touches_the_antimeridian_has_no_leg_around_the_world(edge):
+    for path in ([(179.9, 1.0), (edge, 1.0), (-179.9, 1.0)], [(179.9, 1.0), (edge, 1.0), (179.9, 1.0)]):
+        parts = cut_path(path)
+        assert all(abs(a[0] - b[0]) < 1 for part in parts for a, b in itertools.pairwise(part))
+        assert all(parts)
+
+
+def test_path_without_a_crossing_is_one_part():
+    assert cut_path([(1.0, 2.0), (3.0, 4.0)]) == [[(1.0, 2.0), (3.0, 4.0)]]
+    assert cut_path([]) == []

@@ -146,9 +146,58 @@ def test_polygons_across_the_antimeridian_survive_the_round_trip_in_parts(name):
     assert shapely.union_all(parts).symmetric_difference(whole).area < 1e-4 * whole.area
 
 
-def test_geojson_export_notes_zones_around_a_pole():
-    polar = zone("n", {"circle": {"center": {"lat": 90.0, "lon": 0.0}, "radius": 500}})
-    assert any("contains a pole" in note for note in formats.write_geojson([polar]).notes)
+AROUND_POLE = zone("n", {"polygon": {"exterior": [{"lat": 89.9995, "lon": lon} for lon in (0, 90, 180, -90)]}})
+
+
+@pytest.mark.parametrize("name", ["geojson", "ed269"])
+def test_export_refuses_a_polygon_around_a_pole_that_an_import_would_refuse(name):
+    with pytest.raises(
+        InvalidObject, match=r"n: spec\.area: contains a pole, around which .* has no polygon; export it"
+    ):
+        WRITERS[name][0]([AROUND_POLE])
+
+
+@pytest.mark.parametrize("lat", [90.0, -90.0, 89.9999, 89.9995, -89.9992])
+@pytest.mark.parametrize("radius", [5, 50, 500])
+@pytest.mark.parametrize("name", WRITERS)
+def test_zone_near_a_pole_that_is_exported_can_be_imported(name, lat, radius):
+    write, read = WRITERS[name]
+    near = zone("n", {"circle": {"center": {"lat": lat, "lon": 179.99}, "radius": radius}})
+    try:
+        text = write([near]).text
+    except InvalidObject:
+        return
+    frame = LocalFrame(lat, 0.0)
+    parts = [area_polygon(frame, z.spec.area) for z in read(text).zones]
+    meant = area_polygon(frame, near.spec.area)
+    assert shapely.union_all(parts).symmetric_difference(meant).area < 0.01 * meant.area
+
+
+@pytest.mark.parametrize("name", ["geojson", "ed269"])
+@pytest.mark.parametrize(
+    "corners",
+    [
+        [(50, 4), (50, 6), (50.5, 6), (50.5, 4)],
+        [(-60, 179), (-60, -179), (-60.5, -179), (-60.5, 179)],
+        [(89.9994, 20), (89.9994, 160), (89.9994, 90)],
+        [(89.9994, 110), (89.9994, -110), (89.9994, 180)],
+    ],
+)
+def test_long_sides_survive_export_and_import(name, corners):
+    """The middle of a side of 140 km is 470 m beside its parallel."""
+    large = zone("n", {"polygon": {"exterior": [{"lat": lat, "lon": lon} for lat, lon in corners]}})
+    write, read = WRITERS[name]
+    frame = LocalFrame.at(area_center(large.spec.area))
+    parts = [area_polygon(frame, z.spec.area) for z in read(write([large]).text).zones]
+    meant = area_polygon(frame, large.spec.area)
+    assert shapely.union_all(parts).symmetric_difference(meant).area < 0.6 * meant.length
+    assert shapely.union_all(parts).symmetric_difference(meant).area < 0.01 * meant.area
+
+
+def test_qgc_plan_export_notes_polygons_across_the_antimeridian():
+    corners = [{"lat": lat, "lon": lon} for lat, lon in ((1, 179.99), (1, -179.99), (1.01, -179.99))]
+    notes = formats.write_qgc_plan([zone("a", {"polygon": {"exterior": corners}})]).notes
+    assert notes == ("a: it crosses the antimeridian; QGroundControl draws it around the world",)
 
 
 HIGH = {"type": "Polygon", "coordinates": [[[lon, lat, 30] for lon, lat in SQUARE]]}

@@ -1,5 +1,6 @@
 """Local frames, distances and areas on the WGS 84 ellipsoid."""
 
+from fractus_core.geo.antimeridian import cut_path as cut_path
 from fractus_core.geo.areas import area_center as area_center
 from fractus_core.geo.areas import area_polygon as area_polygon
 from fractus_core.geo.areas import areas_of_shape as areas_of_shape

@@ -26,6 +26,7 @@ from fractus_core.geo.formats.zone_builder import (
     optional_object,
     parse_json,
     parse_point,
+    reject_poles,
     reject_unknown_fields,
     unsupported_parts,
 )
@@ -286,9 +287,10 @@ def write_ed269(zones: Iterable[Zone], *, country: str = "XXX", restriction: str
     """Return a feature for each zone. Required fields that a Zone does not have are filled in, with a note.
 
     Raises:
-        InvalidObject: An altitude is measured from home, for which ED-269 has no datum.
+        InvalidObject: An altitude is measured from home, for which ED-269 has no datum, or a polygon contains a pole.
     """
     zones = tuple(zones)
+    reject_poles((zone for zone in zones if zone.spec.area.circle is None), "around which ED-269 has no polygon")
     notes = unsupported_parts(zones)
     features = []
     for zone in zones:

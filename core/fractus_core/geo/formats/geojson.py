@@ -23,6 +23,7 @@ from fractus_core.geo.formats.zone_builder import (
     parse_json,
     parse_point,
     reject_outlines,
+    reject_poles,
     reject_unknown_fields,
     unsupported_parts,
 )
@@ -241,8 +242,12 @@ def write_geojson(zones: Iterable[Zone]) -> Exported:
     """Return a FeatureCollection with a polygon for each zone, cut at the antimeridian.
 
     `read_geojson` reads it back.
+
+    Raises:
+        InvalidObject: A zone contains a pole.
     """
     zones = tuple(zones)
+    reject_poles(zones, "around which GeoJSON has no polygon")
     notes = unsupported_parts(zones, "circle")
     features = [zone_feature(zone, notes) for zone in zones]
     text = json.dumps({"type": "FeatureCollection", "features": features}, indent=1) + "\n"

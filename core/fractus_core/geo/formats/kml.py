@@ -102,7 +102,7 @@ def _check_elements(
     builder: ZoneBuilder, title: str, element: ElementTree.Element, known: Collection[str], field: str = ""
 ) -> None:
     """Note unknown elements and data, and reject those that may state the size, altitude or time of a zone."""
-    unknown = {_tag(child): _contents(child) for child in element if _tag(child) not in known | _DATA}
+    unknown = {_tag(child): _contents(child) for child in element if _tag(child) not in {*known, *_DATA}}
     builder.properties(title, unknown, (), field)
     builder.properties(title, _data(element), ("identifier",), "ExtendedData")
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import itertools
 import json
 from collections.abc import Collection, Iterable
 from typing import Any
@@ -112,6 +113,7 @@ def write_qgc_plan(zones: Iterable[Zone], *, inclusion: bool = False) -> Exporte
         raise InvalidObject(
             "", f"{lost[0].removesuffix('; left out')}; an inclusion fence would be larger than the zone"
         )
+    notes = unsupported_parts(zones, "altitude", "schedule", "holes")
     polygons = []
     circles = []
     for zone in zones:
@@ -122,6 +124,8 @@ def write_qgc_plan(zones: Iterable[Zone], *, inclusion: bool = False) -> Exporte
             circles.append({"circle": circle, "inclusion": inclusion, "version": 1})
         elif area.polygon is not None:
             corners = [[p.lat, p.lon] for p in area.polygon.exterior]
+            if any(abs(a[1] - b[1]) > 180 for a, b in itertools.pairwise([*corners, corners[0]])):
+                notes.append(f"{zone.name}: it crosses the antimeridian; QGroundControl draws it around the world")
             polygons.append({"polygon": corners, "inclusion": inclusion, "version": 1})
     mission = {
         "cruiseSpeed": 15, "firmwareType": 3, "globalPlanAltitudeMode": 1, "hoverSpeed": 5, "items": [],
@@ -135,6 +139,4 @@ def write_qgc_plan(zones: Iterable[Zone], *, inclusion: bool = False) -> Exporte
         "rallyPoints": {"points": [], "version": 2},
         "version": 1,
     }
-    return Exported(
-        json.dumps(document, indent=2) + "\n", tuple(unsupported_parts(zones, "altitude", "schedule", "holes"))
-    )
+    return Exported(json.dumps(document, indent=2) + "\n", tuple(notes))

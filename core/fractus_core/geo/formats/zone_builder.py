@@ -468,7 +468,8 @@ def _simplified(ring: Sequence[Any], field: str) -> list[tuple[float, float]]:
 def _pieces(start: Point, end: Point) -> int:
     """Return the number of parts of a straight line of degrees that bend by at most `MAX_BEND_M` each."""
     lat = math.radians(min(max(abs(start.lat), abs(end.lat)), 89.0))
-    width_m = math.radians(abs(end.lon - start.lon)) * math.cos(lat) * EARTH_RADIUS_M
+    lon_deg = abs(end.lon - start.lon)
+    width_m = math.radians(min(lon_deg, 360.0 - lon_deg)) * math.cos(lat) * EARTH_RADIUS_M
     return max(math.ceil(math.sqrt(width_m**2 * math.tan(lat) / (8 * EARTH_RADIUS_M) / MAX_BEND_M)), 1)
 
 
@@ -520,19 +521,50 @@ def area_rings(area: Area) -> list[list[list[float]]]:
 
 
 def cut_rings(zone: Zone, notes: list[str]) -> list[list[list[list[float]]]]:
-    """Return closed rings of the parts of an area, cut at the antimeridian. Adds a note if it is cut."""
-    outline = area_rings(zone.spec.area)
+    """Return closed rings of the parts of an area, cut at the antimeridian. Adds a note if it is cut.
+
+    Long sides get intermediate points, so that programs that draw them as straight lines of degrees deviate from the zone by
+    at most `MAX_BEND_M`.
+    """
+    frame = LocalFrame.at(area_center(zone.spec.area))
+    outline = [_with_points_between(frame, ring) for ring in area_rings(zone.spec.area)]
     crossings = sum(abs(a[0] - b[0]) > 180 for a, b in itertools.pairwise(outline[0]))
     if crossings % 2:
         notes.append(f"{zone.name}: it contains a pole; programs that draw a flat map display it incorrectly")
     elif crossings:
-        frame = LocalFrame.at(area_center(zone.spec.area))
         notes.append(f"{zone.name}: it crosses the antimeridian and is cut there, into parts")
-        parts: list[list[list[list[float]]]] = multipolygon_geojson(frame, area_polygon(frame, zone.spec.area))[
+        exterior, *holes = [[frame.xy(lat, lon) for lon, lat in ring] for ring in outline]
+        parts: list[list[list[list[float]]]] = multipolygon_geojson(frame, shapely.Polygon(exterior, holes))[
             "coordinates"
         ]
         return parts
     return [outline]
+
+
+def _with_points_between(frame: LocalFrame, ring: list[list[float]]) -> list[list[float]]:
+    """Return a closed ring of lon, lat with points on the sides that bend between degrees."""
+    points = []
+    for start, end in itertools.pairwise(ring):
+        points.append(start)
+        pieces = _pieces(Point(lat=start[1], lon=start[0]), Point(lat=end[1], lon=end[0]))
+        start_xy = frame.xy(start[1], start[0])
+        end_xy = frame.xy(end[1], end[0])
+        for share in (i / pieces for i in range(1, pieces)):
+            lat, lon = frame.latlon(*(a + (b - a) * share for a, b in zip(start_xy, end_xy, strict=True)))
+            points.append([round(lon, 9), round(lat, 9)])
+    return [*points, ring[-1]]
+
+
+def reject_poles(zones: Iterable[Zone], problem: str) -> None:
+    """Reject polygons around a pole for formats whose edges are straight lines of degrees.
+
+    Raises:
+        InvalidObject: A zone contains a pole.
+    """
+    for zone in zones:
+        (outline, *_) = area_rings(zone.spec.area)
+        if sum(abs(a[0] - b[0]) > 180 for a, b in itertools.pairwise(outline)) % 2:
+            raise InvalidObject(f"{zone.name}: spec.area", f"contains a pole, {problem}; export it to kml or qgc-plan")
 
 
 def _circumscribed(circle: Circle | None) -> Polygon:

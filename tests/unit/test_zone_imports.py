@@ -516,3 +516,23 @@ def test_ed269_export_gives_a_zone_the_same_identifier_in_every_file():
     exported = [json.loads(formats.write_ed269(zones).text)["features"] for zones in ([BLOCK, ROUND], [ROUND])]
     assert exported[0][1]["identifier"] == exported[1][0]["identifier"]
     assert re.fullmatch("[0-9A-Z]{7}", exported[1][0]["identifier"])
+
+
+@pytest.mark.parametrize("odd", [{}, [], 5, None, True])
+def test_value_of_another_type_is_refused_with_a_sentence(odd):
+    circle = {"type": odd, "center": [4.0, 50.0], "radius": 500}
+    volume = {"upperLimit": 5, "upperVerticalReference": odd, "horizontalProjection": circle}
+    crs = {"crs": {"properties": {"name": odd or [1]}}}
+    files = [
+        (formats.read_geojson, {"type": odd}),
+        (formats.read_geojson, feature({"type": odd, "coordinates": SQUARE})),
+        (formats.read_geojson, feature({"type": "GeometryCollection", "geometries": [FLAT, {"type": odd}]})),
+        (formats.read_geojson, feature(FLAT) | crs),
+        (formats.read_ed269, {"features": [{"geometry": [volume]}]}),
+        (formats.read_ed269, {"features": [{"geometry": [volume | {"upperVerticalReference": "AGL"}]}]}),
+        (formats.read_ed318, json.loads(ed318({**FLAT, "layer": LAYER | {"lowerReference": odd}}))),
+        (formats.read_ed318, json.loads(ed318({"type": odd}))),
+    ]
+    for read, document in files:
+        with pytest.raises(InvalidObject):
+            read(json.dumps(document))

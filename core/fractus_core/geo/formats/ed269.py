@@ -145,7 +145,7 @@ def _area(builder: ZoneBuilder, title: str, volume: dict[str, Any], field: str) 
     path = f"{field}.horizontalProjection"
     projection = optional_object(volume.get("horizontalProjection"), path)
     shape = projection.get("type")
-    if shape not in _OF_PROJECTION:
+    if not isinstance(shape, str) or shape not in _OF_PROJECTION:
         raise InvalidObject(f"{path}.type", f"must be Polygon or Circle, not {shape!r}")
     reject_unknown_fields(projection, _OF_PROJECTION[shape], path)
     if shape == "Polygon":
@@ -192,7 +192,7 @@ def read_band(
             raise InvalidObject(f"{field}.{name}", f"must be a number, not {value!r:.40}")
         if side == "lower" and value <= 0 and datum == "AGL":
             continue
-        if datum not in _REFERENCES:
+        if not isinstance(datum, str) or datum not in _REFERENCES:
             raise InvalidObject(f"{field}.{datum_name}", f"must be AGL or AMSL, not {datum!r:.40}; convert it")
         limit_m = round(value * metres, 3)
         if (side == "upper" and limit_m > MAX_ALTITUDE_M) or (side == "lower" and limit_m < MIN_ALTITUDE_M):

@@ -36,10 +36,10 @@ _OF_COLLECTION = _OF_FEATURE | {
 }  # fmt: skip
 """Members of a FeatureCollection that do not affect zones: those of GeoJSON, and those that map servers add."""
 _OF_GEOMETRY = frozenset({"type", "coordinates", "geometries", "bbox", "crs"})
-_AREAS = frozenset({"Polygon", "MultiPolygon", "GeometryCollection"})
+_AREAS = ("Polygon", "MultiPolygon", "GeometryCollection")
 _STYLE = frozenset({"fill", "fill-opacity", "stroke", "stroke-width", "stroke-opacity", "marker-color"})
-_LINES = frozenset({"LineString", "MultiLineString"})
-_POINTS = frozenset({"Point", "MultiPoint"})
+_LINES = ("LineString", "MultiLineString")
+_POINTS = ("Point", "MultiPoint")
 _WGS84 = frozenset(
     {
         "urn:ogc:def:crs:OGC:1.3:CRS84",
@@ -113,7 +113,7 @@ def _check_system(value: dict[str, Any], field: str) -> None:
         return
     named = system.get("properties") if isinstance(system, dict) else None
     name = named.get("name") if isinstance(named, dict) else None
-    if name not in _WGS84:
+    if not isinstance(name, str) or name not in _WGS84:
         raise InvalidObject(field, f"must be WGS 84, not {name or 'an unnamed one'}; convert the file to OGC:CRS84")
 
 

@@ -133,6 +133,7 @@ class Control:
         self.yaw_setpoint = 0.0
         self._integral = [0.0, 0.0, 0.0]
         self._stopping = False
+        self._stopped = False
         self._braking_mps2 = 0.0
         self.thrust_share = 0.0
         self.thrust_demand_n = (0.0, 0.0, 0.0, 0.0)  # thrust demand of each motor
@@ -154,6 +155,17 @@ class Control:
         self.throttle = None
         self.attitude = (0.0, 0.0)
         self._integral = [0.0, 0.0, 0.0]
+
+    def shift(self, north: float, east: float) -> None:
+        """Move the trajectory with an estimate that was reset, as ArduCopter does.
+
+        A vehicle that flies with a velocity, or has stopped, therefore does not move. A vehicle that flies to a point corrects its
+        course.
+        """
+        self.pos[0] += north
+        self.pos[1] += east
+        if self._stopped:
+            self.target = (self.target[0] + north, self.target[1] + east)
 
     def hold_position(self) -> None:
         """Stop as soon as the limits allow, then hold position and altitude."""
@@ -181,7 +193,7 @@ class Control:
     def go_to(self, north: float, east: float, down: float | None = None) -> None:
         """Fly to a point and hold it. Without `down` the vertical target is unchanged."""
         self.horizontal = Axis.POSITION
-        self._stopping = False
+        self._stopping = self._stopped = False
         self.target = (north, east)
         self.target_velocity = (0.0, 0.0)
         if down is not None:
@@ -224,6 +236,7 @@ class Control:
         acc = self.acc
         if self._stopping and math.hypot(vel[0], vel[1]) < STOPPED_MPS:
             self.go_to(pos[0], pos[1])
+            self._stopped = True
         velocity = (vel[0], vel[1])
         bend = (acc[0], acc[1])
         if self.horizontal is Axis.POSITION:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import random
 from collections.abc import Callable
 
@@ -9,12 +10,20 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fractus_vehicle.body import Body, euler_of
 from fractus_vehicle.control import Estimate
-from fractus_vehicle.earth import Place
+from fractus_vehicle.earth import UNIT, Place
 from fractus_vehicle.params import Parameters
 from fractus_vehicle.sensors import Drift, Gps
 
 GPS_INTERVAL_S = 0.2
 GPS_TIMEOUT_S = 7.0
+
+# Reaction to a wrong GPS position, as measured on a real autopilot. The estimator rejects a fix that is farther from its
+# estimate than the gate. A smaller difference is followed within seconds.
+GPS_GATE_M = 5.0
+GPS_FUSION_S = 1.5
+GLITCH_REPORTED_S = 1.0
+GLITCH_ACCEPTED_S = 8.5
+GLITCH_CLEARED_S = 11.5
 
 # Times of startup events, as measured on a real autopilot that is ready after FULL_START_S. A different `ready_after_s`
 # scales all of them.
@@ -100,6 +109,11 @@ class Estimator:
         self._fix_s = -1e9
         self._announced = 0
         self._finally_aligned = False
+        self._gps_error = (0.0, 0.0)  # north and east error of the estimate that it took from the GPS, in metres
+        self._rejected_since_s: float | None = None
+        self._rejected_s = -math.inf
+        self._glitching = False
+        self._shift = (0.0, 0.0)
 
     def since_boot(self, boot_s: float) -> bool:
         """Return True if startup has reached the event that a full startup reaches after `boot_s` seconds."""
@@ -129,7 +143,7 @@ class Estimator:
     def flags(self) -> int:
         """Flags of EKF_STATUS_REPORT."""
         if self.position_ok:
-            return _FLAGS_READY
+            return _FLAGS_READY | (mavlink.EKF_GPS_GLITCHING if self._glitching else 0)
         if not self.aligned:
             return mavlink.EKF_UNINITIALIZED
         return _FLAGS_NO_POSITION if self.origin is not None else _FLAGS_STARTING
@@ -140,8 +154,8 @@ class Estimator:
         quaternion = _tilted(body.quaternion, drift.tilt)
         roll, pitch, yaw = euler_of(quaternion)
         return Estimate(
-            body.north + drift.north,
-            body.east + drift.east,
+            body.north + drift.north + self._gps_error[0],
+            body.east + drift.east + self._gps_error[1],
             body.down + drift.down,
             body.vn + drift.rate_n,
             body.ve + drift.rate_e,
@@ -162,8 +176,9 @@ class Estimator:
             return
         self._next_fix_s += GPS_INTERVAL_S
         if not int(self._params["SIM_GPS_DISABLE"]) and self.since_boot(FIRST_FIX_S):
+            glitch_n, glitch_e, glitch_d = self._glitch()
             self.gps.update(
-                self._start.offset(body.north, body.east, body.down),
+                self._start.offset(body.north + glitch_n, body.east + glitch_e, body.down + glitch_d),
                 (body.vn, body.ve),
                 noise_m=max(self._params["SIM_GPS_NOISE"], 0.0) + self._noise_m,
                 satellites=int(self._params["SIM_GPS_NUMSATS"]),
@@ -175,6 +190,47 @@ class Estimator:
             self.gps.lose()
         self._announce(body)
         self._update_position(time_s)
+        if self.position_ok and self._fix_s == time_s:
+            self._follow_gps(time_s)
+
+    def take_shift(self) -> tuple[float, float]:
+        """Return by how far the estimate was reset to the GPS position since the last call, north and east in metres."""
+        shift = self._shift
+        self._shift = (0.0, 0.0)
+        return shift
+
+    def _glitch(self) -> tuple[float, float, float]:
+        """Return the error of the GPS position (north, east, down) in metres."""
+        north_deg, east_deg, up_m = (self._params[f"SIM_GPS_GLITCH_{axis}"] for axis in "XYZ")
+        start = self._start
+        wrong = Place(start.lat_e7 + round(north_deg / UNIT), start.lon_e7 + round(east_deg / UNIT), start.alt_m + up_m)
+        return start.vector_to(wrong)
+
+    def _follow_gps(self, time_s: float) -> None:
+        """Follow the GPS position, or reject it while it is too far away. After a long rejection, jump to it."""
+        glitch_n, glitch_e, _ = self._glitch()
+        off_n = glitch_n - self._gps_error[0]
+        off_e = glitch_e - self._gps_error[1]
+        follow = 1.0 - math.exp(-GPS_INTERVAL_S / GPS_FUSION_S)
+        if math.hypot(off_n, off_e) > GPS_GATE_M:
+            if self._rejected_since_s is None:
+                self._rejected_since_s = time_s
+            self._rejected_s = time_s
+            follow = 0.0
+            if time_s - self._rejected_since_s >= GLITCH_ACCEPTED_S - GPS_INTERVAL_S / 2:
+                self._shift = (self._shift[0] + off_n, self._shift[1] + off_e)
+                self._rejected_since_s = None
+                follow = 1.0
+        else:
+            self._rejected_since_s = None
+        self._gps_error = (self._gps_error[0] + follow * off_n, self._gps_error[1] + follow * off_e)
+        since_s = self._rejected_since_s
+        if since_s is not None and time_s - since_s >= GLITCH_REPORTED_S and not self._glitching:
+            self._glitching = True
+            self._send_text(mavlink.MAV_SEVERITY_CRITICAL, "GPS Glitch or Compass error")
+        elif self._glitching and time_s - self._rejected_s >= GLITCH_CLEARED_S:
+            self._glitching = False
+            self._send_text(mavlink.MAV_SEVERITY_CRITICAL, "Glitch cleared")
 
     def _announce(self, body: Body) -> None:
         """Send the STATUSTEXTs of the startup sequence and of the first climb."""

@@ -26,7 +26,11 @@ WIRE_TYPES = {
 }
 """MAV_PARAM_TYPE that PARAM_VALUE reports for each type of the table."""
 # Names of later ArduCopter releases for the same parameters.
-ALIASES = {"MAV_GCS_SYSID": "SYSID_MYGCS", "MAV_SYSID": "SYSID_THISMAV"}
+ALIASES = {
+    "MAV_GCS_SYSID": "SYSID_MYGCS",
+    "MAV_SYSID": "SYSID_THISMAV",
+    **{f"SIM_GPS1_GLTCH_{axis}": f"SIM_GPS_GLITCH_{axis}" for axis in "XYZ"},
+}
 # Item counts and the system id. Unlike on a real autopilot, clients cannot change them.
 READ_ONLY = frozenset({"MIS_TOTAL", "FENCE_TOTAL", "RALLY_TOTAL", "SYSID_THISMAV"})
 # Tolerance for rounding errors, which is added to a value before its truncation to an integer.

@@ -248,3 +248,67 @@ def test_fence_action_is_land_far_outside_fence():
     assert pilot.command(mavlink.MAV_CMD_DO_FENCE_ENABLE, 1) == mavlink.MAV_RESULT_ACCEPTED
     pilot.wait(lambda: vehicle.mode == mavlink.COPTER_MODE_LAND, 3.0)
     assert "Circle fence breached" in pilot.texts
+
+
+GLITCH_DEG = 0.0003
+GLITCHING = 33599
+"""Flags of EKF_STATUS_REPORT of a real ArduCopter during a GPS glitch. Without one they are 831."""
+
+
+def _request(pilot: Pilot, message_id: int) -> None:
+    pilot.command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, message_id, 100_000)
+
+
+@pytest.mark.parametrize("name", ["SIM_GPS_GLITCH_X", "SIM_GPS1_GLTCH_X"])
+def test_gps_glitch_is_reported_accepted_and_cleared_as_by_real_autopilot(name: str):
+    vehicle, pilot = airborne(15.0)
+    _request(pilot, mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT)
+    pilot.go_to(0.0, 150.0, 15.0)
+    pilot.fly_on(4.0)
+    began_s = vehicle.time_s
+    pilot.parameter(name, GLITCH_DEG)
+    assert pilot.wait(lambda: pilot.last["EKF_STATUS_REPORT"].integer("flags") == GLITCHING, 2.0) >= 0.8
+    assert "GPS Glitch or Compass error" in pilot.texts
+    pilot.wait(lambda: vehicle.est.north - vehicle.body.north > 30.0, 10.0)
+    assert vehicle.time_s - began_s == pytest.approx(8.5, abs=0.5)
+    pilot.fly_on(10.0 - (vehicle.time_s - began_s))
+    pilot.parameter(name, 0.0)
+    pilot.fly_on(4.0)
+    assert vehicle.body.north < -10.0, "the autopilot flies back to a course that it has not left"
+    pilot.wait(lambda: pilot.last["EKF_STATUS_REPORT"].integer("flags") == 831, 20.0)
+    assert vehicle.time_s - began_s == pytest.approx(30.0, abs=1.5)
+    assert abs(vehicle.est.north - vehicle.body.north) < 1.0
+
+
+def test_gps_glitch_moves_reported_gps_position_at_once_with_unchanged_accuracy():
+    _, pilot = airborne(15.0)
+    _request(pilot, mavlink.MAVLINK_MSG_ID_GPS_RAW_INT)
+    before = pilot.expect("GPS_RAW_INT")
+    pilot.parameter("SIM_GPS_GLITCH_X", GLITCH_DEG)
+    pilot.parameter("SIM_GPS_GLITCH_Z", 20.0)
+    pilot.fly_on(1.0)
+    after = pilot.expect("GPS_RAW_INT")
+    assert after.integer("lat") - before.integer("lat") == pytest.approx(3000, abs=60)
+    assert after.integer("alt") - before.integer("alt") == pytest.approx(20000, abs=2000)
+    assert after.integer("h_acc") == before.integer("h_acc")
+
+
+def test_hovering_vehicle_does_not_move_when_estimator_accepts_glitch():
+    vehicle, pilot = airborne(15.0)
+    pilot.mode(mavlink.COPTER_MODE_BRAKE)
+    pilot.fly_on(3.0)
+    north_m = vehicle.body.north
+    pilot.parameter("SIM_GPS_GLITCH_X", GLITCH_DEG)
+    pilot.fly_on(15.0)
+    assert vehicle.est.north - vehicle.body.north > 30.0
+    assert vehicle.body.north == pytest.approx(north_m, abs=1.0)
+
+
+def test_slow_drift_of_gps_is_followed_without_report():
+    vehicle, pilot = airborne(15.0)
+    _request(pilot, mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT)
+    for second in range(60):
+        pilot.parameter("SIM_GPS_GLITCH_X", 0.5 * second / 111_319.0)
+        pilot.fly_on(1.0)
+    assert vehicle.body.north == pytest.approx(-29.0, abs=2.5)
+    assert pilot.expect("EKF_STATUS_REPORT").integer("flags") == 831

@@ -1,9 +1,10 @@
 """The whole mobility service on the simulated vehicle in virtual time: random flights on bad links, checked by an oracle.
 
 Each seed is one flight (tests/component/closed_loop.py) with zones and limits, a vehicle of another owner, and wind.
-The link delays frames by up to 0.25 s each way with jitter, loses up to 10 % of them, and is interrupted. Some zones
-and limits are added while the driver flies or during the return flight. The oracle knows the true position of the
-vehicle. It reports every breach of a zone or limit that the documented guarantee rules out.
+The link delays frames by up to 0.25 s each way with jitter, loses up to 10 % of them, and is interrupted. The GPS is
+wrong for some seconds. Some zones and limits are added while the driver flies or during the return flight. The oracle
+knows the true position of the vehicle. It reports every breach of a zone or limit that the documented guarantee rules
+out.
 """
 
 from __future__ import annotations

@@ -68,6 +68,8 @@ With WPNAV_ACCEL 250, the stopping distance is 10.6 m from 6.4 m/s and 19.6 m fr
 """
 
 
+METRES_PER_DEG = 111_319.0
+
 JERK_MPS3 = 5.0
 """ArduCopter's PSC_JERK_XY. It limits how fast the vehicle can reduce its acceleration."""
 
@@ -86,6 +88,7 @@ class Weather:
         claimed_error_m: Position error reported by the GPS. If None, the GPS reports the actual error.
         speedup: Speed of the vehicle's clock relative to the clock of the service.
         cut: Begin and duration of the link outage, if any.
+        glitch: Begin and duration of a wrong GPS position, and its error north and east in metres, if any.
         stall: Process ("service" or "vehicle") that stalls every few seconds, and the duration of each stall.
     """
 
@@ -98,6 +101,7 @@ class Weather:
     claimed_error_m: float | None = None
     speedup: int = 1
     cut: tuple[float, float] | None = None
+    glitch: tuple[float, float, float, float] | None = None
     stall: tuple[str, float] | None = None
 
 
@@ -692,6 +696,10 @@ class Flight:
         await self._until(lambda: self.account.flew)
         if self.weather.cut is not None:
             asyncio.get_running_loop().call_later(self.weather.cut[0], self._sever)
+        if self.weather.glitch is not None:
+            at_s, lasting_s, north_m, east_m = self.weather.glitch
+            self.sky.call_later(at_s, self._glitch, north_m, east_m)
+            self.sky.call_later(at_s + lasting_s, self._glitch, 0.0, 0.0)
         for _ in range(chance.randrange(6)):
             await asyncio.sleep(chance.uniform(2, 30))
             if chance.random() < 0.15:
@@ -701,6 +709,12 @@ class Flight:
             else:
                 self.add_limit()
             self.drone.grants.put(self.spec())
+
+    def _glitch(self, north_m: float, east_m: float) -> None:
+        params = self.sky.truth.params
+        params.assign("SIM_GPS_GLITCH_X", north_m / METRES_PER_DEG)
+        params.assign("SIM_GPS_GLITCH_Y", east_m / METRES_PER_DEG / math.cos(math.radians(FRAME.lat)))
+        self.account.events.append(f"{self.sky.time() - 1000:7.2f} GPS wrong by {north_m:.0f}, {east_m:.0f}")
 
     def _sever(self) -> None:
         assert self.weather.cut is not None
@@ -720,6 +734,14 @@ def weather_of(seed: int) -> Weather:
     chance = random.Random(seed * 7 + 1)
     bad = chance.random() < 0.7
     cut = (chance.uniform(3, 60), chance.uniform(0.5, 8)) if chance.random() < 0.15 else None
+    fault = random.Random(seed * 13 + 3)
+    glitch = None
+    # The autopilot alone does not stop for a glitch: its failsafe returns on the wrong position.
+    if cut is None and fault.random() < 0.15:
+        wrong_m = fault.uniform(8, 80)
+        angle = fault.uniform(0, 2 * math.pi)
+        # A longer glitch may never be undone. The drone then lands, which may lead it into a zone below.
+        glitch = fault.uniform(3, 60), fault.uniform(1, 15), wrong_m * math.cos(angle), wrong_m * math.sin(angle)
     return Weather(
         uplink_s=chance.uniform(0, 0.25) if bad else 0.0,
         downlink_s=chance.uniform(0, 0.25) if bad else 0.0,
@@ -727,6 +749,7 @@ def weather_of(seed: int) -> Weather:
         wind_mps=chance.choice([0.0, 0.0, 3.0, 6.0]),
         gusts_mps=chance.choice([0.0, 1.0]),
         cut=cut,
+        glitch=glitch,
     )
 
 

@@ -81,6 +81,8 @@ class VehicleState:
         identity_problem: Reason why it is uncertain which vehicle on the link is the drone's own; empty if it is certain.
         heartbeat_gap_s: Interval between the last two heartbeats.
         located: True if GPS has an accurate three-dimensional fix. Positions without such a fix are ignored.
+        position_problem: Reason why the reported position is not trusted and ignored; empty if it is trusted.
+        position_problem_at: Time since which the position has not been trusted.
     """
 
     lat: float | None = None
@@ -128,6 +130,8 @@ class VehicleState:
     failsafe_text_at: float = -math.inf
     identity_problem: str = ""
     heartbeat_gap_s: float = 0.0
+    position_problem: str = ""
+    position_problem_at: float = -math.inf
 
     @property
     def reports_on_ground(self) -> bool:
@@ -165,11 +169,13 @@ class VehicleState:
             return "it does not report the state of its position estimate (EKF_STATUS_REPORT)"
         if not self.estimated:
             return "its position estimate is not accurate enough yet (EKF_STATUS_REPORT)"
+        if self.position_problem:
+            return f"its position is not trusted: {self.position_problem}"
         return self.identity_problem if self.home is not None else "it has no home yet (HOME_POSITION)"
 
     def position_fresh(self, now: float) -> bool:
-        """Return True if the position is recent enough to judge calls and to fly."""
-        return now - self.position_at <= MAX_POSITION_AGE_S
+        """Return True if the position is trusted and recent enough to judge calls and to fly."""
+        return not self.position_problem and now - self.position_at <= MAX_POSITION_AGE_S
 
     def keeps_place(self, now: float) -> bool:
         """Return True if the position is known and the vehicle does not move horizontally."""

@@ -68,6 +68,9 @@ class MobilitySettings:
     brake_resend_s: float = 0.1
     """Seconds of the vehicle's clock between stop setpoints."""
 
+    position_problem_timeout_s: float = 60.0
+    """Seconds for which a return waits until the position is trusted again. The drone then lands where it is."""
+
     # Supervision and verification of the failsafes
 
     tick_timeout_s: float = 1.0

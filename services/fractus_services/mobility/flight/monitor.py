@@ -105,6 +105,9 @@ class MotionMonitor:
         piloted = control.authority is Authority.PILOT
         compiled = self._constraints() if mode.comes_down or (mode.commanded and not piloted) else None
         verdict, by_system = self._judge(compiled) if compiled is not None else (None, False)
+        problem = control.autopilot.vehicle.position_problem
+        if verdict is not None and verdict.code == POSITION_UNKNOWN and problem:
+            verdict = replace(verdict, reason=f"the drone's position is not trusted: {problem}")
         if verdict is None or verdict.code != POSITION_UNKNOWN:
             control.dispatch(PositionFound())
         if compiled is None or verdict is None:

@@ -58,7 +58,8 @@ class ReturnFlight:
     async def approach(self, kind: TaskKind, is_current: Callable[[], bool], attempts: int) -> FlightMode:
         """Fly home for the system until only the descent is left.
 
-        A drone with the task to land lands at its position, unless it would descend into a zone.
+        A drone with the task to land lands at its position, unless it would descend into a zone. A drone whose position is not
+        trusted waits in the air, because the autopilot's own return would follow the wrong position. If it waits too long, it lands.
 
         Args:
             kind: Task of the system: land or return.
@@ -83,6 +84,9 @@ class ReturnFlight:
         # A landing in progress was chosen by a failsafe or a pilot. The battery may be too low for any other flight.
         landing = vehicle.mode.kind is ModeKind.LANDING or self._blind()
         if kind is TaskKind.LAND and (grant is None or landing or not self._lands_in_zone(grant)):
+            return stack.land
+        if not vehicle.mode.comes_down and not await self._trusts_position(is_current):
+            control.note("land", f"the position is not trusted: {vehicle.position_problem}", "PositionUnknown")
             return stack.land
         if (
             vehicle.in_air
@@ -116,6 +120,24 @@ class ReturnFlight:
         log.error("return: no legal route home is known, the drone returns %s (reason=%s)", path, problem)
         self.given_up = grant
         return stack.return_retracing if retraces else stack.return_straight
+
+    async def _trusts_position(self, is_current: Callable[[], bool]) -> bool:
+        """Wait until the position is trusted; the drone hovers. Return False after a timeout, or if the task or flight has ended."""
+        autopilot = self._control.autopilot
+        vehicle = autopilot.vehicle
+        wait_s = SETTINGS.position_problem_timeout_s / autopilot.pace
+        while vehicle.position_problem and autopilot.now - vehicle.position_problem_at < wait_s:
+            if not is_current() or not vehicle.in_air:
+                break
+            if vehicle.mode.commanded:
+                autopilot.stop()
+            await autopilot.update(SETTINGS.brake_resend_s / autopilot.pace)
+        return not vehicle.position_problem
+
+    def _require_trusted_position(self) -> None:
+        problem = self._control.autopilot.vehicle.position_problem
+        if problem:
+            raise Unavailable("PositionUnknown", f"the drone's position is not trusted: {problem}")
 
     async def _restore_home(self) -> None:
         """Restore home if it was moved, because the autopilot's own return ends at home.
@@ -167,11 +189,13 @@ class ReturnFlight:
         """Fly home for a driver, as one motion. The drone is in GUIDED.
 
         Raises:
-            Refused: There is no legal route and the autopilot has recorded no path, or the motion was stopped.
+            Refused: There is no legal route and the autopilot has recorded no path, the position is not trusted, or the motion was
+                stopped.
             AutopilotError: The autopilot refused.
         """
         self.given_up = None
         await self._control.restore_home()
+        self._require_trusted_position()
         if self._blind():
             return
         try:
@@ -227,8 +251,9 @@ class ReturnFlight:
         """Return the next leg home, or None if the drone is at home, or if position or home is unknown.
 
         Raises:
-            Refused: There is no legal route.
+            Refused: There is no legal route, or the position is not trusted.
         """
+        self._require_trusted_position()
         if self._control.home_moved:
             raise Unavailable("AutopilotUnavailable", "another station moved home; it must be set back first")
         now = self._gate.situation()

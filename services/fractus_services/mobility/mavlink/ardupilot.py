@@ -163,6 +163,8 @@ class ArduCopter:
     fence_total = "FENCE_TOTAL"
     fence_parameters: tuple[str, ...] = (TYPE, ALTITUDE, ACTION, OPTIONS, ENABLE)
 
+    variance_limit = "FS_EKF_THRESH"
+
     gimbal_type = "MNT1_TYPE"
     # Alexmos, serial SToRM32, MAVLink (Gremsy), Siyi, Xacti, Viewpro and Topotek report a measured attitude. Servos,
     # MAVLink SToRM32 and CADDX report their target instead. The reports of gimbals that a script controls are not

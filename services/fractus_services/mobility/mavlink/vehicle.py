@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from dataclasses import dataclass, field
 
@@ -12,6 +13,9 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from fractus_services.mobility.autopilot import DEFAULT_ERROR_M, VELOCITY_HISTORY_S, VehicleState
 from fractus_services.mobility.mavlink.flight_stack import FlightStack
 from fractus_services.mobility.mavlink.gimbal import attitude_of
+from fractus_services.mobility.mavlink.position_checks import VARIANCES, PositionChecks, ReportedPosition
+
+log = logging.getLogger(__name__)
 
 _UNKNOWN_U8 = 0xFF
 _UNKNOWN_U16 = 0xFFFF
@@ -60,6 +64,7 @@ class Vehicle(VehicleState):
         started_at: Time of the first heartbeat that reported running motors.
         stopping_at: Time since which all heartbeats have reported stopped motors in flight; infinite if the last one did not.
         gimbal_limits: Smallest and largest pitch and yaw of the gimbal, degrees; None until they are reported.
+        position_checks: Signs of a wrong position.
     """
 
     stack: FlightStack = field(kw_only=True)
@@ -71,6 +76,7 @@ class Vehicle(VehicleState):
     fence_enabled: bool | None = None
     started_at: float = -math.inf
     stopping_at: float = math.inf
+    position_checks: PositionChecks = field(default_factory=PositionChecks)
 
     def take(self, message: Message, now: float) -> None:
         """Update the state from a message."""
@@ -108,21 +114,39 @@ def _place(lat_e7: int, lon_e7: int) -> tuple[float, float] | None:
     return lat_e7 / 1e7, lon_e7 / 1e7
 
 
+def _check_position(vehicle: Vehicle, now: float) -> None:
+    """Update whether the position is trusted."""
+    problem = vehicle.position_checks.problem(now)
+    if problem and not vehicle.position_problem:
+        vehicle.position_problem_at = now
+        log.warning("position: no longer trusted (reason=%s)", problem)
+    elif vehicle.position_problem and not problem:
+        log.info("position: trusted again")
+    vehicle.position_problem = problem
+
+
 def _position(vehicle: Vehicle, message: Message, now: float) -> None:
+    place = _place(message.integer("lat"), message.integer("lon"))
+    if place is None:
+        return
+    boot_s = message.integer("time_boot_ms") / 1e3
+    amsl_m = message.integer("alt") / 1e3
+    north_mps, east_mps, down_mps = (message.integer(name) / 100 for name in ("vx", "vy", "vz"))
+    reported = ReportedPosition(boot_s, *place, amsl_m, north_mps, east_mps, down_mps)
+    vehicle.position_checks.take_position(reported, vehicle.position_error_m, now, moves=vehicle.armed)
+    _check_position(vehicle, now)
     # Even with a GPS fix the estimator may be using dead reckoning, and its position drifts.
     reports_estimator = math.isfinite(vehicle.estimated_at)
     recent_estimate = vehicle.estimated and now - vehicle.estimated_at <= STATUS_MAX_AGE_S
     dead_reckoning = reports_estimator and not recent_estimate
-    if dead_reckoning or not vehicle.located or now - vehicle.gps_at > STATUS_MAX_AGE_S:
-        return
-    place = _place(message.integer("lat"), message.integer("lon"))
-    if place is None:
+    if dead_reckoning or not vehicle.located or now - vehicle.gps_at > STATUS_MAX_AGE_S or vehicle.position_problem:
         return
     vehicle.lat, vehicle.lon = place
     vehicle.altitude_m = message.integer("relative_alt") / 1e3
-    vehicle.amsl_m = message.integer("alt") / 1e3
-    vehicle.north_mps, vehicle.east_mps, vehicle.down_mps = (message.integer(name) / 100 for name in ("vx", "vy", "vz"))
-    boot_s = message.integer("time_boot_ms") / 1e3
+    vehicle.amsl_m = amsl_m
+    vehicle.north_mps = north_mps
+    vehicle.east_mps = east_mps
+    vehicle.down_mps = down_mps
     vehicle.velocity_history.append((boot_s, vehicle.north_mps, vehicle.east_mps))
     # Also drop velocities from before a restart.
     while not boot_s - VELOCITY_HISTORY_S <= vehicle.velocity_history[0][0] <= boot_s:
@@ -165,6 +189,8 @@ def _gimbal_limits(vehicle: Vehicle, message: Message, _now: float) -> None:
 
 
 def _parameter(vehicle: Vehicle, message: Message, _now: float) -> None:
+    if message.text("param_id") == vehicle.stack.variance_limit:
+        vehicle.position_checks.set_variance_limit(message.real("param_value"))
     if message.text("param_id") == vehicle.stack.gimbal_type:
         measures = message.real("param_value") in vehicle.stack.measured_gimbals
         # If the type was changed, the autopilot uses the new type only after a restart. The type is then requested
@@ -214,7 +240,10 @@ def _estimator(vehicle: Vehicle, message: Message, now: float) -> None:
     vehicle.path_lost = vehicle.path_lost or lost
     if vehicle.estimated:
         vehicle.positioned_at = now
+        variances = {name: message.real(name) for name in VARIANCES}
+        vehicle.position_checks.take_estimator(message.integer("flags"), variances, now)
     vehicle.estimated_at = now
+    _check_position(vehicle, now)
 
 
 def _gps(vehicle: Vehicle, message: Message, now: float) -> None:
@@ -225,8 +254,13 @@ def _gps(vehicle: Vehicle, message: Message, now: float) -> None:
     vehicle.satellites = satellites if satellites != _UNKNOWN_U8 else 0
     error = accuracy_mm / 1e3 if accuracy_mm else DEFAULT_ERROR_M
     vehicle.located = vehicle.fix_type >= mavlink.GPS_FIX_TYPE_3D_FIX and error <= MAX_ERROR_M
-    if vehicle.located:
-        vehicle.position_error_m = max(error, MIN_ERROR_M)
+    if not vehicle.located:
+        return
+    vehicle.position_error_m = max(error, MIN_ERROR_M)
+    place = _place(message.integer("lat"), message.integer("lon"))
+    if place is not None:
+        vehicle.position_checks.take_gps(*place, vehicle.position_error_m, now)
+        _check_position(vehicle, now)
 
 
 def _text(vehicle: Vehicle, message: Message, now: float) -> None:

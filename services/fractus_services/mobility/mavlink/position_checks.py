@@ -1,0 +1,221 @@
+"""Signs of a wrong position although the estimator reports one: a GPS glitch, large variances, a jump, two positions that disagree.
+
+A GPS receiver that reflections or a jammer mislead reports a wrong position with a small error. ArduCopter rejects such a position
+for some seconds, then accepts it: its own position jumps, and it flies to its target from there. The reported error does not change.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass
+
+from fractus_core.geo import LocalFrame
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+QUIET_S = 5.0
+"""Time without any sign after which the position is trusted again."""
+
+DEFAULT_VARIANCE_LIMIT = 0.8
+"""Default of FS_EKF_THRESH. At 1, the estimator rejects its measurements."""
+
+VARIANCES = {
+    "velocity_variance": "velocity",
+    "pos_horiz_variance": "horizontal position",
+    "pos_vert_variance": "altitude",
+    "compass_variance": "compass",
+}
+
+ERROR_FACTOR = 3.0
+"""Multiple of the position error (1 sigma) that two correct positions may be apart."""
+
+JUMP_M = 1.0
+"""Distance of a correction by the estimator that is no jump, in addition to the position error."""
+
+RETURNED_M = 5.0
+"""Distance from the expected position, in addition to the position error, within which a position that jumped has returned.
+
+The expected position follows from the last trusted one and the velocities since then, which are inaccurate.
+"""
+
+ALTITUDE_JUMP_M = 3.0
+"""Change of the altitude by a correction that is no jump."""
+
+DISAGREEMENT_M = 2.0
+"""Distance between GPS and estimate, in addition to the position error: antenna offset, and distance between two positions."""
+
+MAX_ACCEL_MPS2 = 10.0
+"""Largest acceleration of a copter between two positions: a lean angle of 45 degrees, or free fall."""
+
+MAX_SPEED_MPS = 30.0
+"""Largest mean speed between two positions."""
+
+PATH_S = 1.0
+"""Seconds of the vehicle's clock for which positions are kept. The position of the GPS is older than the estimate."""
+
+DISAGREEMENTS = 2
+"""Number of consecutive GPS positions that must disagree, because a single one may be an outlier that the estimator rejects."""
+
+
+@dataclass(frozen=True, slots=True)
+class ReportedPosition:
+    """Position that the estimator reported.
+
+    Attributes:
+        boot_s: Reading of the vehicle's clock.
+        lat, lon: Degrees.
+        amsl_m: Altitude above mean sea level.
+        north_mps, east_mps, down_mps: Velocity.
+    """
+
+    boot_s: float
+    lat: float
+    lon: float
+    amsl_m: float
+    north_mps: float
+    east_mps: float
+    down_mps: float
+
+    @property
+    def speed_mps(self) -> float:
+        """Horizontal speed."""
+        return math.hypot(self.north_mps, self.east_mps)
+
+    def offset_m(self, other: ReportedPosition) -> tuple[float, float]:
+        """Return the horizontal vector to another position, metres east and north."""
+        return LocalFrame(self.lat, self.lon).xy(other.lat, other.lon)
+
+
+class PositionChecks:
+    """Collects signs of a wrong position. Times are monotonic seconds unless they are stated to be on the vehicle's clock.
+
+    Attributes:
+        variance_limit: FS_EKF_THRESH of the vehicle: a variance of this size or larger is a sign.
+    """
+
+    def __init__(self) -> None:
+        self.variance_limit = DEFAULT_VARIANCE_LIMIT
+        self._path: deque[ReportedPosition] = deque()
+        self._path_at = -math.inf
+        self._estimator_problem = ""
+        self._gps_problem = ""
+        self._displacement = ""
+        self._trusted: ReportedPosition | None = None
+        self._flown_m = (0.0, 0.0)
+        self._disagreements = 0
+        self._reason = ""
+        self._seen_at = -math.inf
+
+    def problem(self, now: float) -> str:
+        """Return why the position is not trusted; empty if it is.
+
+        A sign of EKF_STATUS_REPORT or GPS_RAW_INT holds until a later message without it. A position that jumped is not trusted
+        before it has returned, because either of the two positions may be the wrong one.
+        """
+        lasting = self._estimator_problem or self._gps_problem or self._displacement
+        if lasting:
+            self._see(lasting, now)
+        return self._reason if now - self._seen_at < QUIET_S else ""
+
+    def _see(self, reason: str, now: float) -> None:
+        self._reason = reason
+        self._seen_at = max(self._seen_at, now)
+
+    def set_variance_limit(self, limit: float) -> None:
+        """Use the vehicle's FS_EKF_THRESH. Values that switch the failsafe off, or on late, do not apply."""
+        self.variance_limit = limit if 0.0 < limit <= 1.0 else DEFAULT_VARIANCE_LIMIT
+
+    def take_estimator(self, flags: int, variances: dict[str, float], now: float) -> None:
+        """Process EKF_STATUS_REPORT of an estimator that has an absolute position."""
+        self.problem(now)  # The previous report holds until now.
+        excessive = [VARIANCES[name] for name, value in variances.items() if not value < self.variance_limit]
+        self._estimator_problem = ""
+        if flags & mavlink.EKF_GPS_GLITCHING:
+            self._estimator_problem = "the autopilot reports a GPS glitch (EKF_STATUS_REPORT)"
+        elif excessive:
+            self._estimator_problem = (
+                f"the estimator's variance of {', '.join(excessive)} is {self.variance_limit:g} or larger"
+                " (EKF_STATUS_REPORT, FS_EKF_THRESH)"
+            )
+
+    def take_position(self, reported: ReportedPosition, error_m: float, now: float, *, moves: bool) -> None:
+        """Compare a position with the previous one.
+
+        Args:
+            reported: The position.
+            error_m: Position error, 1 sigma.
+            now: Time of the position.
+            moves: True if the motors run. On the ground, the estimator corrects its position and altitude by resets.
+        """
+        if self._path:
+            last = self._path[-1]
+            elapsed_s = reported.boot_s - last.boot_s
+            if elapsed_s == 0.0:
+                return  # The same position again.
+            if elapsed_s < 0.0:
+                self._path.clear()  # The vehicle has restarted. Overtaken positions are dropped before.
+            else:
+                if moves:
+                    self._look_for_jump(last, reported, elapsed_s, error_m, now)
+                self._follow(last, reported, elapsed_s, error_m, now, moves=moves)
+        self._path.append(reported)
+        while self._path[0].boot_s < reported.boot_s - PATH_S:
+            self._path.popleft()
+        self._path_at = now
+
+    def _follow(
+        self,
+        last: ReportedPosition,
+        reported: ReportedPosition,
+        elapsed_s: float,
+        error_m: float,
+        now: float,
+        *,
+        moves: bool,
+    ) -> None:
+        """While a flying vehicle's position is not trusted, compare it with the position that follows from the velocities."""
+        if not moves or not self.problem(now):
+            self._trusted = None
+            self._displacement = ""
+            return
+        if self._trusted is None:
+            self._trusted = last
+            self._flown_m = (0.0, 0.0)
+        self._flown_m = (
+            self._flown_m[0] + (last.east_mps + reported.east_mps) / 2 * elapsed_s,
+            self._flown_m[1] + (last.north_mps + reported.north_mps) / 2 * elapsed_s,
+        )
+        away_m = math.dist(self._trusted.offset_m(reported), self._flown_m)
+        returned = away_m <= RETURNED_M + ERROR_FACTOR * error_m
+        self._displacement = "" if returned else f"the reported position is {away_m:.0f} m from where the vehicle flew"
+
+    def _look_for_jump(
+        self, last: ReportedPosition, reported: ReportedPosition, elapsed_s: float, error_m: float, now: float
+    ) -> None:
+        moved_m = math.hypot(*last.offset_m(reported))
+        if moved_m > _reach_m(last.speed_mps, reported.speed_mps, elapsed_s) + JUMP_M + ERROR_FACTOR * error_m:
+            self._see(f"the reported position jumped by {moved_m:.0f} m within {elapsed_s:.2f} s", now)
+        climbed_m = abs(reported.amsl_m - last.amsl_m)
+        if climbed_m > _reach_m(abs(last.down_mps), abs(reported.down_mps), elapsed_s) + ALTITUDE_JUMP_M:
+            self._see(f"the reported altitude jumped by {climbed_m:.0f} m within {elapsed_s:.2f} s", now)
+
+    def take_gps(self, lat: float, lon: float, error_m: float, now: float) -> None:
+        """Compare the position of the GPS with the estimator's positions of the last second."""
+        self.problem(now)
+        if not self._path or now - self._path_at > PATH_S:
+            self._disagreements = 0
+            self._gps_problem = ""
+            return
+        frame = LocalFrame(lat, lon)
+        apart_m = min(math.hypot(*frame.xy(known.lat, known.lon)) for known in self._path)
+        agrees = apart_m <= DISAGREEMENT_M + ERROR_FACTOR * error_m
+        self._disagreements = 0 if agrees else self._disagreements + 1
+        self._gps_problem = ""
+        if self._disagreements >= DISAGREEMENTS:
+            self._gps_problem = f"GPS_RAW_INT and GLOBAL_POSITION_INT are {apart_m:.0f} m apart"
+
+
+def _reach_m(first_mps: float, second_mps: float, elapsed_s: float) -> float:
+    """Return an upper bound of the distance between two positions with these speeds."""
+    fastest_mps = (first_mps + second_mps + MAX_ACCEL_MPS2 * elapsed_s) / 2
+    return min(fastest_mps, max(MAX_SPEED_MPS, first_mps, second_mps)) * elapsed_s

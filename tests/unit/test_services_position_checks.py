@@ -1,0 +1,256 @@
+"""Signs of a wrong position: the vehicle's position becomes unknown, and known again after a quiet time."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from fractus_core.geo import LocalFrame
+from fractus_runtime.mavlink_codec import message
+from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
+from fractus_services.mobility.mavlink.position_checks import QUIET_S
+from fractus_services.mobility.mavlink.vehicle import Vehicle
+
+READY = 831
+GLITCHING = 33599
+"""Flags of EKF_STATUS_REPORT of a real ArduCopter in flight, without and with a GPS glitch."""
+
+FRAME = LocalFrame(39.36, 22.95)
+
+
+class Flight:
+    """Messages of a flying vehicle: positions at 20 Hz, estimator at 1 Hz, GPS at 2 Hz."""
+
+    def __init__(self, *, armed: bool = True) -> None:
+        self.vehicle = Vehicle(stack=ARDUCOPTER, armed=armed, landed_state=2, landed_at=0.0)
+        self.tick = 0
+        self.flags = READY
+        self.variances: dict[str, float] = {}
+        self.north_m = 0.0
+        self.north_mps = 0.0
+        self.amsl_m = 100.0
+        self.gps_error_m = 0.0
+        self.boot_s = 100.0
+        self.send(2.0)
+
+    @property
+    def now(self) -> float:
+        return self.tick / 20
+
+    @property
+    def known(self) -> bool:
+        return self.vehicle.position_fresh(self.now)
+
+    def position(self) -> None:
+        lat, lon = FRAME.latlon(0.0, self.north_m)
+        place = {"lat": round(lat * 1e7), "lon": round(lon * 1e7), "alt": round(self.amsl_m * 1e3)}
+        clock = {"time_boot_ms": round((self.boot_s + self.now) * 1e3)}
+        self.vehicle.take(message("GLOBAL_POSITION_INT", **place, **clock, vx=round(self.north_mps * 100)), self.now)
+
+    def status(self) -> None:
+        self.vehicle.take(message("EKF_STATUS_REPORT", flags=self.flags, **self.variances), self.now)
+
+    def gps(self) -> None:
+        lat, lon = FRAME.latlon(0.0, self.north_m + self.gps_error_m)
+        place = {"lat": round(lat * 1e7), "lon": round(lon * 1e7)}
+        self.vehicle.take(message("GPS_RAW_INT", fix_type=3, h_acc=500, **place), self.now)
+
+    def send(self, duration_s: float, *, lost: bool = False) -> None:
+        """Fly on for a duration. If the messages are lost, none of them arrives."""
+        for _ in range(round(duration_s * 20)):
+            self.tick += 1
+            self.north_m += self.north_mps / 20
+            if lost:
+                continue
+            if self.tick % 20 == 1:
+                self.status()
+            if self.tick % 10 == 1:
+                self.gps()
+            self.position()
+
+
+def test_position_is_unknown_while_autopilot_reports_gps_glitch_and_until_quiet_time_has_passed() -> None:
+    flight = Flight()
+    assert flight.known
+    flight.flags = GLITCHING
+    flight.status()
+    assert not flight.known
+    assert "GPS glitch" in flight.vehicle.position_problem
+    flight.send(29.0)
+    flight.flags = READY
+    flight.status()
+    flight.send(QUIET_S - 0.1)
+    assert not flight.known
+    flight.send(0.2)
+    assert flight.known
+
+
+@pytest.mark.parametrize("name", ["velocity", "pos_horiz", "pos_vert", "compass"])
+@pytest.mark.parametrize("value", [0.8, 1.2, math.nan, math.inf])
+def test_position_is_unknown_if_variance_reaches_failsafe_threshold(name: str, value: float) -> None:
+    flight = Flight()
+    flight.variances = {f"{name}_variance": 0.79}
+    flight.status()
+    assert flight.known
+    flight.variances = {f"{name}_variance": value}
+    flight.status()
+    assert not flight.known
+    assert "FS_EKF_THRESH" in flight.vehicle.position_problem
+
+
+@pytest.mark.parametrize(
+    ("threshold", "known"), [(0.5, False), (0.9, True), (0.0, True), (5.0, True), (math.nan, True)]
+)
+def test_variance_limit_is_threshold_of_vehicle_if_its_failsafe_is_on(threshold: float, known: bool) -> None:
+    flight = Flight()
+    flight.vehicle.take(message("PARAM_VALUE", param_id=b"FS_EKF_THRESH", param_value=threshold), flight.now)
+    flight.variances = {"pos_horiz_variance": 0.7}
+    flight.status()
+    assert flight.known is known
+    flight.variances = {"pos_horiz_variance": 1.0}
+    flight.status()
+    assert not flight.known
+
+
+@pytest.mark.parametrize("speed_mps", [0.0, 8.0])
+def test_position_is_unknown_at_first_sample_after_jump(speed_mps: float) -> None:
+    flight = Flight()
+    flight.north_mps = speed_mps
+    flight.send(2.0)
+    assert flight.known
+    flight.north_m += 33.0
+    flight.send(0.05)
+    assert not flight.known
+    assert "33 m" in flight.vehicle.position_problem
+
+
+def test_position_stays_unknown_until_it_has_jumped_back() -> None:
+    flight = Flight()
+    flight.north_m += 33.0
+    flight.send(30.0)
+    assert not flight.known
+    assert "33 m from where the vehicle flew" in flight.vehicle.position_problem
+    flight.north_m -= 33.0
+    flight.send(QUIET_S - 0.1)
+    assert not flight.known
+    flight.send(0.3)
+    assert flight.known
+
+
+def test_position_stays_unknown_if_it_jumped_while_link_was_lost_during_glitch() -> None:
+    flight = Flight()
+    flight.flags = GLITCHING
+    flight.send(1.0)
+    flight.north_m += 33.0
+    flight.send(8.0, lost=True)
+    flight.flags = READY
+    flight.send(10.0)
+    assert not flight.known
+
+
+def test_position_is_known_after_landing_at_place_to_which_it_jumped() -> None:
+    flight = Flight()
+    flight.north_m += 33.0
+    flight.send(10.0)
+    flight.vehicle.armed = False
+    flight.send(QUIET_S + 0.5)
+    assert flight.known
+
+
+def test_altitude_jump_makes_position_unknown() -> None:
+    flight = Flight()
+    flight.amsl_m += 10.0
+    flight.send(0.05)
+    assert not flight.known
+    assert "altitude jumped by 10 m" in flight.vehicle.position_problem
+
+
+@pytest.mark.parametrize("lost_s", [0.05, 0.5, 1.0, 10.0])
+@pytest.mark.parametrize("speed_mps", [0.0, 8.0, 20.0])
+def test_fast_flight_with_lost_messages_is_no_jump(lost_s: float, speed_mps: float) -> None:
+    flight = Flight()
+    flight.north_mps = speed_mps
+    flight.send(1.0)
+    flight.send(lost_s, lost=True)
+    flight.send(0.1)
+    assert flight.known
+
+
+def test_acceleration_during_lost_messages_is_no_jump() -> None:
+    flight = Flight()
+    flight.north_m += 0.5 * 2.5 * 3.0**2
+    flight.send(3.0, lost=True)
+    flight.north_mps = 7.5
+    flight.send(0.1)
+    assert flight.known
+
+
+def test_repeated_position_is_no_jump_and_does_not_hide_one() -> None:
+    flight = Flight()
+    for _ in range(3):
+        flight.position()
+    assert flight.known
+    flight.north_m += 33.0
+    flight.position()
+    flight.send(0.05)
+    assert not flight.known
+
+
+def test_restarted_clock_of_vehicle_is_no_jump() -> None:
+    flight = Flight()
+    flight.boot_s = -flight.now
+    flight.north_m += 33.0
+    flight.send(0.5)
+    assert flight.known
+
+
+def test_correction_of_position_on_ground_is_no_jump() -> None:
+    flight = Flight(armed=False)
+    flight.north_m += 33.0
+    flight.amsl_m += 20.0
+    flight.send(1.0)
+    assert flight.known
+
+
+def test_small_correction_by_estimator_is_no_jump() -> None:
+    flight = Flight()
+    flight.north_m += 2.0
+    flight.send(1.0)
+    assert flight.known
+
+
+def test_position_is_unknown_if_two_consecutive_gps_positions_disagree_with_estimate() -> None:
+    flight = Flight()
+    flight.gps_error_m = 12.0
+    flight.gps()
+    assert flight.known, "a single outlier is rejected by the estimator"
+    flight.gps_error_m = 0.0
+    flight.gps()
+    flight.gps_error_m = 12.0
+    flight.gps()
+    assert flight.known
+    flight.gps()
+    assert not flight.known
+    assert "12 m apart" in flight.vehicle.position_problem
+
+
+@pytest.mark.parametrize("lag_s", [0.0, 0.25, 0.9])
+def test_old_gps_position_of_fast_vehicle_agrees_with_estimate(lag_s: float) -> None:
+    flight = Flight()
+    flight.north_mps = 15.0
+    flight.send(2.0)
+    flight.gps_error_m = -15.0 * lag_s
+    flight.send(5.0)
+    assert flight.known
+
+
+def test_arming_is_refused_while_position_is_not_trusted() -> None:
+    flight = Flight(armed=False)
+    vehicle = flight.vehicle
+    vehicle.take(message("HOME_POSITION", latitude=393600000, longitude=229500000), flight.now)
+    vehicle.ready = True
+    vehicle.checks_at = flight.now
+    assert vehicle.arming_refusal(flight.now) == ""
+    flight.flags = GLITCHING
+    flight.status()
+    assert "GPS glitch" in vehicle.arming_refusal(flight.now)

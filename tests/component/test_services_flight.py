@@ -11,6 +11,7 @@ import pytest
 from fractus_core.control import Authority, StreamState
 from fractus_core.control.state import FlightMode
 from fractus_core.policy.decision_types import Call, GotoArgs, SetSpeedArgs, TakeoffArgs, Verdict
+from fractus_runtime.mavlink_codec import Message, message
 from fractus_services.errors import AutopilotError, Refused
 from fractus_services.grant_files import ActiveGrant
 from mobility_world import (
@@ -475,6 +476,46 @@ def test_goto_with_heading_waits_for_yaw(tmp_path: Path) -> None:
             world.plane.refuses.add(mavlink.MAV_CMD_CONDITION_YAW)
             with pytest.raises(AutopilotError, match="failed command CONDITION_YAW"):
                 await end(world.service.goto(grant, goto(0, 40, yaw_deg=180.0), 0))
+
+    fly(flight)
+
+
+# Refusals by the autopilot
+
+
+def _text(text: str) -> Message:
+    return message("STATUSTEXT", severity=mavlink.MAV_SEVERITY_CRITICAL, text=text.encode())
+
+
+def test_refused_leg_quotes_no_earlier_text_and_names_probable_reason(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            grant = world.grants.put(spec())
+            await world.up(grant)
+            world.plane.take(_text("Arming motors"))
+            world.plane.refuses.add(mavlink.MAV_CMD_DO_REPOSITION)
+            with pytest.raises(AutopilotError) as refused:
+                await end(world.service.goto(grant, goto(0, 40), 0))
+            reason = "the autopilot failed command DO_REPOSITION without a reason"
+            assert str(refused.value) == f"{reason}; probably the target is outside the vehicle's fence"
+
+    fly(flight)
+
+
+@pytest.mark.parametrize(
+    ("text", "quoted"), [("Mode change to RTL failed: requires position", True), ("Mission: 1 Takeoff", False)]
+)
+def test_refused_mode_quotes_text_received_after_command(tmp_path: Path, text: str, quoted: bool) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            world.plane.take(_text("Mode change to RTL failed: requires home"))
+            world.plane.refuses.add(mavlink.MAV_CMD_DO_SET_MODE)
+            await asyncio.sleep(0.1)
+            world.plane.downlink_s = 0.1
+            asyncio.get_running_loop().call_later(0.05, world.plane.take, _text(text))
+            with pytest.raises(AutopilotError) as refused:
+                await world.plane.set_mode(RTL)
+            assert str(refused.value) == "the autopilot failed command DO_SET_MODE" + (f": {text}" if quoted else "")
 
     fly(flight)
 

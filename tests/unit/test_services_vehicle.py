@@ -99,6 +99,9 @@ def test_readiness_depends_on_requirements_of_the_arming_mode() -> None:
     vehicle.ready = False
     vehicle.take(message("STATUSTEXT", severity=2, text=b"PreArm: AHRS: waiting for home"), 30.0)
     assert vehicle.arming_refusal(30.0) == "PreArm: AHRS: waiting for home"
+    vehicle.take(message("SYS_STATUS"), 71.0)
+    vehicle.ready = False
+    assert vehicle.arming_refusal(71.0) == "its pre-arm checks fail", "the text is too old"
     vehicle.take(message("SYS_STATUS", **HEALTHY), 31.0)
     assert "EKF_STATUS_REPORT" in vehicle.arming_refusal(31.0), "a vehicle without EKF_STATUS_REPORT is not ready"
     vehicle.take(message("EKF_STATUS_REPORT", flags=BOOTED), 31.0)

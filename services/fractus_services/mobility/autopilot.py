@@ -51,6 +51,9 @@ WIND_MAX_AGE_S = 10.0
 READY_MAX_AGE_S = 5.0
 """Maximum age of the reported readiness. At the rate of 1 Hz, four successive messages were lost."""
 
+CHECKS_TEXT_MAX_AGE_S = 40.0
+"""Maximum age of a text that states a failed pre-arm check. ArduCopter repeats these texts every 30 s while a check fails."""
+
 VELOCITY_HISTORY_S = 0.3
 """Period for which velocities are kept to compute the acceleration, in seconds of the vehicle's clock."""
 
@@ -76,7 +79,7 @@ class VehicleState:
         path_lost: True if the autopilot has stopped recording its path since it was armed.
         satellites: Number of visible satellites; None until it is reported.
         velocity_history: Time on the vehicle's clock, and velocity north and east, of the latest positions.
-        texts: Recent status texts.
+        texts: Time of arrival and text of recent status texts.
         status_texts: Number, MAV_SEVERITY and text of recent status texts.
         identity_problem: Reason why it is uncertain which vehicle on the link is the drone's own; empty if it is certain.
         heartbeat_gap_s: Interval between the last two heartbeats.
@@ -123,7 +126,7 @@ class VehicleState:
     wind_from_deg: float = 0.0
     wind_mps: float = 0.0
     wind_at: float = -math.inf
-    texts: list[str] = field(default_factory=list)
+    texts: list[tuple[float, str]] = field(default_factory=list)
     status_texts: deque[tuple[int, int, str]] = field(default_factory=lambda: deque(maxlen=50))
     path_lost: bool = False
     failsafe_text: str = ""
@@ -163,7 +166,10 @@ class VehicleState:
         if now - self.checks_at > READY_MAX_AGE_S:
             return "it does not report its pre-arm checks (SYS_STATUS)"
         if not self.ready:
-            reason = next((text for text in reversed(self.texts) if text.startswith("PreArm")), "")
+            recent = [
+                text for at, text in self.texts if now - at <= CHECKS_TEXT_MAX_AGE_S and text.startswith("PreArm:")
+            ]
+            reason = recent[-1] if recent else ""
             return reason or "its pre-arm checks fail"
         if now - self.estimated_at > READY_MAX_AGE_S:
             return "it does not report the state of its position estimate (EKF_STATUS_REPORT)"

@@ -38,6 +38,13 @@ _ACCEPTS_ONE_SYSTEM = Setting(
     ("MAV_GCS_SYSID_HI",), 0, frozenset(float(n) for n in range(1, SYSTEM_ID + 1)), False, _ACCEPTS_COMPANION
 )
 
+_REFUSALS: dict[int, tuple[str, ...]] = {
+    mavlink.MAV_CMD_COMPONENT_ARM_DISARM: ("Arm:", "PreArm:"),
+    mavlink.MAV_CMD_DO_SET_MODE: ("Mode change to ", "No such mode"),
+    mavlink.MAV_CMD_NAV_TAKEOFF: ("Takeoff ",),
+}
+"""Beginnings of the texts that state why a command was refused."""
+
 _UNSTEERED = 1 << 4 | 1 << 5 | 1 << 6
 """Bits of GUID_OPTIONS that are not allowed.
 
@@ -185,9 +192,13 @@ class ArduCopter:
         """Return the number of a mode."""
         return (float(_NUMBERS[mode]),)
 
-    def explains_refusal(self, text: str) -> bool:
-        """Recognise texts of pre-arm checks, mode changes and takeoffs."""
-        return text.startswith(("Arm", "PreArm", "Mode", "Takeoff"))
+    def explains_refusal(self, command: int, text: str) -> bool:
+        """Recognise texts of failed arming checks and mode changes, but not `Arming motors` or `Mission: 1 Takeoff`."""
+        return text.startswith(_REFUSALS.get(command, ()))
+
+    def probable_refusal(self, command: int) -> str:
+        """Return the probable reason. DO_REPOSITION to a point outside the fence fails without a text."""
+        return "the target is outside the vehicle's fence" if command == mavlink.MAV_CMD_DO_REPOSITION else ""
 
     def reports_failsafe(self, text: str) -> bool:
         """Recognise active failsafes.

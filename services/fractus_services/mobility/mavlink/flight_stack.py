@@ -118,8 +118,11 @@ class FlightStack(Protocol):
     def mode_parameters(self, mode: FlightMode) -> tuple[float, ...]:
         """Return the parameters of MAV_CMD_DO_SET_MODE from the second on. The first one requests a custom mode."""
 
-    def explains_refusal(self, text: str) -> bool:
-        """Return True if a status text states why a command was refused."""
+    def explains_refusal(self, command: int, text: str) -> bool:
+        """Return True if a status text states why a command (MAV_CMD) was refused."""
+
+    def probable_refusal(self, command: int) -> str:
+        """Return the probable reason for a command that failed without a status text; empty if there is no typical one."""
 
     def reports_failsafe(self, text: str) -> bool:
         """Return True if a status text reports an active failsafe."""

@@ -357,6 +357,7 @@ class MavlinkAutopilot(AutopilotLink):
             # changes do not wait for earlier mode changes, because a mode change may start the return flight.
             async with nullcontext() if command in _NOT_SERIALIZED else self._locks.setdefault(command, asyncio.Lock()):
                 answer = Answer()
+                sent_at = self.now
                 for attempt in range(attempts):
                     permit()
                     if attempt and self._acknowledgements.is_overtaken(command, answer):
@@ -373,7 +374,7 @@ class MavlinkAutopilot(AutopilotLink):
                     if result == mavlink.MAV_RESULT_TEMPORARILY_REJECTED and attempt + 1 < attempts:
                         await asyncio.sleep(REJECTED_RETRY_S)
                         continue
-                    raise AutopilotError(self._refusal(command, result), refused=True)
+                    raise AutopilotError(self._refusal(command, result, sent_at), refused=True)
             raise AutopilotError(f"the autopilot did not answer command {enum_name('MAV_CMD', command)}", link=True)
 
     async def _attempt(
@@ -401,9 +402,17 @@ class MavlinkAutopilot(AutopilotLink):
             await asyncio.wait([answer], timeout=self._acknowledgements.timeout_s)
         return answer.result() if answer.done() else None
 
-    def _refusal(self, command: int, result: int) -> str:
-        texts = [text for text in self.vehicle.texts[-4:] if self.stack.explains_refusal(text)]
-        reason = f": {texts[-1]}" if texts else ""
+    def _refusal(self, command: int, result: int, sent_at: float) -> str:
+        """Return a sentence with the reason: a text that the autopilot sent since the command, or else the probable reason."""
+        texts = [
+            text for at, text in self.vehicle.texts if at >= sent_at and self.stack.explains_refusal(command, text)
+        ]
+        probable = self.stack.probable_refusal(command) if result == mavlink.MAV_RESULT_FAILED else ""
+        reason = ""
+        if texts:
+            reason = f": {texts[-1]}"
+        elif probable:
+            reason = f" without a reason; probably {probable}"
         return f"the autopilot {_RESULTS.get(result, 'refused')} command {enum_name('MAV_CMD', command)}{reason}"
 
     async def set_mode(self, mode: FlightMode, permit: Permit = always) -> None:
@@ -422,7 +431,6 @@ class MavlinkAutopilot(AutopilotLink):
 
     async def arm(self, permit: Permit = always) -> None:
         """Start the motors."""
-        self.vehicle.texts.clear()
         await self.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1, permit=permit)
 
     async def disarm(self, permit: Permit = always) -> None:

@@ -265,7 +265,7 @@ def _gps(vehicle: Vehicle, message: Message, now: float) -> None:
 
 def _text(vehicle: Vehicle, message: Message, now: float) -> None:
     text = message.text("text")
-    vehicle.texts.append(text)
+    vehicle.texts.append((now, text))
     del vehicle.texts[:-20]
     number = vehicle.status_texts[-1][0] + 1 if vehicle.status_texts else 1
     vehicle.status_texts.append((number, message.integer("severity"), text))

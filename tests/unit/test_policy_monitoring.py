@@ -137,6 +137,23 @@ def test_monitor_corrects_altitude_and_speed() -> None:
     assert monitor(at(north_mps=5.5), grant) is None
 
 
+@pytest.mark.parametrize(
+    ("height_m", "down_mps", "reason"),
+    [
+        (18.0, 0.1, "the drone is at 18.0 m, above the limit of 15.0 m"),
+        (18.0, -1.0, "the drone climbs to"),
+        (2.0, 0.0, "the drone is at 2.0 m, below the limit of 8.0 m"),
+        (4.0, 1.0, "the drone sinks to"),
+    ],
+)
+def test_monitor_reports_climb_or_descent_only_of_drone_that_climbs_or_sinks(
+    height_m: float, down_mps: float, reason: str
+) -> None:
+    verdict = monitor(at(alt=height_m, down_mps=down_mps), compiled(altitude(lowerLimit=8, upperLimit=15)))
+    assert verdict is not None
+    assert verdict.reason.startswith(reason)
+
+
 def test_known_altitude_limit_applies_despite_limit_of_unknown_datum() -> None:
     grant = compiled(altitude(upperLimit=15), altitude("terrain", lowerLimit=5, altitudeReference="terrain"))
     high = monitor(at(alt=18), grant)

@@ -50,7 +50,7 @@ SINKING_MPS = 0.5
 a drone that the system flies and that sinks faster counts as returning below a limit."""
 
 CLIMBING_MPS = 0.2
-"""Maximum climb rate of a drone that holds its altitude."""
+"""Maximum climb or sink rate of a drone that holds its altitude."""
 
 DEEPER_M = 0.6
 """A drone on the wrong side of a fence is stopped again only if it moves this much farther in."""
@@ -398,7 +398,8 @@ def _check_altitude(
     high = max(now.altitude_m, rest_m)
     low = min(now.altitude_m, rest_m)
     if over is not None and over.upper is not None and high > over.upper + share * slack and not sinks_back:
-        reason = f"the drone climbs to {high:.1f} m, above the limit of {over.upper:.1f} m"
+        moves = "climbs to" if now.down_mps < -CLIMBING_MPS else "is at"
+        reason = f"the drone {moves} {high:.1f} m, above the limit of {over.upper:.1f} m"
         return _altitude_correction(_LimitViolation(over, over.upper, "AltitudeAboveLimit", reason), now, grant, stop)
     if unknown:
         sinking = now.down_mps > -SINKING_MPS
@@ -406,7 +407,8 @@ def _check_altitude(
     if under is not None and under.lower is not None and low < under.lower - slack and not now.vertical:
         if over is not None and over.upper is not None and over.upper < under.lower:
             return None
-        reason = f"the drone sinks to {low:.1f} m, below the limit of {under.lower:.1f} m"
+        moves = "sinks to" if now.down_mps > CLIMBING_MPS else "is at"
+        reason = f"the drone {moves} {low:.1f} m, below the limit of {under.lower:.1f} m"
         return _altitude_correction(_LimitViolation(under, under.lower, "AltitudeBelowLimit", reason), now, grant, stop)
     return None
 

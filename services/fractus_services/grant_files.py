@@ -95,6 +95,8 @@ class GrantFiles:
         self._loaded: dict[Path, ActiveGrant | None] = {}
         self._problems: dict[Path, str] = {}
         """Reported reason why each file cannot be read now. These files are read again at each scan."""
+        self._unreadable: dict[Path, ActiveGrant] = {}
+        """Grants whose files cannot be read now. They are not in force, and are revoked if their files are removed."""
         self._directory_listed = False
         self._directory_problem = ""
         self._active: dict[str, ActiveGrant] = {}
@@ -169,7 +171,7 @@ class GrantFiles:
         if complete:
             renamed = {grant.digest for grant in self._loaded.values() if grant is not None}
             for path in before.keys() - self._loaded.keys():
-                removed = before[path]
+                removed = before[path] or self._unreadable.pop(path, None)
                 if removed is not None and removed.digest not in renamed:
                     self._revoke(removed)
         return changed or any(before.get(path) is not grant for path, grant in self._loaded.items())
@@ -207,7 +209,7 @@ class GrantFiles:
 
     def _load(self, path: Path) -> ActiveGrant | None:
         """Return the Grant of a file. Revoke the previous Grant of the file if it is no longer valid."""
-        before = self._loaded.get(path)
+        before = self._loaded.get(path) or self._unreadable.pop(path, None)
         try:
             grant = self._read(path)
         except (UnsuitableFile, IsADirectoryError, ValueError, InvalidObject, BadSignature) as error:
@@ -222,6 +224,8 @@ class GrantFiles:
                 log.critical("grants: cannot read file, it grants nothing (file=%s error=%s)", path_text(path), error)
                 self._refused(path_text(path.name), str(error))
             self._problems[path] = str(error)
+            if before is not None:
+                self._unreadable[path] = before
             return None
         except Exception as error:
             log.exception("grants: reading failed, the file grants nothing (file=%s)", path_text(path))

@@ -313,6 +313,29 @@ def test_grant_files_return_a_grant_when_a_disk_error_ends(tmp_path: Path, monke
     assert files.active
 
 
+def test_grant_removed_during_a_disk_error_is_revoked_for_good(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    files = grant_files(tmp_path)
+    path = tmp_path / "g.json"
+    path.write_text(granted := body())
+    files.scan()
+    assert files.active
+    with monkeypatch.context() as patch:
+
+        def fail(*_: object) -> bytes:
+            raise OSError(5, "Input/output error")
+
+        patch.setattr(module, "read_json", fail)
+        path.touch()
+        files.scan()
+        files.scan()
+        assert not files.active
+        path.unlink()
+        files.scan()
+    path.write_text(granted)
+    files.scan()
+    assert not files.active
+
+
 def test_removed_grant_is_revoked_for_good_beside_a_file_that_cannot_be_read(tmp_path: Path) -> None:
     files = grant_files(tmp_path)
     (tmp_path / "loop.json").symlink_to("loop.json")

@@ -162,7 +162,7 @@ def silent(alert: str, at: str) -> dict[str, Any]:
     return {"alertname": alert, "eval_time": at, "exp_alerts": []}
 
 
-def test_case(rows: tuple[tuple[str, str], ...], *checks: dict[str, Any]) -> dict[str, Any]:
+def rule_test(rows: tuple[tuple[str, str], ...], *checks: dict[str, Any]) -> dict[str, Any]:
     return {"interval": "15s", "input_series": series(rows), "alert_rule_test": list(checks)}
 
 
@@ -179,14 +179,14 @@ def test_alerts_have_a_case_and_a_section_in_the_docs() -> None:
 def test_alerts_fire_in_their_cases(promtool: str, tmp_path: Path) -> None:
     # An expected alert would have to list all its labels. Instead, expect no alerts, so that promtool reports each one.
     output = judge(
-        promtool, tmp_path, [test_case(case.series, silent(alert, case.at)) for alert, case in CASES.items()]
+        promtool, tmp_path, [rule_test(case.series, silent(alert, case.at)) for alert, case in CASES.items()]
     )
     assert set(re.findall(r"alertname:\s*(\w+)", output)) == set(CASES), output
 
 
 def test_alerts_do_not_fire_in_normal_operation(promtool: str, tmp_path: Path) -> None:
-    healthy = test_case(HEALTHY, *(silent(alert, at) for alert in CASES for at in ("1m", "10m", "14m")))
-    well = [test_case(case.well, silent(alert, case.at)) for alert, case in CASES.items() if case.well]
+    healthy = rule_test(HEALTHY, *(silent(alert, at) for alert in CASES for at in ("1m", "10m", "14m")))
+    well = [rule_test(case.well, silent(alert, case.at)) for alert, case in CASES.items() if case.well]
     assert judge(promtool, tmp_path, [healthy, *well]) == ""
 
 

@@ -197,7 +197,7 @@ def test_cluster_radio_is_replaced_after_its_process_was_killed(site: Site) -> N
         assert time.monotonic() < deadline
         threading.Event().wait(0.05)
     assert not site.ping("drone-1", hub)
-    with pytest.raises(ClusterError, match="radio does not run"):
+    with pytest.raises(ClusterError, match="radio is not running"):
         site.radio.command(uplink="drone-1", off=True)
     site.wire()
     site.wait_until_reachable("drone-1", hub, reachable=True)

@@ -92,7 +92,7 @@ def test_demo_chart_notes_name_existing_application() -> None:
 def test_demo_chart_without_drone_node_fails_with_remedy() -> None:
     result = template()
     assert result.returncode != 0
-    assert "no node has the label fractus.dev/class=drone; label one" in result.stderr
+    assert "no node has the label fractus.dev/class=drone; label a node" in result.stderr
 
 
 def test_demo_chart_refuses_invalid_values() -> None:

@@ -258,7 +258,7 @@ def test_operator_writes_only_objects_that_it_has_created(
             denied(lambda field=field, value=value: client.merge(node, {"metadata": {field: value}}), labels)
         client.merge(node, {"metadata": {"labels": {"fractus.dev/geohash": "sx1"}}})
         guarded = {"metadata": {"labels": {"fractus.dev/guarded": "true"}}}
-        denied(lambda: client.merge(node, guarded), "mark only nodes as guarded")
+        denied(lambda: client.merge(node, guarded), "may mark a node as guarded only if")
         world.api.merge(node, {"spec": {"taints": [{"key": "fractus.dev/class", "effect": "NoExecute"}]}})
         client.merge(node, guarded)
         world.api.merge(node, {"spec": {"taints": []}})

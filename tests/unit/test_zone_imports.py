@@ -242,7 +242,7 @@ def test_geojson_feature_without_an_area_that_a_zone_can_have_is_refused(geometr
     [
         (kml("<Polygon>EDGE<gx:altitudeOffset>5</gx:altitudeOffset></Polygon>"), "Polygon[0].altitudeOffset: may state"),
         (kml("<Polygon>EDGE</Polygon><radius>500</radius>"), "radius: may state"),
-        (kml("<Polygon>EDGE</Polygon><Snippet>up to 120 m</Snippet>"), "Snippet: may state"),
+        (kml("<Polygon>EDGE</Polygon><Snippet>up to 120 m</Snippet><Snippet>x</Snippet>"), "Snippet: may state"),
         (kml("<Polygon>EDGE</Polygon>", '<ExtendedData><Data name="ceiling"><value>1</value></Data></ExtendedData>'), "ExtendedData.ceiling: may"),
         (kml("<Polygon>EDGE</Polygon>", "<Folder><name>f</name><description>until 2027-01-01</description></Folder>"), "description: may state"),
         (kml("<MultiGeometry><Polygon>EDGE</Polygon><Circle><radius>5</radius></Circle></MultiGeometry>"), "MultiGeometry.Circle: may"),
@@ -536,3 +536,22 @@ def test_value_of_another_type_is_refused_with_a_sentence(odd):
     for read, document in files:
         with pytest.raises(InvalidObject):
             read(json.dumps(document))
+
+
+@pytest.mark.parametrize(
+    "around",
+    [
+        '<Snippet maxLines="0"/>',
+        "<ScreenOverlay><name>legend</name><overlayXY x='0' y='1'/></ScreenOverlay>",
+        '<Style id="s1"><LineStyle><width>2</width></LineStyle></Style>',
+        '<Schema name="s"><SimpleField type="int" name="radius"/></Schema>',
+    ],
+)
+def test_kml_elements_for_the_display_do_not_refuse_a_file(around):
+    assert len(formats.read_kml(kml("<Polygon>EDGE</Polygon>", around)).zones) == 1
+    assert len(formats.read_kml(kml("<Snippet maxLines='2'>x</Snippet><Polygon>EDGE</Polygon>")).zones) == 1
+
+
+def test_qgc_plan_with_an_unknown_part_is_refused():
+    with pytest.raises(InvalidObject, match="corridors: a Zone cannot represent this field"):
+        formats.read_qgc_plan(json.dumps({"fileType": "Plan", "corridors": [{"width": 50}]}))

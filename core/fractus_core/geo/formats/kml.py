@@ -35,11 +35,15 @@ _LOOK = frozenset(
         "drawOrder",
     }
 )
+_WITHOUT_MEANING = frozenset({"id", "targetId", "maxLines"})
+"""Attributes that identify or format an element."""
 _DATA = frozenset({"ExtendedData", "Metadata"})
 _AROUND_DATA = _DATA | {"SchemaData", "displayName", "value"}
 _HOLDERS = frozenset({"kml", "Document", "Folder", "Update", "Create", "Change"})
 _TIMES = frozenset({"TimeSpan", "TimeStamp"})
-_OF_HOLDER = _HOLDERS | _LOOK | _TIMES | {"name", "Placemark", "Schema", "NetworkLink", "GroundOverlay"}
+_PICTURES = frozenset({"ScreenOverlay", "PhotoOverlay", "Tour"})
+"""Features that are drawn on the screen or beside the ground, such as a legend, and movements of the viewer."""
+_OF_HOLDER = _HOLDERS | _PICTURES | _LOOK | _TIMES | {"name", "Placemark", "Schema", "NetworkLink", "GroundOverlay"}
 _OF_POLYGON = frozenset({"outerBoundaryIs", "innerBoundaryIs", "altitudeMode", "extrude", "tessellate"})
 _LINES = frozenset({"LineString", "LinearRing"})
 _OTHERS = frozenset({"Point", *_LINES, "Model", "Track", "MultiTrack"})
@@ -102,16 +106,20 @@ def _check_elements(
     builder: ZoneBuilder, title: str, element: ElementTree.Element, known: Collection[str], field: str = ""
 ) -> None:
     """Note unknown elements and data, and reject those that may state the size, altitude or time of a zone."""
-    unknown = {_tag(child): _contents(child) for child in element if _tag(child) not in {*known, *_DATA}}
+    unknown: dict[str, list[Any]] = {}
+    for child in element:
+        if _tag(child) not in {*known, *_DATA}:
+            unknown.setdefault(_tag(child), []).extend(_contents(child))
     builder.properties(title, unknown, (), field)
     builder.properties(title, _data(element), ("identifier",), "ExtendedData")
 
 
-def _contents(element: ElementTree.Element) -> Any:
+def _contents(element: ElementTree.Element) -> list[Any]:
     """Return the attributes, texts and child elements of an element, by name."""
     text = (element.text or "").strip()
     children = [{_tag(child): _contents(child)} for child in element]
-    return [*element.attrib.values(), *([text] if text else []), *children]
+    attributes = {name: value for name, value in element.attrib.items() if name not in _WITHOUT_MEANING}
+    return [attributes, *([text] if text else []), *children]
 
 
 def _check_always(element: ElementTree.Element, field: str) -> None:

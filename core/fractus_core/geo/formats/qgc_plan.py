@@ -25,6 +25,7 @@ from fractus_core.geo.formats.zone_builder import (
 )
 
 _FENCE_VERSION = 2
+_OF_PLAN = frozenset({"fileType", "version", "groundStation", "geoFence", "mission", "rallyPoints"})
 _OF_FENCE = frozenset({"version", "polygons", "circles", "breachReturn"})
 
 
@@ -43,6 +44,7 @@ def read_qgc_plan(text: str, without: Collection[str] = ()) -> Imported:
     document = parse_json(text)
     if document.get("fileType") != "Plan":
         raise InvalidObject("fileType", f"must be Plan, not {document.get('fileType')!r}")
+    reject_unknown_fields(document, _OF_PLAN, "")
     fence = optional_object(document.get("geoFence"), "geoFence")
     if fence and fence.get("version") != _FENCE_VERSION:
         raise InvalidObject(

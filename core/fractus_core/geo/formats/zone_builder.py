@@ -381,7 +381,8 @@ def reject_unknown_fields(fields: Mapping[str, Any], known: Collection[str], fie
     for key, value in fields.items():
         if key not in known and value not in EMPTY:
             raise InvalidObject(
-                f"{field}.{key}", "a Zone cannot represent this field; remove it if it does not affect the zone"
+                f"{field}.{key}" if field else key,
+                "a Zone cannot represent this field; remove it if it does not affect the zone",
             )
 
 

@@ -235,7 +235,7 @@ class GrantSynchronizer:
             self._work.set()
 
     def on_authority_changed(self) -> None:
-        """Verify again the Grants whose authority was unknown."""
+        """Repeat the verification of Grants that failed because their authority was unknown."""
         for body, _ in tuple(self._unverified.values()):
             self._put(body)
         self._work.set()

@@ -253,7 +253,11 @@ def _foreign_pods(cluster: ClusterReader) -> Iterator[Finding]:
 
 
 def _is_subject_to_policy(pod: Body) -> bool:
-    """Return True if policy `fractus-pods` applies to a recreated pod: not a mirror pod, and it tolerates the taint."""
+    """Return True if the admission policy `fractus-pods` will apply to a pod when it is recreated.
+
+    The policy applies to pods that tolerate the taint of drones and edge nodes, except mirror pods. Pods that have
+    ended are not recreated.
+    """
     ended = (pod.get("status") or {}).get("phase") in {"Succeeded", "Failed"}
     mirror = "kubernetes.io/config.mirror" in (pod["metadata"].get("annotations") or {})
     tolerates = any(t.get("key", "") in {"", CLASS} for t in pod["spec"].get("tolerations") or ())

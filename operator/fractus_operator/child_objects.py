@@ -1,7 +1,8 @@
-"""Child objects of Applications: applied if missing or different, deleted if no longer desired.
+"""Reconciliation of the child objects of Applications.
 
-The operator may write and delete Secrets but not read them. The admission policy of the chart allows this only for Secrets that
-it created.
+The operator applies a child object that is missing or different, and deletes a child object that is no longer desired.
+It may write and delete the Secrets of components, but not read them. The chart's admission policy limits writing and
+deleting to Secrets that the operator created.
 """
 
 from __future__ import annotations

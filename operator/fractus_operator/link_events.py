@@ -15,7 +15,10 @@ from fractus_operator.store import Informer, Store
 from fractus_operator.work_queue import WorkQueue
 
 LINK_EVENT_PERIOD_S = 10.0
-"""Minimum time between Events of one link, in seconds. Events then describe the current state and count the changes."""
+"""Minimum time between two reports of one link by Events, in seconds.
+
+If the link changes more often, the next Events contain its current state and the number of changes.
+"""
 
 
 @dataclass(frozen=True, slots=True)

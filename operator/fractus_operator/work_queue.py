@@ -46,14 +46,14 @@ async def run_periodically(name: str, step: Callable[[], Awaitable[None]], perio
 
 @contextmanager
 def skip_failed_node(name: str, node: str) -> Iterator[None]:
-    """Log an error of one node's part of a step, so that the step continues with the other nodes.
+    """Log an error that occurs for one node, so that the step continues with the next node.
 
     Args:
         name: Name of the step in the log.
         node: Name of the drone or edge node.
 
     Raises:
-        KubeError: The API server did not respond. It would not respond for other nodes either.
+        KubeError: The API server did not respond. The step ends, because requests for other nodes would fail too.
     """
     try:
         yield

@@ -86,14 +86,14 @@ class RateLimiter:
 
 
 class CallAdmission(grpc.aio.ServerInterceptor):  # type: ignore[misc]  # grpc has no types
-    """Admits the calls of one service, traces them, and ends failed calls with a status.
+    """Interceptor of one service: authorizes calls, traces them, and ends failed calls with a gRPC status.
 
     Args:
         grants: Grants of this node.
         clock: Returns Unix time.
         translate: Converts an exception of the service to a refusal, or returns None for an unknown exception.
-        failed: Callback invoked with the verdict on an unexpected exception.
-        on_passenger: Callback invoked with the Grant of a caller that is no driver, whenever its Grant is looked up.
+        failed: Callback invoked with a verdict when a call raises an unexpected exception.
+        on_passenger: Callback invoked with the Grant of a caller that is not a driver, each time the Grant is read.
     """
 
     def __init__(
@@ -205,12 +205,13 @@ class CallAdmission(grpc.aio.ServerInterceptor):  # type: ignore[misc]  # grpc h
         return build(behaviour, None, handler.response_serializer)
 
     async def _received(self, unsent: Counter[str], context: Any) -> Any:
-        """Return the request of a call as bytes, or EOF.
+        """Return the request message of a call as bytes, or EOF if the client sent none.
 
-        End the call if the request is late, or if too many calls wait for their requests.
+        Abort the call if its request message does not arrive in time. Also abort it if too many calls of the same
+        client still wait for their request messages.
 
         Args:
-            unsent: Number of calls of each identity whose request has not arrived.
+            unsent: Number of calls without a request message, by identity of the client.
             context: gRPC context of the call.
         """
         try:

@@ -56,9 +56,10 @@ def resting_place(v: VehicleState) -> Vector:
 
 
 class Leg:
-    """Leg from the position where the current motion would come to rest to a local point.
+    """Leg of the simulated vehicle to a local point.
 
-    Create the object when the leg begins. Then call `step` in each control step while the vehicle flies the leg.
+    The leg starts at the position where the current motion of the vehicle would come to rest. Create the object
+    when the leg begins. Then call `step` in each control step while the vehicle flies the leg.
     """
 
     def __init__(self, v: VehicleState, north: float, east: float, down: float) -> None:

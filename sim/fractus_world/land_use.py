@@ -267,7 +267,15 @@ def _row(site: Site, ground: shapely.Polygon) -> list[shapely.Geometry]:
 
 
 def _frontage(line: shapely.LinearRing, at_m: float) -> _Frontage:
-    """Return the frontage at a distance along a closed line. Its direction `away` points to the inside of the line."""
+    """Return the frontage at a point of a closed line.
+
+    Args:
+        line: Outline of a block.
+        at_m: Distance of the point along the outline, in metres.
+
+    Returns:
+        The frontage. Its direction `away` points into the block.
+    """
     behind = line.interpolate(at_m - 1.0)
     ahead = line.interpolate(at_m + 1.0)
     length = max(math.hypot(ahead.x - behind.x, ahead.y - behind.y), 1e-6)

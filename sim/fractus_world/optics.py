@@ -181,7 +181,14 @@ class View:
         )
 
     def rays(self, pixels: Matrix) -> Matrix:
-        """Return the directions (east, north, up) of pixels, shape (..., 2) to (..., 3). The optical axis has length 1."""
+        """Return the direction in which the camera sees each pixel.
+
+        Args:
+            pixels: Pixel coordinates, shape (..., 2).
+
+        Returns:
+            Vectors east, north and up, shape (..., 3). Their component along the optical axis is 1.
+        """
         lens = self.intrinsics
         across = (pixels - np.array([lens.width / 2.0, lens.height / 2.0])) / lens.focal_px
         ahead = np.ones((*across.shape[:-1], 1))

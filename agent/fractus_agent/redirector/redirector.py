@@ -126,12 +126,12 @@ class Redirector:
             raise
 
     def set_services(self, services: Iterable[Endpoint], callers: Callers = NO_GUARDS) -> None:
-        """Set the services that clients on this node connect to. Redirects of other services end.
+        """Set the services to which clients on this node connect, and remove the redirects of all other services.
 
         Args:
-            services: Endpoints that clients connect to.
-            callers: Allowed clients by guarded endpoint. On a node with clients, the guarded endpoints are services. On other
-                nodes they are pods that accept only traffic of a direct link.
+            services: Endpoints of the services.
+            callers: Clients that may connect to each guarded endpoint. On a node with clients, the guarded endpoints
+                are services. On other nodes, they are pods that accept only traffic of a direct link.
 
         Raises:
             NetlinkError: The kernel refused the transaction. Nothing has changed.

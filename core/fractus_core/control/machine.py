@@ -515,7 +515,10 @@ def _end_grace(update: StateUpdate) -> None:
 
 
 def _attend(update: StateUpdate) -> None:
-    """Take over the vehicle: hover and wait for the driver of a mission that continues, otherwise return."""
+    """Take over a vehicle for which no party has control authority.
+
+    If the vehicle is airborne and its mission continues, hover and wait for a driver. Otherwise, return.
+    """
     mission = update.state.mission
     state = update.state
     update.set(authority=Authority.SYSTEM)

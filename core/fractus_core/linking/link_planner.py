@@ -199,7 +199,7 @@ def _while_up(
 def _unroll(
     state: int, current: int, names: Sequence[str], horizon: Horizon, solution: Solution
 ) -> tuple[PlanSegment, ...]:
-    """Return the segments of the plan, for people."""
+    """Return the planned links in order of time, as segments to display."""
     segments = [PlanSegment(0.0, names[state])]
     step = horizon.connect_steps if state != current else 0
     while step < horizon.steps:

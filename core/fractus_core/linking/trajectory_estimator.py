@@ -112,7 +112,11 @@ def _is_passed(index: int, position: LocalPosition, points: Sequence[LocalPositi
 
 
 def _leg_distance(position: LocalPosition, begin: LocalPosition, end: LocalPosition) -> tuple[float, float]:
-    """Return the distance to a leg in metres, and the share of the leg at which it is nearest."""
+    """Return the distance from a position to the nearest point of a leg, and the place of that point on the leg.
+
+    Returns:
+        Distance in metres, and the place as a share of the leg's length: 0 at its begin, 1 at its end.
+    """
     along = [b - a for a, b in zip(begin, end, strict=True)]
     square = sum(a * a for a in along)
     share = sum(a * (p - b) for a, p, b in zip(along, position, begin, strict=True)) / square if square else 0.0

@@ -29,7 +29,7 @@ _TILT_RAD = math.atan((math.sqrt(5) - 1) / 2)
 """Tilt of the lattice rows. No usual direction of roads or paths is parallel to them, so straight legs are sampled evenly."""
 
 _BATCH = 256
-"""Number of stale bounds that are updated at once. One numpy call per bound would cost more time."""
+"""Number of outdated bounds that one numpy call updates. One call per bound would be slower."""
 _CHUNK = 2048
 """Number of candidates whose runs are computed at once; limits the memory of a step."""
 _TABLE = 2_000_000

@@ -66,11 +66,12 @@ def find_static(builder: PlanBuilder, component: Component) -> list[Location]:
 def place_static(builder: PlanBuilder, locations: Sequence[Location]) -> None:
     """Fill the locations of all static components with the nearest suitable nodes.
 
-    A node hosts a component only once. If the nearest nodes do not suffice for all locations that need instances, some
-    locations use other nodes (see `_NodeMatching`). Locations for every suitable node get the remaining nodes.
+    A node hosts a component only once. Locations that request a number of instances choose first. If several of them
+    need the same node, some of them use nodes that are farther away (see `_NodeMatching`). Locations that request an
+    instance on every suitable node (`instances: "*"`) then get the remaining nodes.
 
     Raises:
-        Infeasible: A location that needs instances gets none.
+        Infeasible: A location that requests a number of instances gets none.
     """
     matching = _NodeMatching(builder)
     numbered = [location for location in locations if location.spot.instances != "*"]
@@ -97,10 +98,10 @@ def place_static(builder: PlanBuilder, locations: Sequence[Location]) -> None:
 class _NodeMatching:
     """Assignment of nodes to locations.
 
-    A location without a free node takes a node from another location, which gets another node in the same way: an
-    augmenting path of bipartite matching (H. W. Kuhn 1955). If all instances request equal resources, the result has the maximum
-    number of instances. It depends only on the order of components, locations and nodes. Running instances yield to the
-    first instance of a location, but not to further ones.
+    A location without a free node takes a node from a second location. The second location then gets a replacement in
+    the same way. This is an augmenting path of bipartite matching (H. W. Kuhn 1955). If all instances request equal
+    resources, the result has the maximum number of instances. It depends only on the order of components, locations and
+    nodes. A running instance is moved only for the first instance of a location, not for further ones.
     """
 
     def __init__(self, builder: PlanBuilder) -> None:
@@ -364,7 +365,7 @@ def place_along(
 
 
 def _reject_without_coverage(builder: PlanBuilder, component: Component, scene: CoverScene, hosts: HybridHosts) -> None:
-    """Reject candidates in range of the drone whose own range does not reach the operation area."""
+    """Reject the candidates whose direct links cover no part of the operation area."""
     node, first, end = scene.samples.runs(scene.xy, scene.reach_m)
     useful = np.zeros(len(scene.names), dtype=bool)
     useful[node[end > first]] = True

@@ -48,7 +48,7 @@ _PERMITTING_KINDS = frozenset({"inclusion", "grant"})
 """Kinds of policies that allow something only in their zones. Their zones out of reach are therefore kept."""
 
 _Bounds = tuple[Point, float]
-"""A position, and the distance from it in metres up to which zones matter."""
+"""A position, and the distance in metres within which a zone may affect the node."""
 
 FIXED_NODE_REACH_M = 1000.0
 """Zones further than this from a fixed node do not affect it, unless its camera may see them."""
@@ -321,7 +321,7 @@ def _granted(
 
 
 def _concerns_pictures(spec: PolicySpec) -> bool:
-    """Return True if a policy also applies to zones that a camera sees from a distance."""
+    """Return True if a policy also applies to zones that the camera can see from outside."""
     return spec.type == "PrivacyControl" or not PICTURE_METHODS.isdisjoint(spec.methods)
 
 

@@ -294,7 +294,11 @@ def _segments(frame: LocalFrame, flight: Flight) -> tuple[_Spots, _Spots]:
 
 
 def _passages(starts: _Spots, ends: _Spots, spot: Sequence[float], radius_m: float) -> _Spots:
-    """Return the interval (0 to 1) of each segment within a radius of a spot, infinite if none is; shape (n, 2)."""
+    """Return the part of each segment within a radius of a point.
+
+    Returns:
+        Begin and end of the part as shares of the segment, shape (n, 2). Infinite if no part is within the radius.
+    """
     along = ends[:, :2] - starts[:, :2]
     offset = starts[:, :2] - np.array(spot[:2])
     a = (along**2).sum(axis=1)

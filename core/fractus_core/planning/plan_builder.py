@@ -96,7 +96,7 @@ class PlanBuilder:
     # -- checks --
 
     def check_edge(self, node: EdgeNode, component: Component) -> Check:
-        """Check if an edge node can host the component. Otherwise return the first failed requirement."""
+        """Check if an edge node can host the component. The result contains the first failed requirement, if any."""
         kept = self.was_placed(component, node.name)
         return (
             check_host(self.inventory.hosts, node.name, self.settings, kept=kept)
@@ -197,7 +197,7 @@ class PlanBuilder:
         return tuple(listed), len(listable) - len(listed) + far
 
     def _unlisted(self, component: str, mentioned: set[str]) -> int:
-        """Return the number of nodes out of range for a component that are not mentioned."""
+        """Return the number of nodes that are out of range for a component and not listed in the plan."""
         candidates, known = self._candidates.get(component, (set(), 0))
         return max(known - len(candidates | mentioned), 0)
 

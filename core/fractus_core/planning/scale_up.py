@@ -1,4 +1,4 @@
-"""Detection of nodes on which an existing plan could have more instances."""
+"""Search for nodes that could host additional instances of an existing plan."""
 
 from __future__ import annotations
 

@@ -178,7 +178,7 @@ class SpatialIndex:
         return [names[i] for i in order], xy[order]
 
     def _chords(self, lat: float, lon: float) -> _Floats:
-        """Return the chord to each slot in metres, infinite for free slots."""
+        """Return the chord length to the point in each slot, in metres. It is infinite for free slots."""
         chords = self._xyz - np.array(ecef(lat, lon))
         lengths: _Floats = np.sqrt(np.einsum("ij,ij->i", chords, chords))
         return lengths

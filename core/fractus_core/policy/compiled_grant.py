@@ -22,7 +22,7 @@ from fractus_core.policy.decision_types import Home, Situation, UncertainTime, e
 MAX_FRAME_REACH_M = 500_000.0
 """Zones farther than this from the origin are left out of the frame, because no drone reaches them."""
 MAX_UNINDEXED = 4
-"""Up to this number of zones, testing each zone is faster than an index."""
+"""Number of zones above which a spatial index is used. For fewer zones, testing each zone is faster."""
 _PERMITTING_KINDS = frozenset({"inclusion", "grant"})
 """Kinds of policies that permit something inside their zones.
 
@@ -263,7 +263,7 @@ def _rule(policy: GrantedPolicy) -> Rule:
 
 
 def _prepared(shape: BaseGeometry) -> BaseGeometry:
-    """Index the edges of a shape in place (GEOS), because thousands of checks against the shape follow."""
+    """Build the GEOS index of a shape in place, because the shape is checked thousands of times."""
     shapely.prepare(shape)
     return shape
 

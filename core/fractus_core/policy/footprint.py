@@ -15,9 +15,12 @@ from fractus_core.policy.decision_types import Attitude, Lens, Situation
 from fractus_core.policy.kinematics import XY
 
 MAX_SIGHT_M = 10_000.0
-"""Nothing is recognisable from farther away: at a field of view of 5 degrees, 8 megapixels resolve 0.3 m there."""
+"""Maximum distance at which a picture shows recognisable objects.
+
+With a field of view of 5 degrees, 8 megapixels resolve 0.3 m at this distance.
+"""
 MAX_HALF_VIEW_DEG = 80.0
-"""A view that reaches farther to one side, errors included, counts as seeing everything."""
+"""Maximum half angle of a view, including errors. A camera with a wider view is assumed to see everything around it."""
 _MAX_TURN_DEG = 60.0
 """Largest yaw error for which tangents bound the turned corners. For larger errors, a circle bounds them."""
 _ARC_DEG = 15.0
@@ -35,11 +38,12 @@ Vector = tuple[float, float, float]
 
 @dataclass(frozen=True, slots=True)
 class Footprint:
-    """Ground and air that a picture may show, in metres east and north in the frame of a grant.
+    """The part of the ground and the air that a picture may show.
 
     Attributes:
-        sight: Horizontal outline of the air between the camera and the visible ground, including both.
-        margin_m: Bound of the camera's position error. It applies around `sight`.
+        sight: Horizontal outline of the camera, the visible ground and the air between them, in metres east and north
+            in the frame of a grant.
+        margin_m: Bound of the camera's position error. Objects within this distance of `sight` may be visible.
         upper_m: Height above home of the highest visible point. Infinite if the picture may show sky.
         farthest_m: Distance from the camera to the farthest ground shown. Infinite at the horizon.
     """
@@ -65,7 +69,7 @@ class Footprint:
             return False
         if self._at is None or not (upper_m < self._lowest_m or lower_m > 0.0):
             return True
-        # All rays are straight and lead down, so the view at a depth is the view at depth 1, enlarged.
+        # All rays are straight and lead down, so the size of the visible area is proportional to the depth.
         far = self._highest_m - max(lower_m, 0.0)
         near = max(self._lowest_m - upper_m, 0.0)
         if far < 0.0:
@@ -95,10 +99,10 @@ def exposure_footprint(poses: Sequence[Situation], frame: LocalFrame) -> Footpri
 
 
 def footprint(now: Situation, frame: LocalFrame) -> Footprint | None:
-    """Return the present footprint, or None while the position is unknown. It includes all errors within their bounds.
+    """Return the present footprint, enlarged by the bounds of all errors. Return None while the position is unknown.
 
-    The ground counts as level, between home's altitude and `relief_m` below it. If attitude, lens or ground is unknown,
-    the camera counts as seeing everything around it.
+    The ground is assumed to be level, at an altitude between home and `relief_m` below home. If the attitude, the lens
+    or the ground is unknown, the camera is assumed to see everything around it.
     """
     if now.lat is None or now.lon is None or not now.is_plausible:
         return None
@@ -152,7 +156,7 @@ def _everything(position: XY, now: Situation) -> Footprint:
 
 
 def _widened(lens: Lens, error_deg: float) -> tuple[float, float] | None:
-    """Return the tangents of the half views that contain every ray for every direction of the error.
+    """Return the tangents of the half views, widened so that they contain every ray for any direction of the error.
 
     On the sphere of directions a turn by e moves a ray sideways by at most asin(sin e / cos elevation).
     """
@@ -222,7 +226,7 @@ def _sector(position: XY, now: Situation, axis: Vector, corners: list[Vector], e
 
 
 def _turned(corners: list[XY], error_deg: float) -> list[XY]:
-    """Return points whose hull contains the corners of a piece of ground for every yaw error."""
+    """Return points whose convex hull contains the corners of an area at every possible yaw error."""
     if error_deg <= 0.0:
         return corners
     if error_deg > _MAX_TURN_DEG:

@@ -26,12 +26,12 @@ _SIMPLIFY_TOLERANCE_M = 0.2
 _MAX_EXACT_CORNERS = 24
 """Shapes with at most this number of corners are not simplified."""
 _SEGMENTS = 3
-"""Straight pieces around a corner, per quarter of a circle. Each additional piece is an additional corner to search."""
+"""Number of straight edges that replace a quarter of a circle at a corner. More edges make the search slower."""
 
 
 @dataclass(frozen=True, slots=True)
 class FreeSpace:
-    """Air between two altitudes in which a route may lead, and the fences in it."""
+    """The air between two altitudes through which a route may lead, and its fences."""
 
     now: Situation
     grant: CompiledGrant

@@ -29,7 +29,7 @@ SEVERITY: dict[GeofenceAction, int] = exhaustive(
 """Severity of each action. A higher value takes more control from the application."""
 
 HOME_RADIUS_M = 5.0
-"""A leg that ends within this distance of home is a return, and a leg that starts within it a departure.
+"""A leg that ends within this distance of home counts as a return. A leg that starts within it counts as a departure.
 
 Both are permitted regardless of the position of the operation area.
 """
@@ -48,7 +48,7 @@ RTL_CONE_SLOPE = 3.0
 owner configures that (ArduPilot parameter RTL_CONE_SLOPE)."""
 
 BISECTION_STEPS = 24
-"""Steps of the search for the point at which a leg is far enough from a fence. The result is accurate to a millimetre."""
+"""Number of bisection steps to find the point where a leg is far enough from a fence. The error is below 1 mm."""
 
 _SAMPLES = 24
 """Number of sample points on the illegal part of a leg at which its distance to the border must not shrink."""
@@ -159,7 +159,7 @@ def _check_operation_area(leg: Leg, now: Situation, grant: CompiledGrant, margin
 
 
 def _approaches(leg: Leg, now: Situation, grant: CompiledGrant, operation_area: BaseGeometry) -> bool:
-    """Return True if a leg leads a drone that is outside the operation area closer to this area or to home."""
+    """Return True if the drone is outside the operation area, and the leg leads closer to this area or to home."""
     stop = shapely.points(leg.stop)
     end = shapely.points(leg.target)
     if operation_area.covers(stop):
@@ -387,7 +387,7 @@ def _path_from_rest(certain: BaseGeometry, leg: Leg) -> BaseGeometry:
 def _only_gains_distance(
     leg: Leg, keeps: Callable[[BaseGeometry], bool], clearance: Callable[[BaseGeometry], float]
 ) -> bool:
-    """Return True if a leg that begins too close to a fence gains distance until it is far enough, and then stays so.
+    """Return True if a leg that begins too close to a fence moves away until it is far enough, and then stays so.
 
     Distances are measured to the original fence, because growing or shrinking a shape of ten thousand corners takes seconds.
     """

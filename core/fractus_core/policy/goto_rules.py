@@ -68,7 +68,7 @@ def judge_goto(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
 
 
 def _turns_too_wide(verdict: Verdict, args: GotoArgs) -> bool:
-    """Return True if a leg from standstill may get a better verdict."""
+    """Return True if a stop before the leg may lead to a better verdict."""
     return not verdict.permits or _shortened(verdict, args)
 
 

@@ -34,15 +34,15 @@ def stopping_distance_m(speed_mps: float, accel_mps2: float, position_gain: floa
 
 
 def reaction_s(situation: Situation, accel_mps2: float) -> float:
-    """Return the time at unchanged speed before braking takes effect: latency, and half the time of the jerk limit."""
+    """Return the seconds at unchanged speed before braking takes effect: latency plus half the time to full braking."""
     return situation.latency_s + accel_mps2 / (2 * situation.airframe.jerk_mps3)
 
 
 def pending_outcomes(now: Situation, position: XY) -> list[tuple[XY, Situation]]:
-    """Return the states that the drone may reach by its pending velocity setpoints before a decision takes effect.
+    """Return the extreme states that the drone may reach before a new command takes effect.
 
-    The drone may follow a pending setpoint from now on, with full acceleration. The results are the extreme cases. The
-    drone may also follow several setpoints in succession, which leads to a state between these cases.
+    Until then, the drone may follow any of its pending velocity setpoints, with full acceleration. If it follows
+    several of them in succession, its state lies between the returned states.
 
     Returns:
         Position in frame metres and situation, for each extreme case.
@@ -88,7 +88,7 @@ def _bounding_velocities(velocities: tuple[tuple[float, float, float], ...]) -> 
 
 
 def situation_at_rest(now: Situation, grant_frame: LocalFrame, position: XY) -> Situation:
-    """Return the situation of a drone that is commanded to stop now, when it has come to rest."""
+    """Return the situation after a drone that is commanded to stop now has come to rest."""
     lat, lon = grant_frame.latlon(*stop_point(now, position))
     return replace(
         now, lat=lat, lon=lon, altitude_m=stop_altitude_m(now), north_mps=0.0, east_mps=0.0, down_mps=0.0, pending=()
@@ -109,7 +109,7 @@ class MotionBeforeReaction:
 
 
 def motion_before_reaction(situation: Situation) -> MotionBeforeReaction:
-    """Return how far a drone flies, and how fast it may become, before it obeys a command.
+    """Return the distance that a drone flies before it obeys a command, and the speed that it may have then.
 
     An accelerating drone keeps accelerating for the latency, and then until its jerk limit ends the acceleration. If
     its acceleration is unknown, full acceleration is assumed, unless the drone flies at its speed setpoint.
@@ -121,7 +121,7 @@ def motion_before_reaction(situation: Situation) -> MotionBeforeReaction:
     if forward is None:
         forward = airframe.accel_mps2 if STATIONARY_MPS <= speed < situation.speed_setpoint_mps else 0.0
     elif forward < 0.0 and situation.is_pending_motion:
-        forward = 0.0  # A pending setpoint may have ended the braking.
+        forward = 0.0  # The drone may have stopped braking because of a pending setpoint.
     forward = min(max(forward, -airframe.accel_mps2), airframe.accel_mps2)
     if forward <= 0.0:
         # A braking drone keeps braking, so its speed is lower when the command takes effect.
@@ -142,7 +142,7 @@ def motion_before_reaction(situation: Situation) -> MotionBeforeReaction:
 def stop_point(situation: Situation, position: XY) -> XY:
     """Return the point of rest in frame metres if the drone is commanded to stop now."""
     speed = math.hypot(situation.north_mps, situation.east_mps)
-    # Below the noise of a GNSS velocity its direction is meaningless.
+    # A velocity below the noise of GNSS has no meaningful direction.
     if speed < 0.05:
         return position
     airframe = situation.airframe
@@ -270,7 +270,7 @@ class Leg:
 
     @property
     def _beyond(self) -> XY:
-        """Farthest point of an overshoot. A drone that turns on its way swings past the target."""
+        """Farthest point beyond the target that a drone may reach, because a drone that turns in flight overshoots."""
         if self.follows_velocity:
             return self.target
         tx, ty = self.turn
@@ -314,10 +314,10 @@ def goto_leg(now: Situation, position: XY, target: XY, altitude_m: float) -> Leg
 
 
 def velocity_leg(now: Situation, position: XY, args: VelocityArgs) -> Leg:
-    """Return the leg of a drone that takes up a velocity, keeps it for its hold time, and stops.
+    """Return the leg of a drone that changes to a velocity, keeps it for the hold time, and stops.
 
-    The ground is the convex hull of the possible positions. Latency may delay the beginning, the end, or neither.
-    The target is the last possible point of rest.
+    Latency may delay the beginning of the motion, its end, or neither. The ground of the leg is the convex hull of the
+    drone's positions in all three cases. The target is the point of rest in the case that ends last.
     """
     airframe = now.airframe
     reaction = motion_before_reaction(now)

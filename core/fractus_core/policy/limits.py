@@ -46,7 +46,7 @@ class Bound:
 
 @dataclass(frozen=True, slots=True)
 class Correction:
-    """A value inside all limits. Code, reason and policies are set if the value was changed."""
+    """A value that satisfies all limits. Code, reason and policies are set if the value was changed."""
 
     value: float
     code: str = ""
@@ -201,12 +201,15 @@ def clamp(quantity: str, unit: str, value: float, bounds: list[Bound]) -> Correc
 
 
 def is_achievable(quantity: str, limit: float | None) -> bool:
-    """Return True if a value may be corrected to a limit: any finite altitude, and any speed above zero."""
+    """Return True if a value may be corrected to a limit.
+
+    The limit must be finite. A speed limit must also be above zero.
+    """
     return limit is not None and math.isfinite(limit) and (quantity != "Speed" or limit > 0)
 
 
 def check_contradiction(quantity: str, unit: str, bounds: list[Bound]) -> Verdict | None:
-    """Return the denial of every value if limits contradict each other, or None."""
+    """Return a denial if no value satisfies both the lower and the upper limits, or None if a value does."""
     highest = _highest(bounds)
     lowest = _lowest(bounds)
     if lowest <= highest + ROUNDING_SLACK:

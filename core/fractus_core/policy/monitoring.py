@@ -111,7 +111,7 @@ def monitor(
     if worst is not None:
         return replace(worst, brake_first=worst.action == "takeover" and now.is_moving)
     for outcome_position, outcome in outlooks:
-        # The drone may come to rest before the fence. It is stopped now, and taken over only if it does go too far.
+        # The drone may still come to rest before the fence. Stop it now. It is taken over only if it passes the fence.
         further = _stopping_path(
             outcome,
             outcome_position,
@@ -123,7 +123,7 @@ def monitor(
         if worst is not None:
             return replace(worst, action="deny", takeover="hover")
     if fences_changed and current_leg is not None:
-        # A leg that has become illegal is stopped at once. A later stop would depend on the link at that moment.
+        # Stop a leg that has become illegal at once, because the link to the autopilot may fail later.
         worst = _worst(
             _fence_reactions(
                 now, grant, _rest_of_leg(now, grant, start, current_leg, margin), system_flies=system_flies
@@ -132,7 +132,7 @@ def monitor(
         if worst is not None:
             return replace(worst, brake_first=worst.action == "takeover" and now.is_moving)
     rest_m = _altitude_after_stop_m(now, level_m)
-    # A climb initiated by the autopilot was never judged and may end anywhere, so it gets only part of the tolerance.
+    # No rule has checked a climb that the autopilot started, and its end is unknown. So its tolerance is smaller.
     unjudged_climb = system_flies and current_leg is None and now.down_mps < -CLIMBING_MPS
     correction = _check_altitude(
         now, grant, start, stop, rest_m, sinks_back=system_flies, share=0.5 if unjudged_climb else 1.0
@@ -170,7 +170,10 @@ def _rest_position(now: Situation, start: XY, stop: XY, target: XY) -> XY:
 
 
 def _rest_altitude_m(now: Situation, current_leg: GotoArgs | None, grant: CompiledGrant) -> float:
-    """Return the altitude of rest of a drone that climbs or sinks to the altitude of its leg. See `_rest_position`."""
+    """Return the altitude above home at which a climbing or sinking drone comes to rest.
+
+    The result is the altitude of the drone's leg if the drone can brake for it as planned, as in `_rest_position`.
+    """
     rest_m = stop_altitude_m(now)
     climb = -now.down_mps
     if current_leg is None or current_leg.alt is None or climb == 0.0:
@@ -187,10 +190,11 @@ def _rest_altitude_m(now: Situation, current_leg: GotoArgs | None, grant: Compil
 
 
 def _altitude_after_stop_m(now: Situation, rest_m: float) -> float:
-    """Return the altitude of rest of a drone that was already commanded to climb or sink no further.
+    """Return the altitude of rest, and consider that the drone may already have received a command to stop its climb.
 
-    The result is used for altitude limits: the drone already reacts to that command, and a correction would arrive even
-    later. Zones are judged by the altitude of rest after a command given now.
+    `rest_m` assumes that the command is sent now. If a pending command already ends the climb or descent, the drone
+    comes to rest earlier by the distance that it covers during the latency. Only altitude limits use this result.
+    Zones are judged with `rest_m`.
     """
     climb = -now.down_mps
     if not now.pending or -now.pending[-1][2] * climb > 0.0:
@@ -200,10 +204,11 @@ def _altitude_after_stop_m(now: Situation, rest_m: float) -> float:
 
 
 def must_stop_first(now: Situation, grant: CompiledGrant) -> bool:
-    """Return True if a moving drone must come to rest before it begins anything else, even a legal motion.
+    """Return True if a moving drone must come to rest before it begins another motion.
 
-    This is the case if its path to rest comes so close to a fence that the monitor could stop it on the new course as well.
-    The check uses the margin of legs. It ignores braking that has begun, because a new command may interrupt it.
+    The drone must come to rest if its stopping path comes closer to a fence than the margin of legs. Otherwise, the
+    monitor could interrupt the next motion, even a legal one. Braking that has begun is ignored, because a new command
+    may interrupt it.
     """
     position = grant.locate(now)
     if position is None or not now.in_air or not now.is_moving:
@@ -230,7 +235,7 @@ def _stopping_path(now: Situation, start: XY, stop: XY, margin: float, rest_m: f
     path = shapely.points(start) if start == stop else shapely.linestrings((start, stop))
     lower = min(now.altitude_m, rest_m) - now.altitude_error_m
     upper = max(now.altitude_m, rest_m) + now.altitude_error_m
-    # A fence below does not keep a landing drone in the air.
+    # A landing drone may descend into a fence below it, so ignore its descent.
     ends_m = max(rest_m, now.altitude_m) if now.vertical else rest_m
     return _StoppingPath(
         AirVolume(path, margin, lower, upper), shapely.points(start), shapely.points(stop), now.altitude_m, ends_m
@@ -256,7 +261,15 @@ class _StoppingPath:
 
 @dataclass(frozen=True, slots=True)
 class _Fence:
-    """Name and action of a fence, and the codes of its breach after and before it happens."""
+    """A fence, with the texts for verdicts on it.
+
+    Attributes:
+        policy: Name of the policy.
+        action: Action of the policy.
+        name: Name of the fence in messages.
+        broken: Verdict code if the drone is on the wrong side.
+        ahead: Verdict code if the drone is about to reach the wrong side.
+    """
 
     policy: str
     action: GeofenceAction

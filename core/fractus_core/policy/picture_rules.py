@@ -19,7 +19,7 @@ _FILTER_ORDER: tuple[FilterAction, ...] = exhaustive(
 """Filters from mildest to strictest, which is also the order of their application."""
 _FALLBACK_ORDER: tuple[Fallback, ...] = exhaustive(Fallback, ("blurAverage", "black", "refuse"))
 _WHOLE_PICTURE_FILTERS: frozenset[FilterAction] = frozenset({"blurMedian", "blurAverage", "black"})
-"""Filters of the whole picture. They leave no face to find."""
+"""Filters of the whole picture. After them, no face is recognisable."""
 
 
 def judge_privacy(now: Situation, grant: CompiledGrant) -> Verdict:

@@ -41,7 +41,7 @@ def judge_takeoff(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
 
 
 def _climb_problem(position: XY, now: Situation, grant: CompiledGrant, altitude_m: float) -> Verdict | None:
-    """Return the objection to a climb because of fences or the return route, or None."""
+    """Return the denial of a climb that breaks a fence or has no legal return route, or None."""
     return _vertical_problem(position, now, grant, now.altitude_m, altitude_m) or check_return(
         position, altitude_m, now, grant
     )

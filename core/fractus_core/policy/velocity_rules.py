@@ -39,7 +39,7 @@ from fractus_core.policy.limits import (
 )
 
 RETURN_CLIMB_MPS = 1.0
-"""Vertical speed with which a drone beyond an altitude limit is led back."""
+"""Vertical speed at which a drone that violates an altitude limit returns to the limit."""
 
 MIN_SCALED_MPS = 0.3
 """A velocity that would be scaled below this speed is denied."""
@@ -63,7 +63,7 @@ def judge_speed(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
 
 @dataclass(slots=True)
 class _Setpoint:
-    """A velocity setpoint while it is corrected to limits and fences."""
+    """A velocity setpoint during its correction to limits and fences."""
 
     args: VelocityArgs
     now: Situation
@@ -219,7 +219,7 @@ def _exceeds_limit(setpoint: _Setpoint, args: VelocityArgs, edge: float, *, abov
 
 
 def _scaled_climb(setpoint: _Setpoint, edge: float, *, above: bool) -> VelocityArgs:
-    """Return the largest fraction of the vertical part that stays within a limit. Zero always does."""
+    """Return the largest fraction of the vertical part with which the drone stays within a limit, or zero."""
     args = setpoint.args
     best = replace(args, down_mps=0.0)
     low = 0.0

@@ -96,10 +96,11 @@ def _compare(other: Pixels, visible: npt.NDArray[np.uint8], picture: Pixels) -> 
 
 
 def _match_exposure(first: Pixels, second: Pixels, visible: Mask) -> tuple[Pixels, Pixels] | None:
-    """Reduce two aligned frames to the exposure of the darker one, for each colour channel.
+    """Adjust two aligned frames to the same exposure.
 
-    A camera that adapts its exposure or white balance between two frames changes all pixels, including pixels of still
-    objects. If the brighter frame is saturated, the darker frame is clipped at the same level.
+    In each colour channel, the brighter frame is scaled down to the level of the darker one. Otherwise, a change of
+    exposure or white balance between the frames would count as motion. Saturated pixels of the brighter frame do not
+    contain the true brightness, so both frames are clipped at the scaled saturation level.
 
     Returns:
         The two frames, or None if the exposure changed too much.

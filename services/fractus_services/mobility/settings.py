@@ -182,8 +182,8 @@ class MobilitySettings:
     setpoint_resend_s: float = 0.2
     """Seconds of the vehicle's clock between repetitions of a velocity setpoint.
 
-    A lost message must not leave the previous setpoint in force, and ArduCopter itself stops after GUID_TIMEOUT without one
-    (1 s, set with the failsafes).
+    If the message of a setpoint is lost, a repetition ends the previous setpoint. ArduCopter also stops if it receives
+    no setpoint for GUID_TIMEOUT (1 s, set together with the failsafes).
 """
 
     min_hold_s: float = 1e-3

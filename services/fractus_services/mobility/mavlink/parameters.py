@@ -81,7 +81,10 @@ class Parameters:
         self.forget()
 
     def forget(self) -> None:
-        """Reset after the connection broke: the next answers may be from another vehicle or release."""
+        """Delete all received values.
+
+        Call this after a connection loss, because the next vehicle may be another one or run another firmware release.
+        """
         self.values: dict[str, float] = {}
         self._value_received = asyncio.Event()
         self._number = 0

@@ -164,8 +164,8 @@ class Timing:
         since_s = now - self._history[0][0]
         if since_s < RATE_S[0]:
             return
-        # If a position at the start of the period was late, the clock seems fast. Take the smaller of the rates since
-        # the first and since the second position, because rarely both are late.
+        # If the first position of the period arrived late, the measured rate is too high. Therefore measure from the
+        # second position as well, and take the lower rate. Both positions are rarely late.
         rate = min((self._sampled - first) / (now - begun) for begun, first in islice(self._history, 2))
         error = (max(self.delay_s, 0.0) + 0.1) / since_s
         # The error is infinite while the delay is unknown, so it is limited here.

@@ -177,7 +177,7 @@ def _gimbal(vehicle: Vehicle, message: Message, now: float) -> None:
 
 def _gimbal_limits(vehicle: Vehicle, message: Message, _now: float) -> None:
     if message.integer("gimbal_device_id") <= 1:
-        # A float32 in radians differs slightly from the degrees that it represents, so the degrees are rounded.
+        # The message contains radians as float32. Rounding restores the degrees that the vehicle's owner configured.
         limits = tuple(
             (
                 round(math.degrees(message.real(f"{axis}_min")), 3),

@@ -82,7 +82,7 @@ class PhotographHandler(http.server.BaseHTTPRequestHandler):
 @functools.cache
 def photograph(width: int, height: int) -> bytes:
     """Return a JPEG photograph with the noise of a small sensor."""
-    picture = cv2.imread(str(ROOT / "sim" / "fractus_world" / "astronaut.jpg"))
+    picture = cv2.imread(str(ROOT / "sim" / "fractus_world" / "astronaut.png"))
     picture = cv2.resize(picture, (width, height), interpolation=cv2.INTER_CUBIC)
     noise = np.random.default_rng(1).normal(0, 6, picture.shape)
     _, encoded = cv2.imencode(".jpg", np.clip(picture + noise, 0, 255).astype(np.uint8))

@@ -1,6 +1,6 @@
 """Billboards with photographed faces, upright beside roads or lying on the ground, for face detection.
 
-The photograph, astronaut.jpg, is NASA's portrait of Eileen Collins (public domain).
+The photograph, astronaut.png, is NASA's portrait of Eileen Collins (public domain).
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from fractus_world.roads import Road, Roads, centre
 Picture = NDArray[np.uint8]
 
 VARIATIONS = 8
-_PHOTOGRAPH = Path(__file__).with_name("astronaut.jpg")
+_PHOTOGRAPH = Path(__file__).with_name("astronaut.png")
 _CROP = (92, 0, 362, 300)
 """Left, top, right, bottom of the head and shoulders in the photograph."""
 _FACE = (180, 72, 272, 186)

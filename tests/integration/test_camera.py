@@ -135,7 +135,7 @@ async def test_camera_uses_changed_node_description_at_once(rig: Rig) -> None:
     assert (await denied(capture(camera)))[1].code == "PositionUnknown", (
         "the service took a picture before it knew its node"
     )
-    await rig.until_logged("camera", "the camera counts as seeing everything (missing=services.camera)")
+    await rig.until_logged("camera", "policies assume that the camera sees everything (missing=services.camera)")
 
     async def becomes(code: str) -> None:
         found: str | None = None

@@ -224,7 +224,9 @@ async def _search(fleet: Fleet, i: int) -> Any:
     """Return the next leg of a return flight, planned by the service."""
     now: Situation = fleet.situation(i, measured=True)
     place: Floats = fleet.estimated[i]
-    vehicle = SimpleNamespace(home=HOME, distance_m=lambda _lat, _lon: math.hypot(place[0], place[1]))
+    vehicle = SimpleNamespace(
+        home=HOME, position_problem="", distance_m=lambda _lat, _lon: math.hypot(place[0], place[1])
+    )
     state = SimpleNamespace(mission=None)
     control: Any = SimpleNamespace(
         autopilot=SimpleNamespace(vehicle=vehicle), cruise_mps=CRUISE_MPS, state=state, home_moved=False

@@ -147,12 +147,19 @@ def test_oracle_finds_no_permitted_goto_that_enters_a_zone(
     error = (draw.uniform(-1, 1), draw.uniform(-1, 1))
     scale = now.position_error_m / max(math.hypot(*error), 1.0)
     off = (error[0] * scale, error[1] * scale)
-    track = fly(
-        (start[0] + off[0], start[1] + off[1]), velocity, (end[0] + off[0], end[1] + off[1]), 10.0, now.latency_s
-    )
     # The check ignores zones that the drone enters even if it is commanded to stop.
     braking = [(x + off[0] * k, y + off[1] * k) for x, y in brake(start, velocity, now.latency_s) for k in (-1, 0, 1)]
     unavoidable = any(inside(point, zone) for zone in zones for point in braking)
+    begin = start
+    track: list[tuple[float, float]] = []
+    if verdict.brake_first:
+        stop = brake(start, velocity, now.latency_s)
+        track = [(x + off[0], y + off[1]) for x, y in stop]
+        begin = stop[-1]
+        velocity = (0.0, 0.0)
+    track += fly(
+        (begin[0] + off[0], begin[1] + off[1]), velocity, (end[0] + off[0], end[1] + off[1]), 10.0, now.latency_s
+    )
     if begun_outside and not unavoidable:
         for point in track:
             for zone in zones:

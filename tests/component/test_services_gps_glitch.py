@@ -119,3 +119,15 @@ def test_drone_brakes_as_soon_as_gps_and_estimate_disagree(tmp_path: Path) -> No
             await until(lambda: abs(sky.truth.body.ve) < 0.5, 6.0)
 
     fly(work, tmp_path)
+
+
+def test_mission_cannot_begin_in_flight_while_position_is_not_trusted(tmp_path: Path) -> None:
+    async def work(sky: Sky, directory: Path) -> None:
+        async with flying_past_zone(sky, directory) as (drone, _distances_m):
+            (key,) = drone.control.state.missions
+            assert drone.control.not_ready_reason(key) is None
+            sky.truth.params.assign("SIM_GPS_GLITCH_X", GLITCH_DEG)
+            await until(lambda: bool(drone.control.autopilot.vehicle.position_problem), 2.0)
+            assert drone.control.not_ready_reason(key) == "position and home are not known yet"
+
+    fly(work, tmp_path)

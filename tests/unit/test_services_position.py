@@ -15,6 +15,7 @@ from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
 from fractus_services.mobility.mavlink.mavlink_autopilot import MavlinkAutopilot
 from fractus_services.mobility.mavlink.vehicle import Vehicle
 from fractus_services.mobility.rpc.telemetry import telemetry_of
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from virtual_time import Loop
 
 
@@ -45,6 +46,25 @@ def test_invalid_coordinates_are_ignored(lat_e7: int, lon_e7: int) -> None:
     vehicle.take(message("GLOBAL_POSITION_INT", lat=lat_e7, lon=lon_e7), 1.0)
     vehicle.take(message("HOME_POSITION", latitude=lat_e7, longitude=lon_e7), 1.0)
     assert (vehicle.lat, vehicle.home, vehicle.position_at) == (None, None, -math.inf)
+
+
+def test_position_is_trusted_again_only_when_a_new_position_arrives() -> None:
+    def estimator(flags: int, now: float) -> None:
+        vehicle.take(message("EKF_STATUS_REPORT", flags=flags), now)
+
+    healthy = 831
+    vehicle = Vehicle(stack=ARDUCOPTER)
+    fix(vehicle, 3)
+    estimator(healthy, 0.0)
+    place(vehicle, 39.0, 0.5)
+    estimator(healthy | mavlink.EKF_GPS_GLITCHING, 1.0)
+    assert "GPS glitch" in vehicle.position_problem
+    for second in range(2, 9):
+        estimator(healthy, float(second))
+    assert vehicle.position_problem, "the known position is still that from before the glitch"
+    vehicle.take(message("GPS_RAW_INT", fix_type=3, h_acc=600), 9.0)
+    place(vehicle, 39.0, 9.1)
+    assert (vehicle.position_problem, vehicle.position_at) == ("", 9.1)
 
 
 def test_position_accuracy_expires_when_no_longer_reported() -> None:

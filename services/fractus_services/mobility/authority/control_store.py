@@ -239,7 +239,7 @@ class ControlStore:
     def not_ready_reason(self, key: str) -> str | None:
         """Return why the drone cannot fly for a mission now, or None if it can."""
         vehicle = self.autopilot.vehicle
-        located = vehicle.lat is not None and vehicle.home is not None
+        located = vehicle.lat is not None and vehicle.home is not None and not vehicle.position_problem
         # In flight, a known status is sufficient, even if the failsafes cannot be verified at the moment.
         problem = "" if self.failsafe_status is None or vehicle.armed else self.failsafe_status.problem
         unverified = BEING_SET if self.failsafe_status is None else problem

@@ -86,7 +86,8 @@ class ReturnFlight:
         if kind is TaskKind.LAND and (grant is None or landing or not self._lands_in_zone(grant)):
             return stack.land
         if not vehicle.mode.comes_down and not await self._trusts_position(is_current):
-            control.note("land", f"the position is not trusted: {vehicle.position_problem}", "PositionUnknown")
+            if is_current() and vehicle.in_air:
+                control.note("land", f"the position is not trusted: {vehicle.position_problem}", "PositionUnknown")
             return stack.land
         if (
             vehicle.in_air

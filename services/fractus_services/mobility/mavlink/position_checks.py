@@ -203,9 +203,7 @@ class PositionChecks:
         """Compare the position of the GPS with the estimator's positions of the last second."""
         self.problem(now)
         if not self._path or now - self._path_at > PATH_S:
-            self._disagreements = 0
-            self._gps_problem = ""
-            return
+            return  # There is nothing to compare, so an earlier disagreement remains.
         frame = LocalFrame(lat, lon)
         apart_m = min(math.hypot(*frame.xy(known.lat, known.lon)) for known in self._path)
         agrees = apart_m <= DISAGREEMENT_M + ERROR_FACTOR * error_m

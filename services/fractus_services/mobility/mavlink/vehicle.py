@@ -114,15 +114,19 @@ def _place(lat_e7: int, lon_e7: int) -> tuple[float, float] | None:
     return lat_e7 / 1e7, lon_e7 / 1e7
 
 
-def _check_position(vehicle: Vehicle, now: float) -> None:
-    """Update whether the position is trusted."""
+def _check_position(vehicle: Vehicle, now: float) -> bool:
+    """Return True if the position may be trusted. If not, store the problem.
+
+    Only a position that is accepted clears the problem, so that no reader sees a trusted position that is seconds old.
+    """
     problem = vehicle.position_checks.problem(now)
-    if problem and not vehicle.position_problem:
+    if not problem:
+        return True
+    if not vehicle.position_problem:
         vehicle.position_problem_at = now
         log.warning("position: no longer trusted (reason=%s)", problem)
-    elif vehicle.position_problem and not problem:
-        log.info("position: trusted again")
     vehicle.position_problem = problem
+    return False
 
 
 def _position(vehicle: Vehicle, message: Message, now: float) -> None:
@@ -134,13 +138,16 @@ def _position(vehicle: Vehicle, message: Message, now: float) -> None:
     north_mps, east_mps, down_mps = (message.integer(name) / 100 for name in ("vx", "vy", "vz"))
     reported = ReportedPosition(boot_s, *place, amsl_m, north_mps, east_mps, down_mps)
     vehicle.position_checks.take_position(reported, vehicle.position_error_m, now, moves=vehicle.armed)
-    _check_position(vehicle, now)
+    plausible = _check_position(vehicle, now)
     # Even with a GPS fix the estimator may be using dead reckoning, and its position drifts.
     reports_estimator = math.isfinite(vehicle.estimated_at)
     recent_estimate = vehicle.estimated and now - vehicle.estimated_at <= STATUS_MAX_AGE_S
     dead_reckoning = reports_estimator and not recent_estimate
-    if dead_reckoning or not vehicle.located or now - vehicle.gps_at > STATUS_MAX_AGE_S or vehicle.position_problem:
+    if dead_reckoning or not vehicle.located or now - vehicle.gps_at > STATUS_MAX_AGE_S or not plausible:
         return
+    if vehicle.position_problem:
+        log.info("position: trusted again")
+        vehicle.position_problem = ""
     vehicle.lat, vehicle.lon = place
     vehicle.altitude_m = message.integer("relative_alt") / 1e3
     vehicle.amsl_m = amsl_m

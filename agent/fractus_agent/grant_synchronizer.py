@@ -17,6 +17,7 @@ from fractus_core.control import Outcome, OutcomeKind
 from fractus_core.policy.grant_signatures import BadSignature, UnknownAuthority, read_authorities, verify
 from fractus_runtime.files import (
     UnsuitableFile,
+    list_files,
     parse_json,
     read_file,
     remove_file,
@@ -62,7 +63,7 @@ class GrantDirectory:
 
     def names(self) -> set[str]:
         """Return the names of the stored Grants."""
-        return {path.stem for path in self._path.glob("*.json")}
+        return {path.stem for path in list_files(self._path, ".json")}
 
     def contains(self, grant: Grant) -> bool:
         """Return True if exactly this Grant is stored."""

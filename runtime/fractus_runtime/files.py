@@ -108,6 +108,18 @@ def parse_json(content: bytes | str) -> Any:
     return value
 
 
+def list_files(directory: Path, suffix: str) -> list[Path]:
+    """Return the files of a directory whose names end with a suffix, in the order of their names.
+
+    `Path.glob` is not used, because it lists a directory that cannot be read as empty.
+
+    Raises:
+        OSError: The directory cannot be listed.
+    """
+    with os.scandir(directory) as entries:
+        return sorted(directory / entry.name for entry in entries if entry.name.endswith(suffix))
+
+
 def path_text(path: Path | str) -> str:
     """Return a path as text that can be logged and sent. Bytes of a name that is not UTF-8 are escaped."""
     return os.fsencode(path).decode(errors="backslashreplace")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-import os
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -16,7 +15,7 @@ from fractus_core.api.grants import Grant, GrantSpec
 from fractus_core.api.model import InvalidObject
 from fractus_core.policy.compiled_grant import CompiledGrant, compile_grant
 from fractus_core.policy.grant_signatures import BadSignature
-from fractus_runtime.files import UnsuitableFile, path_text, read_json
+from fractus_runtime.files import UnsuitableFile, list_files, path_text, read_json
 
 from fractus_services.grant_verifier import GrantVerifier
 
@@ -149,7 +148,8 @@ class GrantFiles:
     def _read_changes_locked(self) -> bool:
         stamps, complete = self._list()
         authorities_changed = self._verifier.reload_authorities()
-        if stamps == self._stamps and not authorities_changed and not self._problems:
+        may_revoke = complete and bool(self._unreadable)
+        if stamps == self._stamps and not authorities_changed and not self._problems and not may_revoke:
             return False
         if self._stamps and stamps != self._stamps:
             # A file that is copied in place is incomplete for a moment.
@@ -157,8 +157,10 @@ class GrantFiles:
             stamps, complete = self._list()
         before = dict(self._loaded)
         for path in self._stamps.keys() - stamps.keys():
-            self._loaded.pop(path, None)
+            missing = self._loaded.pop(path, None)
             self._problems.pop(path, None)
+            if missing is not None and not complete:
+                self._unreadable[path] = missing
         for path, stamp in stamps.items():
             if (
                 self._stamps.get(path) != stamp
@@ -170,8 +172,8 @@ class GrantFiles:
         self._stamps = stamps
         if complete:
             renamed = {grant.digest for grant in self._loaded.values() if grant is not None}
-            for path in before.keys() - self._loaded.keys():
-                removed = before[path] or self._unreadable.pop(path, None)
+            for path in (before.keys() | self._unreadable.keys()) - self._loaded.keys():
+                removed = before.get(path) or self._unreadable.pop(path, None)
                 if removed is not None and removed.digest not in renamed:
                     self._revoke(removed)
         return changed or any(before.get(path) is not grant for path, grant in self._loaded.items())
@@ -181,10 +183,7 @@ class GrantFiles:
         stamps: dict[Path, _Stamp] = {}
         complete = True
         try:
-            # Not Path.glob, which lists a directory without read permission as empty.
-            with os.scandir(self._directory) as listed:
-                names = sorted(entry.name for entry in listed if entry.name.endswith(".json"))
-            for path in (self._directory / name for name in names):
+            for path in list_files(self._directory, ".json"):
                 try:
                     stat = path.stat()
                     stamps[path] = (stat.st_mtime_ns, stat.st_size, stat.st_ino)
@@ -230,6 +229,8 @@ class GrantFiles:
         except Exception as error:
             log.exception("grants: reading failed, the file grants nothing (file=%s)", path_text(path))
             self._refused(path_text(path.name), f"{type(error).__name__}: {error}")
+            self._revoke(before)
+            self._problems.pop(path, None)
             return None
         self._problems.pop(path, None)
         if grant is None or (before is not None and before.identity != grant.identity):

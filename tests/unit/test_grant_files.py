@@ -376,8 +376,28 @@ def test_grants_in_a_directory_that_cannot_be_listed_are_not_taken_for_removed(
         raise PermissionError(13, "Permission denied")
 
     with monkeypatch.context() as patch:
-        patch.setattr("fractus_services.grant_files.os.scandir", fail)
+        patch.setattr("os.scandir", fail)
         files.scan()
         assert not files.active
     files.scan()
     assert files.active, "the Grant was not revoked for good"
+
+
+def test_grant_removed_while_the_directory_cannot_be_listed_is_revoked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "g.json").write_text(granted := body())
+    files = grant_files(tmp_path)
+    files.scan()
+
+    def fail(_path: Path) -> None:
+        raise OSError(24, "Too many open files")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("os.scandir", fail)
+        files.scan()
+    (tmp_path / "g.json").unlink()
+    files.scan()
+    (tmp_path / "g.json").write_text(granted)
+    files.scan()
+    assert not files.active, "the removed Grant was accepted again"

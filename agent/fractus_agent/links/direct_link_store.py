@@ -13,6 +13,7 @@ from fractus_core.api.direct_links import DirectLink, LinkedService
 from fractus_core.api.model import InvalidObject
 from fractus_runtime.files import (
     UnsuitableFile,
+    list_files,
     path_text,
     read_file,
     read_json,
@@ -65,7 +66,7 @@ class DirectLinkStore:
         """Read the files, and remove temporary ones."""
         self._directory.mkdir(parents=True, exist_ok=True, mode=0o700)
         remove_temporary_files(self._directory)
-        for path in self._directory.glob("*.json"):
+        for path in list_files(self._directory, ".json"):
             try:
                 self._read(read_json(path))
             except (OSError, ValueError) as error:
@@ -79,7 +80,7 @@ class DirectLinkStore:
         match event:
             case Listed(bodies):
                 names = {body["metadata"]["name"] for body in bodies}
-                for removed in {*self._links, *(path.stem for path in self._directory.glob("*.json"))} - names:
+                for removed in {*self._links, *(path.stem for path in list_files(self._directory, ".json"))} - names:
                     self._remove(removed)
                 for body in bodies:
                     self._put(body)

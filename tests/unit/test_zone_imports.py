@@ -115,6 +115,7 @@ LIMITS = [
     ("note", "GND"), ("note", "up to 150m AGL"), ("note", "08:00-16:00"), ("note", "0800-1600"), ("note", "2026-05-01"), ("note", "01.05.2026"),
     ("note", "Mon-Fri"), ("note", "H24"), ("note", "ca. 300"), ("note", "24/7"), ("note", "08-18"), ("note", "18h00"), ("note", "Mo-Fr"), ("note", "until further notice"),
     ("note", "Sector 5"), ("keepout", "wide"), ("Länge", "x"), ("note", "sunrise to sunset"), ("note", ["a", {"b": "5 km"}]), ("note", {"circle": {"value": "five"}}),
+    ("ref", {"upperLimit": 120}), ("address", [{"radius": 500}]),
 ]  # fmt: skip
 
 
@@ -504,6 +505,15 @@ def test_many_features_of_one_name_are_named_in_seconds():
     found = formats.read_geojson(json.dumps({"type": "FeatureCollection", "features": features}))
     assert len({zone.name for zone in found.zones}) == 3000
     assert time.process_time() - start_s < 30
+
+
+def test_zone_whose_identifier_is_the_stable_name_of_another_is_not_lost():
+    first, other = moved(0, properties={"name": "a"}), moved(1, properties={"name": "a"})
+    whole = {"type": "FeatureCollection", "features": [first, other]}
+    stable = formats.read_geojson(json.dumps(whole)).zones[0].name
+    clash = moved(2, properties={"identifier": stable})
+    found = formats.read_geojson(json.dumps({"type": "FeatureCollection", "features": [first, other, clash]}))
+    assert len({zone.name for zone in found.zones}) == 3
 
 
 @pytest.mark.parametrize("name", ["geojson", "kml"])

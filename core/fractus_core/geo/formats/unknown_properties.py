@@ -101,6 +101,10 @@ def may_state_limit(name: str, value: Any) -> bool:
         if item in EMPTY:
             continue
         if _is_harmless(key):
+            # The property itself states no limit, but objects in it may.
+            for part in item if isinstance(item, list) else [item]:
+                if isinstance(part, Mapping):
+                    pending += [(str(inner), content) for inner, content in part.items()]
             continue
         if _names_limit(key):
             return True

@@ -272,6 +272,7 @@ class ZoneBuilder:
         names = _stable_names(self._parts)
         titles = Counter(part.feature.title for part in self._parts)
         zones: dict[str, Zone] = {}
+        imported: dict[str, _Part] = {}
         wrong: list[InvalidObject] = []
         for name, part in zip(names, self._parts, strict=True):
             title = part.feature.title
@@ -280,9 +281,13 @@ class ZoneBuilder:
             elif part.problem is not None:
                 where = title if titles[title] == 1 else f"{title}, --leave-out {name}"
                 wrong.append(InvalidObject(part.problem.field, f"{part.problem.problem} (in {where})"))
-            elif name in zones:
+            elif name in imported and [*part.names()][-1] == [*imported[name].names()][-1]:
                 self.note(title, "occurs twice with the same area, altitude and times; imported once")
+            elif name in imported:
+                problem = f"another zone has the name {name}; give one of them another name or identifier (in {title})"
+                wrong.append(InvalidObject("", problem))
             elif part.zone is not None:
+                imported[name] = part
                 zones[name] = _named(part.zone, name, part.feature)
         if wrong:
             raise InexactFeatures(wrong)

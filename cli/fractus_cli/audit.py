@@ -185,10 +185,10 @@ def _areas(paths: Sequence[Path]) -> Areas:
 
 
 def _checkpoints(since: tuple[str, ...], ca: Path | None) -> dict[str, Checkpoint]:
-    """Return the checkpoints by log name."""
+    """Parse the checkpoints of --since. Return them by log name."""
     if not since:
         return {}
-    # Only checkpoints need cryptography.
+    # Imported here, because only checkpoints need cryptography.
     from cryptography import x509  # noqa: PLC0415
     from fractus_runtime.audit_checkpoints import InvalidCheckpoint, parse_status_checkpoint, read_checkpoint  # noqa: PLC0415
 

@@ -61,7 +61,7 @@ def verify_log(name: Path, files: list[Path], since: ChainEntry | None = None) -
 
 @dataclass(frozen=True, slots=True)
 class Window:
-    """Time window in Unix nanoseconds. None is unbounded."""
+    """Time window in Unix nanoseconds. If a bound is None, the window is open on that side."""
 
     begin_ns: int | None = None
     end_ns: int | None = None
@@ -93,8 +93,8 @@ def _entries(log: str, node: str, files: Iterable[Path], window: Window) -> Iter
 def _nodes(segments_by_log: dict[Path, list[Path]]) -> dict[Path, str]:
     """Return the node of each log.
 
-    A `started` entry names the node. A log without such an entry belongs to the node of the other logs in its directory. If they
-    name no node or several nodes, the directory name is used.
+    A `started` entry names the node. A log without such an entry belongs to the node of the other logs in its
+    directory. If these logs name no node or several nodes, the directory name is used.
     """
     started = {name: _first_started(files) for name, files in segments_by_log.items()}
     by_directory: dict[Path, set[str]] = {}
@@ -121,7 +121,7 @@ def _started(entry: Entry) -> str:
 
 
 def _read(line: bytes) -> Entry:
-    """Parse an entry. Return an empty one if the line is invalid."""
+    """Parse an entry. Return an empty entry if the line is invalid."""
     try:
         entry = json.loads(line)
     except (ValueError, RecursionError):

@@ -57,11 +57,14 @@ _BOUNDS: dict[str, tuple[float, float, str]] = {
 
 
 Parser = Callable[[click.Context, click.Parameter, str | None], Any]
-"""Callback of an option that converts its text to a value."""
+"""Callback of a click option. The callback converts the text of the option to a value."""
 
 
 def parse_numbers(*names: str) -> Parser:
-    """Return a parser of comma-separated numbers with these names. The bounds of a number depend on its name."""
+    """Return a parser of comma-separated numbers, one number for each name.
+
+    The bounds of a number depend on its name.
+    """
 
     def parse(context: click.Context, option: click.Parameter, text: str | None) -> tuple[float, ...] | None:
         del context, option
@@ -105,7 +108,8 @@ def parse_call(method: str, text: str) -> Call:
     if method not in METHODS:
         raise BadManifest(f"--method: unknown method {method}; use one of: {', '.join(sorted(METHODS))}")
     try:
-        # Parse integers as floats, because the JSON parser fails on very long integers. As floats they are out of range.
+        # Parse integers as floats, because the JSON parser fails on very long integers. Such an integer becomes a float
+        # that is out of range.
         values = json.loads(text, parse_int=float, object_pairs_hook=_reject_duplicates)
     except json.JSONDecodeError as error:
         raise BadManifest(f"--args: invalid JSON: {error.msg} at character {error.pos + 1}") from None

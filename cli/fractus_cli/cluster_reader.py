@@ -41,7 +41,7 @@ class ClusterReader:
         return self._client.get(path)
 
     def list(self, path: str, **selectors: str) -> Sequence[Body]:
-        """Return a collection. It is empty if the kind does not exist.
+        """Return a collection, or an empty list if the kind does not exist.
 
         Raises:
             KubeError: The API server rejected the request or is unreachable.
@@ -52,7 +52,7 @@ class ClusterReader:
             return ()
 
     def list_permitted(self, path: str) -> Sequence[Body] | None:
-        """Return a collection, or None if the user is not permitted to list it (for example with rights in one namespace only).
+        """Return a collection, or None if the user may not list it, for example with rights in one namespace only.
 
         Raises:
             KubeError: The API server failed or is unreachable.
@@ -98,7 +98,7 @@ def kube_errors_explained() -> Iterator[None]:
     except (KubeError, ExceptionGroup) as error:
         first: Exception = error
         while isinstance(first, ExceptionGroup):
-            first = first.exceptions[0]  # The first failure is the cause. It cancelled the other tasks.
+            first = first.exceptions[0]  # Report only the first failure, because it cancelled the other tasks.
         if not isinstance(first, KubeError):
             raise
         remedy = "check your permissions" if first.status else "check the cluster and --kubeconfig"

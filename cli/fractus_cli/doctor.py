@@ -29,7 +29,7 @@ from fractus_cli.cluster_reader import (
 from fractus_cli.output import output_option, printable
 
 MIN_VERSION = (1, 32)
-"""Minimum Kubernetes version of the charts."""
+"""Minimum Kubernetes version that the charts require."""
 SERVICES = ("fractus-agent", "fractus-mobility", "fractus-camera")
 POLICIES = (
     "fractus-agent",
@@ -150,7 +150,7 @@ def _schema(definition: Body) -> Body:
 
 
 def _missing_fields(expected: Body, installed: Body, prefix: str = "") -> Iterator[str]:
-    """Yield the fields that are missing in the installed schema. The API server would drop their values."""
+    """Yield the fields that are missing in the installed schema. The API server drops the values of missing fields."""
     for name, field in (expected.get("properties") or {}).items():
         installed_field = (installed.get("properties") or {}).get(name)
         if installed_field is None:
@@ -212,7 +212,7 @@ def _creation_failure(cluster: ClusterReader, daemon_set: str) -> Body:
 
 
 def _creation_remedy(failed: Body) -> str:
-    """Return the remedy if the API server rejects pods of the system."""
+    """Return the remedy for pods of Fractus that the API server rejects."""
     if "PodSecurity" in str(failed.get("message")):
         return f"kubectl label namespace {SYSTEM} pod-security.kubernetes.io/enforce=privileged --overwrite"
     return f"kubectl -n {SYSTEM} get events --field-selector reason=FailedCreate; also check its ResourceQuota and LimitRange"
@@ -244,7 +244,7 @@ def _foreign_pods(cluster: ClusterReader) -> Iterator[Finding]:
         and pod["metadata"]["namespace"] not in exempt
         and _is_subject_to_policy(pod)
     }
-    # Setting the value replaces the previous one, so each remedy lists all namespaces.
+    # A new value of `exemptNamespaces` replaces the previous value, so each remedy lists all namespaces.
     listed = ",".join(n for n in (*exempt, *sorted(examples)) if n != SYSTEM)
     remedy = f"if they belong to the cluster: {_HELM} --reuse-values --set 'admission.exemptNamespaces={{{listed}}}'"
     for namespace, name in sorted(examples.items()):

@@ -21,7 +21,10 @@ from fractus_services.recording.segment_writer import McapWriter
 from fractus_cli.audit_logs import Entry, actor, is_decision
 
 GAP_NS = 10_000_000_000
-"""Time between two state entries that ends a path. While the motors run, the audit log has two state entries per second."""
+"""A path ends if no state entry follows within this time.
+
+While the motors run, the audit log has two state entries per second.
+"""
 
 _COLUMNS = (
     "time", "node", "log", "kind", "lat", "lon", "alt_m", "amsl_m", "speed_mps", "battery", "mode", "controller", "component",
@@ -73,12 +76,12 @@ class _Path:
     def parts(self) -> list[list[tuple[float, ...]]]:
         """Return the lines between crossings of the antimeridian.
 
-        A point is its longitude, latitude, altitude and time in nanoseconds after the first one.
+        A point consists of longitude, latitude, altitude, and the time since the first point in nanoseconds.
         """
-        # Nanoseconds since 1970 exceed the precision of floats.
+        # Times are relative to the first point, because nanoseconds since 1970 exceed the precision of floats.
         after_ns = [float(time_ns - self.times[0]) for time_ns in self.times]
         parts = cut_path([(*point, time_ns) for point, time_ns in zip(self.points, after_ns, strict=True)])
-        # A path that begins or ends at the antimeridian has a part of one point there.
+        # If a path begins or ends at the antimeridian, its first or last part is a single point. Omit such parts.
         return [part for part in parts if len(part) > 1] or parts[:1]
 
 
@@ -107,7 +110,7 @@ class _DroneFlights:
             self.paths[-1].times.append(entry["time_ns"])
             self.paths[-1].points.append(self.last)
         elif is_decision(entry):
-            # Entries of the monitor have no position, so use the last recorded one.
+            # Entries of the monitor have no position, so use the last recorded position.
             at = (lon, lat, self.home_m + alt) if lat is not None and lon is not None else self.last
             self.decisions.append((entry, at))
 
@@ -142,7 +145,10 @@ def write_geojson(export: Export, out: IO[bytes]) -> None:
 
 
 def _path_geometry(path: _Path) -> tuple[dict[str, Any], list[Any]]:
-    """Return the geometry of a path and the times of its positions: a list per line if it crosses the antimeridian."""
+    """Return the geometry of a path and the times of its positions.
+
+    A path across the antimeridian has a list of times per line.
+    """
     parts = path.parts()
     lines = [[list(point[:3]) for point in part] for part in parts]
     times = [[_iso(path.times[0] + round(point[3])) for point in part] for part in parts]

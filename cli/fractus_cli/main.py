@@ -1,4 +1,4 @@
-"""The `fractus` command. Lists its subcommands without importing them, and imports only the subcommand that is called."""
+"""The `fractus` command. It lists subcommands without importing them, and imports only the called subcommand."""
 
 from __future__ import annotations
 
@@ -22,7 +22,10 @@ _MARKERS = {
     "sim": "matplotlib",
     "view": "aiohttp",
 }
-"""A module that each extra installs. Finding it takes a millisecond, and importing a command takes up to a second."""
+"""For each extra, a module that the extra installs.
+
+A search for the module takes a millisecond. An import of the command takes up to a second.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +52,7 @@ class Entry:
 
     @property
     def requirement(self) -> str:
-        """Requirement for pip that provides the command."""
+        """Requirement with which pip installs the command."""
         if self.extra == "sim":
             return "fractus-sim"
         return f"fractus-drones[{self.extra}]" if self.extra else "fractus-drones"
@@ -152,7 +155,7 @@ def run(arguments: Sequence[str] | None = None) -> int:
 
 def _report(error: Exception) -> int:
     while isinstance(error, ExceptionGroup):
-        error = error.exceptions[0]  # The first failure is the cause. It cancelled the other tasks.
+        error = error.exceptions[0]  # Report only the first failure, because it cancelled the other tasks.
     match error:
         case click.exceptions.NoArgsIsHelpError():
             click.echo(error.format_message())

@@ -61,7 +61,7 @@ class BadManifest(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Manifest:
-    """Object in a file."""
+    """Object that was read from a file."""
 
     file: pathlib.Path
     body: dict[str, Any]
@@ -94,7 +94,7 @@ class LoadedObject:
 
 @dataclass
 class Manifests:
-    """All objects by kind, namespace and name."""
+    """All objects of the manifests, by kind, namespace and name."""
 
     objects: dict[tuple[str, str, str], LoadedObject] = field(default_factory=dict)
 

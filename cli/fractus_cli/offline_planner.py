@@ -28,7 +28,7 @@ class PlanResult:
 
 
 def plan_all(manifests: Manifests, settings: Settings) -> list[PlanResult]:
-    """Plan each Application with the drones and resources that the earlier Applications leave.
+    """Plan each Application with the drones and resources that no earlier Application uses.
 
     Raises:
         BadManifest: There is no Application, or an Application refers to an object that does not exist.

@@ -39,7 +39,7 @@ _TUNING: dict[str, tuple[str, click.FloatRange, str]] = {
     "--cruise-speed": ("cruise_speed_mps", _POSITIVE, "Ground speed assumed for flight times, in m/s."),
     "--battery-reserve": ("battery_reserve", _SHARE, "Share of a full charge that must remain after landing."),
 }  # fmt: skip
-"""Planning options: setting, bounds and help text."""
+"""Planning options, each with its setting, bounds and help text."""
 
 
 def _tunable(command: Callable[..., None]) -> Callable[..., None]:

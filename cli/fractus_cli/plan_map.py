@@ -29,7 +29,7 @@ Feature = dict[str, Any]
 def plan_map(
     application: Application, plan: DeploymentPlanSpec, inventory: Inventory, settings: Settings
 ) -> Iterator[Feature]:
-    """Yield features: the operation area, its part for each control point, the route, transit legs and nodes."""
+    """Yield features: the operation area, the area of each control point, the route, transit legs and nodes."""
     name = "/".join(application.key)
     area = operation_area(application.spec, inventory.depots, settings.safety_radius_m)
     if plan.operation_area is not None:

@@ -234,7 +234,7 @@ def _situation(drone: Drone, options: Mapping[str, Any]) -> Situation:
         armed=flying,
         in_air=flying,
         airframe=Airframe(retraces=options["way_home"] == "retraced"),
-        # The attitude of a gimbal is measured only in flight.
+        # The attitude of a gimbal is unknown, because it is measured only in flight.
         attitude=None if has_gimbal else Attitude(0.0, 0.0, math.degrees(math.atan2(east, north))),
         lens=bounding_lens(camera),
     )

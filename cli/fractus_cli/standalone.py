@@ -53,7 +53,7 @@ class StandalonePki:
 
     @classmethod
     def create(cls, directory: Path, clock: Callable[[], datetime] = _now, life: timedelta = DEFAULT_LIFE) -> Self:
-        """Open a directory. Create its certificate authority if there is none.
+        """Open a directory. Create the certificate authority if the directory has none.
 
         Raises:
             BrokenAuthority: The files of the authority are damaged.
@@ -91,7 +91,9 @@ class StandalonePki:
         return _write(self._directory / "nodes" / name, self._authority.issue_node(name, self._clock(), self._life))
 
     def component(self, identity: str) -> Path:
-        """Return the directory with the certificate of a component instance. Renew the certificate if it is due.
+        """Return the directory with the certificate of a component instance.
+
+        Renew the certificate if its renewal is due.
 
         Args:
             identity: SPIFFE id of the instance: `GrantSpec.identity` of its Grant.

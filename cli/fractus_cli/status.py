@@ -40,7 +40,7 @@ def collect(cluster: ClusterReader, namespace: str) -> dict[str, Any]:
     """Return drones, edge nodes and Applications by name, and the names of collections that the user is not permitted to list.
 
     Raises:
-        ClickException: The user is not permitted to list these Applications.
+        ClickException: The user is not permitted to list the Applications of the namespace.
     """
     scope = f"/namespaces/{namespace}" if namespace else ""
     applications = cluster.list_permitted(f"{GROUP}{scope}/applications")

@@ -43,10 +43,10 @@ _Lines = dict[Hashable, int]
 
 
 class _Dumper(yaml.CSafeDumper):
-    """Quotes strings that other YAML parsers would read as numbers or booleans, and writes no aliases."""
+    """YAML writer without aliases. It quotes strings that other YAML parsers would read as numbers or booleans."""
 
     def ignore_aliases(self, data: object) -> bool:
-        """Return True for every value."""
+        """Return True for every value, so that no aliases are written."""
         return True
 
 

@@ -11,7 +11,7 @@ from fractus_core.planning.operation_area import check_crossings, route_of
 from fractus_core.policy.selectors import is_attribute
 
 MAX_WAYPOINTS = 2000
-"""Maximum number of waypoints of an application. No battery lasts for as many."""
+"""Maximum number of waypoints of an application. No battery lasts for so many waypoints."""
 
 
 def check_area(area: Area, field: str) -> None:

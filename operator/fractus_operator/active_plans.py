@@ -63,7 +63,10 @@ class ActivePlans:
         return plan.spec if plan is not None and plan.uid == uid else None
 
     def flight_host(self, plan: DeploymentPlanSpec | None) -> tuple[Submitted | None, DeploymentPlanSpec | None]:
-        """Return the Application whose flight a plan shares, and its active plan. Each is None if it does not exist."""
+        """Return the Application whose flight a plan shares, and its active plan.
+
+        The Application or plan is None if it does not exist.
+        """
         if plan is None or plan.drone is None or plan.drone.shared_with is None:
             return None, None
         namespace, _, name = plan.drone.shared_with.partition("/")
@@ -83,7 +86,7 @@ class ActivePlans:
         self.wake_guests(key)
 
     def forget(self, key: Key) -> bool:
-        """Drop the plan that was decided for an Application. Return True if there was one."""
+        """Drop the plan that was decided for an Application. Return True if such a plan existed."""
         known = self._decided.pop(key, None) is not None
         if known:
             self.application_changed(key)

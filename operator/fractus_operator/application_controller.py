@@ -73,7 +73,7 @@ class BeingDeleted(Exception):
 
 @dataclass
 class _ApplicationState:
-    """State of one Application between reconciliations. It may be lost, for example in a restart.
+    """State of one Application between reconciliations. The state may be lost, for example in a restart.
 
     Attributes:
         excluded: Nodes that plans avoid, with the end of the exclusion and the reason.
@@ -132,7 +132,7 @@ class ApplicationController:
                         try:
                             next_s = await self.reconcile(key)
                         except BeingDeleted:
-                            return  # caught here, so that it does not count as a failure
+                            return  # caught here, so that the deletion does not count as a failure
                     backoff.succeeded()
                 except KubeError as error:
                     next_s = backoff.delay_s()

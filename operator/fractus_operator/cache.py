@@ -129,7 +129,7 @@ class ClusterCache:
         )
 
     async def synced(self) -> None:
-        """Wait until every kind was listed once. Decisions need all of them."""
+        """Wait until every kind was listed once. Decisions need all kinds."""
         for informer in self.informers:
             await informer.synced.wait()
 
@@ -378,7 +378,7 @@ def _changed_by_user(old: Submitted | None, new: Submitted | None) -> bool:
 
 
 def _occupied(pod: PodView | None) -> tuple[str, Mapping[str, float]] | None:
-    """Return the node and the resources that a pod occupies, or None if it occupies none."""
+    """Return the node and the resources that a pod occupies, or None if the pod occupies no resources."""
     return (pod.node, pod.requests) if pod is not None and pod.node is not None and not pod.finished else None
 
 
@@ -392,7 +392,7 @@ def _rules_differ(old: Drone | EdgeNode | None, new: Drone | EdgeNode | None) ->
 
 
 def _planning_inputs(drone: Drone) -> tuple[object, ...]:
-    """Return the fields of a drone's status that planning uses. The position is not one of them."""
+    """Return the fields of a drone's status that planning uses. Planning does not use the position."""
     return drone.in_air, _ready(drone)
 
 

@@ -328,7 +328,7 @@ def _check_owner(application: Application, kind: Kind, observed: Body) -> None:
     """Check that an object belongs to this Application.
 
     Raises:
-        NameTaken: It belongs to another owner.
+        NameTaken: The object belongs to another owner.
     """
     if not _is_child(application, kind, observed):
         name = observed["metadata"]["name"]

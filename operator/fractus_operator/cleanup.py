@@ -227,7 +227,7 @@ class OrphanedPods:
         twice = sorted(orphaned & self._orphaned)
         self._orphaned = orphaned
         for key in twice:
-            # The watch of Applications may be behind that of pods, so the API server decides.
+            # The watch of Applications may be behind the watch of pods, so the API server decides.
             present = (await self._store.list_whole(APPLICATION, namespace=key[0])).items
             if all(label_key(key_of(body)) != key for body in present):
                 await self._remove(key)

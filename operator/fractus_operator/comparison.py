@@ -27,7 +27,7 @@ def is_current(desired: Body, observed: Body | None) -> bool:
     """Return True if applying the stamped object would change nothing.
 
     Two conditions must hold. The digest equals the digest of the last apply, so no field was removed from the desired object
-    since. Every desired field has its value in the observed object, so no other client changed one.
+    since. Every desired field has its value in the observed object, so no other client changed a field.
     """
     if observed is None:
         return False

@@ -19,7 +19,7 @@ from fractus_operator.store import Store
 from fractus_operator.work_queue import WorkQueue
 
 EVENT_BURST = 20
-"""Number of Events of one drone without a pause, enough for several flights."""
+"""Maximum number of Events of one drone without a pause. This number is sufficient for several flights."""
 EVENT_PERIOD_S = 60.0
 """Seconds until one more Event is allowed after a burst. The changes during this pause are summarised."""
 MAX_LATE = timedelta(seconds=60)
@@ -58,7 +58,7 @@ class FlightReport:
 
 
 def parse_flight_report(drone: Drone, before: FlightReport | None) -> FlightReport | None:
-    """Return the report of a drone, or None if it is not newer than the report before or its state is unknown."""
+    """Return the report of a drone, or None if the report is not newer than `before` or its state is unknown."""
     status = drone.status
     if status is None or status.flight_state == "unknown":
         return None

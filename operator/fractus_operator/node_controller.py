@@ -237,7 +237,7 @@ class NodeGrantsController:
                     kinds.GRANT, grant_key, changes, ContentType.JSON_PATCH, subresource="status"
                 )
             except (Conflict, Invalid, NotFound) as error:
-                # The Grant was deleted, and possibly replaced by one of the same name.
+                # The Grant was deleted, and possibly replaced by a Grant of the same name.
                 log.info("node controller: report of a deleted Grant ignored (grant=%s error=%s)", grant_key[1], error)
                 continue
             self._cache.children[kinds.GRANT].record_write(grant_key, written)

@@ -69,9 +69,10 @@ def report_timeout_s(node: Drone | EdgeNode) -> float:
 
 
 def displayed_flight_state(drone: Drone) -> str:
-    """Return a drone's flight state for metrics. It is unknown only if the drone may be in the air.
+    """Return a drone's flight state for metrics. The state is unknown only if the drone may be in the air.
 
-    It is offline if the drone never reported, or if it was on the ground at its last report and no Application may fly it.
+    The state is offline if the drone never reported, or if it was on the ground at its last report and no Application
+    may fly it.
     """
     status = drone.status
     if status is not None and status.flight_state != "unknown":
@@ -84,7 +85,10 @@ def displayed_flight_state(drone: Drone) -> str:
 
 
 class StaleNodeDetector:
-    """Measures the age of each node's last report with the clock of this process. Clocks of nodes may differ from it."""
+    """Measures the age of each node's last report with the clock of this process.
+
+    Clocks of nodes may differ from the clock of this process.
+    """
 
     def __init__(self) -> None:
         self._last_reports: dict[tuple[str, str], tuple[datetime, float]] = {}

@@ -143,7 +143,7 @@ class NodeObjects:
         return self.known.get((NODE_GRANTS_NAMESPACE, node))
 
     def account_of(self, node: str) -> Mapping[Kind, bool]:
-        """Return the existing objects of a node's account, each with True if it is unmodified."""
+        """Return the existing objects of a node's account, each with True if the object is unmodified."""
         present = {kind: informer.get((NODE_GRANTS_NAMESPACE, node)) for kind, informer in self.accounts.items()}
         return {kind: unmodified for kind, unmodified in present.items() if unmodified is not None}
 

@@ -53,7 +53,7 @@ class NodeServicePods:
         return len(self._pods)
 
     def pod_changed(self, key: Key, old: PodView | None, new: PodView | None) -> None:
-        """Handle a change of a pod. Pods that are not of a service are ignored."""
+        """Handle a change of a pod. Pods that belong to no service are ignored."""
         for pod in (old, new):
             if pod is None or pod.node is None or pod.namespace != self._namespace or pod.daemon_set not in SERVICES:
                 continue
@@ -90,7 +90,7 @@ class NodeServicePods:
         return tuple(self._pods.get(node, {}).values())
 
     def has_revision(self, daemon_set: str) -> bool:
-        """Return True if a DaemonSet has a revision. Without one it was deleted and creates no more pods."""
+        """Return True if a DaemonSet has a revision. A DaemonSet without a revision was deleted."""
         return daemon_set in self._latest
 
     def is_current(self, pod: PodView) -> bool:

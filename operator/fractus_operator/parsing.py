@@ -131,7 +131,7 @@ def parse_object(model: type[R], body: Body) -> R:
 
 
 def parse_application(body: Body) -> Submitted:
-    """Parse an Application. If it is invalid, the result contains the reason."""
+    """Parse an Application. If the Application is invalid, the result contains the reason."""
     try:
         return Submitted(body, parse_object(Application, body), None)
     except InvalidObject as error:

@@ -24,7 +24,10 @@ from fractus_operator.labels import (
 _MAX_LOG = 400
 """Maximum length of the kept log lines of a failed container, and of a message why pods cannot be created."""
 FINISHED_DEADLINE_S = 1
-"""Value of `activeDeadlineSeconds` that stops a running pod. It is the minimum, and the time counts from the start of the pod."""
+"""Value of `activeDeadlineSeconds` that stops a running pod.
+
+The API server accepts no smaller value. The time counts from the start of the pod.
+"""
 _CANNOT_START = frozenset({"ImagePullBackOff", "ErrImagePull", "InvalidImageName", "CreateContainerConfigError"})
 REPLICA_FAILURE = "ReplicaFailure"
 """Condition type of a Deployment whose pods cannot be created (reason REFUSED) or deleted."""

@@ -1,4 +1,4 @@
-"""Controller of Zones and Policies: sets their Ready condition, which is True if they can be enforced."""
+"""Controller of Zones and Policies: sets the Ready condition, which is True if the object can be enforced."""
 
 from __future__ import annotations
 
@@ -32,7 +32,10 @@ class PolicyController:
             await self._report(ZONE, zone, self._check_zone(zone))
 
     async def reconcile_policy(self, key: Key) -> None:
-        """Check the rules of one Policy that its schema cannot express. A Policy is ready if all of its Zones are."""
+        """Check the rules of one Policy that its schema cannot express.
+
+        A Policy is ready if all of its Zones are ready.
+        """
         policy = self._cache.policies.get(key)
         if policy is not None:
             await self._report(POLICY, policy, self._check_policy(policy))

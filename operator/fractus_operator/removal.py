@@ -34,7 +34,7 @@ from fractus_operator.labels import LEASE_NAME, is_location_label
 from fractus_operator.store import KubeError, NotFound, Store, Unconfigured
 
 WIPE = "fractus-wipe"
-"""DaemonSet of the chart whose pods are ready when the data of their node is deleted."""
+"""DaemonSet of the chart that deletes the data of nodes. A pod becomes ready when the data of its node is deleted."""
 OPERATOR = "fractus-operator"
 """Deployment of the operator."""
 

@@ -90,7 +90,7 @@ def choose_plan(
 
 
 def mission_changed(application: Application | None, plan: DeploymentPlanSpec | None) -> bool:
-    """Return True if the mission of an Application differs from the planned one, or if either is missing."""
+    """Return True if the mission of an Application differs from the mission of its plan, or if one is missing."""
     if application is None or plan is None:
         return True
     if plan.application_generation == application.metadata.generation:
@@ -198,7 +198,7 @@ def stuck_nodes(
         node = nodes.get(pod.instance or "")
         if pod.unschedulable_since is None or node is None or pod.terminating:
             continue
-        # A pod of another Deployment copies the labels. A user of the namespace created it.
+        # Ignore a pod of another Deployment, which a user of the namespace created with copied labels.
         if pod.deployment != pod.instance:
             continue
         remaining_s = (pod.unschedulable_since + UNSCHEDULABLE_GRACE - now).total_seconds()

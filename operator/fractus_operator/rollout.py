@@ -142,7 +142,7 @@ class Rollout:
         self._certificates.forget(key)
 
     def _is_frozen(self, desired: Body, plan: DeploymentPlanSpec) -> bool:
-        """Return True if a Deployment must not change: its drone is in flight, and its part of the manifest is the same.
+        """Return True if a Deployment must not change: its drone flies, and its part of the manifest is unchanged.
 
         Otherwise, an upgrade of the operator that builds pods differently would restart a driver in flight.
         """
@@ -155,7 +155,10 @@ class Rollout:
         return cause == present and cause.rpartition("@")[2] == drone
 
     def _links(self, application: Application, plan: DeploymentPlanSpec, pods: Sequence[PodView]) -> list[Body]:
-        """Return the DirectLinks of a plan. Links to a new Service follow in the next step, when it has an address."""
+        """Return the DirectLinks of a plan.
+
+        Links to a new Service follow in the next step, when the Service has an address.
+        """
         if plan.drone is None:
             return []
         planned = plan_links(application, plan, self._cache.drone(plan.drone.node), ByName(self._cache.edge_nodes))

@@ -22,11 +22,11 @@ log = logging.getLogger(__name__)
 SERVICES_CURRENT = "ServicesCurrent"
 ROLLOUT_PERIOD_S = 2.0
 _SHARE = 20
-"""Services are replaced on one of this number of nodes at the same time, and always on at least one node."""
+"""Services are replaced on at most 1/`_SHARE` of all nodes at the same time, or on one node if the fleet is small."""
 STUCK_S = 600.0
 """Maximum time until services are ready, in seconds, including image pulls over slow links.
 
-After it, the rollout may continue without the node.
+After this time, the rollout may continue without the node.
 """
 
 

@@ -26,7 +26,7 @@ _REASONS = {
     OutcomeKind.FAILED: "MissionFailed",
 }
 _MAX_NAMED = 3
-"""Maximum number of instances that a message names. The others are counted."""
+"""Maximum number of instances that a message names. For further instances, the message contains only their number."""
 _ACTIVITY = {
     "unknown": "in an unknown state",
     "inactive": "on the ground",

@@ -21,7 +21,8 @@ from fractus_operator.store import Conflict, Informer, KubeError, Store
 log = logging.getLogger(__name__)
 
 _BUSY_ROLLOUTS = 5
-"""Number of concurrent rollouts from which a further one takes seconds, so that its Application is reported as queued."""
+"""With this number of concurrent rollouts, a further rollout takes seconds, so its Application is reported as
+queued."""
 _MIN_FAILURES = 3
 """Number of successive failed reconciliations after which the status reports the failure.
 

@@ -171,7 +171,10 @@ class Store(Client):
 
 
 def _applied_entries(entries: Sequence[Body]) -> list[Body] | None:
-    """Return metadata.managedFields in which all fields of this operator are applied fields, or None if they are already."""
+    """Return metadata.managedFields with all fields of this operator as applied fields.
+
+    Return None if all fields of this operator are applied fields already.
+    """
     managed = [e for e in entries if e.get("manager") == FIELD_MANAGER and not e.get("subresource")]
     if all(entry["operation"] == "Apply" for entry in managed):
         return None

@@ -26,7 +26,7 @@ MAX_RETRY_DELAY_S = 0.5
 """Longest delay between requests for control while the service restarts. The drone hovers only for the grace period."""
 
 OnProgress = Callable[[Progress], Awaitable[None] | None]
-"""Callback for a progress report of a motion. It may be a coroutine function."""
+"""Callback for a progress report of a motion. The callback may be a coroutine function."""
 
 OnWait = Callable[[str], None]
 """Callback for the reason why control is not granted yet, for example "the autopilot is not ready to arm: ..."."""
@@ -64,13 +64,16 @@ class Control:
         self.waypoints_reached = 0
         """Number of completed waypoints, including those of earlier runs of this component."""
         self.begun: Sequence[object] | None = None
-        """Waypoints of the mission that was started at this control point; None if there is none. `waypoints_reached` counts them."""
+        """Waypoints of the mission that was started at this control point; None if no mission was started.
+
+        `waypoints_reached` counts them.
+        """
         self.mission_complete = False
         """True after control of the last control point was returned."""
 
     @property
     def lost(self) -> FractusError | None:
-        """Reason why control was lost; None while it is held."""
+        """Reason why control was lost; None while control is held."""
         return self._lost
 
     async def acquire(self) -> Self:
@@ -147,7 +150,7 @@ class Control:
             await self.report(number + 1)
 
     async def abandon(self) -> None:
-        """Close the stream without returning control: the drone hovers, then the system flies it home."""
+        """Close the stream without returning control: the drone hovers, then the system flies the drone home."""
         self._returning = True
         self._granted.clear()
         if self._watcher is not None:

@@ -14,7 +14,7 @@ from fractus.errors import InvalidRequest, PolicyDenied
 from fractus.values import Position, Progress
 
 EARTH_M = 6_371_008.8
-"""Mean radius in metres. The error on an orbit of one kilometre is a few metres at most."""
+"""Mean radius of the Earth in metres. The error on an orbit of one kilometre is a few metres at most."""
 
 _log = logging.getLogger("fractus")
 

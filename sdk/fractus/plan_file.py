@@ -42,7 +42,7 @@ _COMMANDS = {
     217: "DO_SEND_SCRIPT_MESSAGE", 218: "DO_AUX_FUNCTION", 222: "DO_GUIDED_LIMITS", 223: "DO_ENGINE_CONTROL",
     600: "JUMP_TAG", 601: "DO_JUMP_TAG", 4501: "CONDITION_GATE", 42600: "DO_WINCH", 42702: "NAV_SCRIPT_TIME", 42703: "NAV_ATTITUDE_TIME",
 }  # fmt: skip
-"""Names of MAV_CMD without their prefix, of the commands that occur in missions."""
+"""Names of the MAVLink commands that occur in missions, by their number, without the prefix MAV_CMD."""
 
 _CAMERA_COMMANDS = {
     195: "DO_SET_ROI_LOCATION", 196: "DO_SET_ROI_WPNEXT_OFFSET", 197: "DO_SET_ROI_NONE", 198: "DO_SET_ROI_SYSID",
@@ -191,7 +191,7 @@ def _waypoint(item: _Item, speed_mps: float | None) -> Waypoint:
 
 
 def _speed_mps(item: _Item, current_mps: float | None) -> float | None:
-    """Return the horizontal speed after DO_CHANGE_SPEED. Vertical speeds are the autopilot's and leave it unchanged."""
+    """Return the horizontal speed after DO_CHANGE_SPEED. A vertical speed does not change it."""
     kind, speed_mps, _, relative, *_ = item.parameters()
     if kind in _VERTICAL_SPEEDS:
         _log.warning("mission: plan item omitted (%s command=%s speed_type=%d)", item.place, item.name, kind)

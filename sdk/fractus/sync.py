@@ -166,7 +166,7 @@ class Control(_Wrapper[_control.Control]):
 
     @property
     def lost(self) -> FractusError | None:
-        """Reason why control was lost; None while it is held."""
+        """Reason why control was lost; None while control is held."""
         return self._async.lost
 
     def __enter__(self) -> Self:

@@ -136,9 +136,9 @@ def _status(call: Any) -> grpc.StatusCode:
 
 
 def _closer(shutdown: Callable[[], None]) -> Callable[[], None]:
-    """Return a function that calls `shutdown` and waits for it for `CLOSE_TIMEOUT_S` at most.
+    """Return a function that calls `shutdown` in a thread and waits at most `CLOSE_TIMEOUT_S` for its end.
 
-    The thread for it is started now, because an interpreter that is shutting down cannot start threads.
+    The thread is started now, because an interpreter that is shutting down cannot start threads.
     """
     closing = threading.Event()
     closed = threading.Event()

@@ -33,7 +33,7 @@ class ConnectionLimit:
         return _Connection(self._factory(), self)
 
     def opened(self, connection: _Connection) -> None:
-        """Add a connection, and close another one if there are too many."""
+        """Add a connection, and close another connection if there are too many."""
         self._open[connection] = None
         if len(self._open) > self._maximum:
             oldest = next((other for other in self._open if not other.authorized), connection)

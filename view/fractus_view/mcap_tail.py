@@ -117,7 +117,10 @@ def message_at(path: Path, location: MessageLocation) -> dict[str, Any] | None:
 
 
 def _read_record(file: IO[bytes], offset: int, path: Path) -> tuple[int, bytes, int] | None:
-    """Return opcode and content of the record at an offset, and the offset of the next record. Return None if it is incomplete."""
+    """Return opcode and content of the record at an offset, and the offset of the next record.
+
+    Return None if the record is incomplete.
+    """
     if offset == 0:
         start = file.read(len(MAGIC))
         if start != MAGIC[: len(start)]:

@@ -31,7 +31,7 @@ _REFERENCES = {"home": "home", "amsl": "sea level", "terrain": "ground"}
 
 
 def fix(drone: api.Drone, now_ms: int) -> Fix | None:
-    """Return the reported position of a drone, or None if there is none."""
+    """Return the reported position of a drone, or None if the drone reported no position."""
     position = drone.status.position if drone.status is not None else None
     if position is None:
         return None

@@ -208,7 +208,10 @@ def _log_failure(task: asyncio.Task[None]) -> None:
 
 
 def _cookie(request: web.Request) -> str:
-    """Return the name of the cookie. It contains the port, because browsers send cookies to all servers of a host."""
+    """Return the name of the cookie.
+
+    The name contains the port, because browsers send cookies to all servers of a host.
+    """
     _, _, port = request.headers.get(hdrs.HOST, "").rpartition(":")
     return f"fractus-view-{port if port.isdecimal() else 80}"
 

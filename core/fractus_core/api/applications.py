@@ -185,7 +185,10 @@ class ApplicationSpec(Model):
         return component
 
     def callers(self, name: str) -> set[str]:
-        """Return the components whose calls to a component are declared, on either side. Empty: all may call it."""
+        """Return the declared callers of a component, from its `ingress` and their `egress`.
+
+        If no caller is declared, all components may call it.
+        """
         return {other.name for other in self.components if name in other.egress}.union(self.component(name).ingress)
 
 

@@ -249,7 +249,7 @@ class Container(Model):
 
 
 def _repeated(keys: Iterable[Hashable]) -> list[int]:
-    """Return the indexes of keys that occurred before."""
+    """Return the indexes of keys that repeat an earlier key."""
     seen: set[Hashable] = set()
     repeated = []
     for i, key in enumerate(keys):

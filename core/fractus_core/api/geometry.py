@@ -46,7 +46,7 @@ class Position(Point):
         description="Datum of alt: home (home position), amsl (mean sea level) or terrain (ground below the drone).",
     )
 
-    # The API server sets the default `home`, so that value is allowed without alt.
+    # The API server sets the default `home`, so the reference `home` is allowed without alt.
     @rule(
         "has(self.alt) || !has(self.altitudeReference) || self.altitudeReference == 'home'",
         "altitudeReference requires alt; set alt or remove altitudeReference",

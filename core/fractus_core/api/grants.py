@@ -130,7 +130,7 @@ class GrantSpec(Model):
     def mission_key(self) -> str:
         """Identifier of the mission.
 
-        It includes the instance, so a Grant cannot name the mission of another instance.
+        The identifier contains the identity of the instance, so a Grant cannot name the mission of another instance.
         """
         return f"{self.identity}#{self.mission or ''}"
 
@@ -153,7 +153,7 @@ class GrantSpec(Model):
 
 GrantPhase = Literal["Pending", "Active", "Complete", "Revoked", "Failed"]
 ENDED: frozenset[GrantPhase] = frozenset({"Complete", "Revoked", "Failed"})
-"""Final phases: a Grant never leaves them."""
+"""Final phases. The phase of a Grant does not change after one of these phases."""
 
 
 class GrantStatus(OpenModel):
@@ -188,7 +188,10 @@ NODE_GRANTS_NAMESPACE = "fractus-nodes"
 """Namespace of the NodeGrants objects. The service account of a node may read only the object of this node."""
 
 MAX_UNPACKED_BYTES = 64 * 2**20
-"""Maximum size of the Grants of a node as JSON. Compression reduces it to about 1 %, because Grants share zones."""
+"""Maximum size of the Grants of a node as JSON.
+
+Compression reduces this size to about 1 %, because Grants share zones.
+"""
 MAX_PACKED_BYTES = 2**20
 """Maximum length of the packed text. The rest of the etcd object limit is left for the status."""
 MAX_MESSAGE = 1024

@@ -170,5 +170,5 @@ def node_identity(node: str) -> str:
 
 
 def node_server_name(node: str) -> str:
-    """Return the DNS name in the server certificate of a node. Clients verify it regardless of the address they dial."""
+    """Return the DNS name in the server certificate of a node. Clients verify the name, not the address."""
     return f"{node}.node.{TRUST_DOMAIN}"

@@ -30,7 +30,10 @@ EDGE_REPORT_S = 60.0
 
 
 CONDITIONS_BY_TYPE: dict[str, JsonValue] = {"x-kubernetes-list-type": "map", "x-kubernetes-list-map-keys": ["type"]}
-"""The agent and the operator write different conditions of one object."""
+"""Schema keywords of the list of conditions.
+
+They let the agent and the operator write different entries of the list.
+"""
 
 
 GROUNDED_ANNOTATION = f"{GROUP}/grounded"
@@ -38,7 +41,10 @@ GROUNDED_ANNOTATION = f"{GROUP}/grounded"
 After the next report, the annotation is ignored."""
 
 ON_MISSION = "OnMission"
-"""Condition of a Drone, set by the operator: unless it is False, the drone may have taken off since its last report."""
+"""Condition of a Drone, set by the operator.
+
+Unless the condition is False, the drone may have taken off since its last report.
+"""
 
 
 def is_airborne(state: str | None, last: str | None) -> bool:
@@ -93,7 +99,7 @@ class Interface(Model):
 
 
 def direct_interface(interfaces: Iterable[Interface]) -> Interface | None:
-    """Return the interface for direct links: the first one with a device, a range and a pairing."""
+    """Return the interface for direct links: the first interface with a device, a range and a pairing."""
     usable = (each for each in interfaces if each.device and each.range is not None and each.pairing is not None)
     return next(usable, None)
 
@@ -343,7 +349,7 @@ class Drone(Resource, plural="drones", short="drn"):
 
     @property
     def grounded_by_hand(self) -> bool:
-        """True if a person declared the drone grounded (`GROUNDED_ANNOTATION`) and it has not reported since."""
+        """True if a person declared the drone grounded (`GROUNDED_ANNOTATION`) and the drone has not reported since."""
         declared = self.metadata.annotations.get(GROUNDED_ANNOTATION)
         last_seen = self.status.last_seen if self.status is not None else None
         if declared is None or last_seen is None:

@@ -160,7 +160,7 @@ def _listed(choices: object) -> str:
 
 
 def _for_other(type_: PolicyType, then: str) -> str:
-    """Return a CEL rule that applies to all other types of policy."""
+    """Return a CEL rule that applies to all types of policy except one."""
     return f"self.type == '{type_}' || ({then})"
 
 
@@ -249,9 +249,10 @@ class PolicySpec(Validity):
         return "upperLimit" if self.lower_limit is None and self.upper_limit is None else None
 
     @rule(
-        # Speed: an upper limit of 0 m/s would stop the drone, and a negative one would fly it backwards. A lower limit
-        # of 0 is allowed and has no effect. Altitude: no drone flies below terrain, so the upper limit must be above 0
-        # there. Home and mean sea level have no such bound, because drones may fly below them.
+        # Speed: an upper limit of 0 m/s would stop the drone, and a negative limit would fly it backwards. A lower
+        # limit of 0 is allowed and has no effect. Altitude: no drone flies below terrain, so an upper limit above
+        # terrain must be greater than 0. Limits above home or mean sea level may be negative, because drones may fly
+        # below both.
         _for(
             "LimitControl",
             "(!has(self.upperLimit) || self.upperLimit > 0.0 || (self.kind != 'speed'"

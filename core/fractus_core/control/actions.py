@@ -48,7 +48,7 @@ class EndStream:
 
 @dataclass(frozen=True, slots=True)
 class RefuseStream:
-    """Refuse a control stream that was opened: the driver may neither command the vehicle nor wait for it."""
+    """Refuse a control stream that was opened: the driver may neither command the vehicle nor wait for control."""
 
     lease_id: int
     code: str
@@ -57,7 +57,7 @@ class RefuseStream:
 
 @dataclass(frozen=True, slots=True)
 class StartSystemTask:
-    """Start to hover, return or land, until done or stopped."""
+    """Start a system task: hover, return or land. The task runs until it is complete or stopped."""
 
     task: SystemTask
 
@@ -76,7 +76,7 @@ class Brake:
 
 @dataclass(frozen=True, slots=True)
 class HoldPosition:
-    """Hover for the driver, unless a motion or task begins first."""
+    """Hover while the driver keeps control. A motion or system task that begins replaces the hover."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,7 +112,7 @@ class WakeWaiters:
 
 @dataclass(frozen=True, slots=True)
 class SetStreamRates:
-    """Request telemetry at the rates for a flying or a standing vehicle."""
+    """Request telemetry at the rates for a flying vehicle or for a vehicle on the ground."""
 
     flying: bool
 

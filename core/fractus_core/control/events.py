@@ -21,7 +21,7 @@ class StreamOpened:
 
 @dataclass(frozen=True, slots=True)
 class StreamClosed:
-    """A driver's control stream ended. If the driver did not return control before, it counts as lost."""
+    """A driver's control stream ended. If the driver did not return control before, the driver counts as lost."""
 
     lease_id: int
 
@@ -35,7 +35,7 @@ class TransitRequested:
 
 @dataclass(frozen=True, slots=True)
 class TransitFailed:
-    """The transit flight failed by an internal error, which every retry would repeat."""
+    """The transit flight failed because of an internal error. A retry would fail in the same way."""
 
     lease_id: int
     reason: str
@@ -43,7 +43,7 @@ class TransitFailed:
 
 @dataclass(frozen=True, slots=True)
 class GrantControl:
-    """Every precondition for granting control to a waiting driver holds."""
+    """Control can be granted to a waiting driver, because all preconditions are met."""
 
     lease_id: int
 
@@ -55,7 +55,7 @@ class ControlReturned:
     Attributes:
         key: Key of the mission.
         control_points: Number of control points in the driver's grant.
-        paths: True if at least one of them has a path.
+        paths: True if at least one of the control points has a path.
     """
 
     key: str
@@ -65,12 +65,12 @@ class ControlReturned:
 
 @dataclass(frozen=True, slots=True)
 class WaypointsDone:
-    """The driver completed the first waypoints of its control point.
+    """The driver reported how many waypoints of its control point are complete.
 
     Attributes:
         key: Key of the mission.
-        waypoints: Number of waypoints that were reached or skipped.
-        leg: True if a leg of the driver ended, at a waypoint or elsewhere.
+        waypoints: Number of waypoints of the control point that were reached or skipped so far.
+        leg: True if a leg of the driver ended. The end of the leg need not be a waypoint.
     """
 
     key: str
@@ -80,7 +80,7 @@ class WaypointsDone:
 
 @dataclass(frozen=True, slots=True)
 class CruiseSpeedSet:
-    """The driver set the speed for legs that specify none."""
+    """The driver set the speed for legs that specify no speed."""
 
     speed_mps: float
 
@@ -105,14 +105,14 @@ class MotionFinished:
 
 @dataclass(frozen=True, slots=True)
 class MotionFailed:
-    """A motion ended with an error. The autopilot may still be executing it."""
+    """A motion ended with an error. The autopilot may still be executing the motion."""
 
     motion_id: int
 
 
 @dataclass(frozen=True, slots=True)
 class MotionCancelled:
-    """The caller of a motion cancelled it."""
+    """The caller of a motion cancelled the motion."""
 
     motion_id: int
 
@@ -200,7 +200,7 @@ class VehicleObserved:
 
 @dataclass(frozen=True, slots=True)
 class VehicleFound:
-    """The link to the autopilot came up, for the first time or again."""
+    """The link to the autopilot was established or restored."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -305,7 +305,7 @@ class TourBegan:
 
 @dataclass(frozen=True, slots=True)
 class TourPointVisited:
-    """The mission visited the first `visited` of its points of interest."""
+    """The mission visited a point of interest. `visited` is the number of points visited so far."""
 
     key: str
     visited: int
@@ -313,7 +313,7 @@ class TourPointVisited:
 
 @dataclass(frozen=True, slots=True)
 class TourInterrupted:
-    """The mission over points of interest cannot continue now, but may continue in a moment."""
+    """The mission over points of interest cannot continue now, but a retry may succeed soon."""
 
     key: str
     reason: str

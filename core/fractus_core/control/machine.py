@@ -104,7 +104,7 @@ the heartbeats, and the autopilot's own failsafe brings the vehicle home.
 CANCELLED_DESCENT_S = 0.3
 """Seconds for which a cancelled descent continues.
 
-The driver's stream may be about to break too, and in that case the vehicle must come down.
+If the driver's stream breaks within this time, the descent is not stopped, because the vehicle must then come down.
 """
 
 DESCENTS = frozenset({"Land", "ReturnToLaunch"})
@@ -138,8 +138,8 @@ def transition(state: ControlState, event: Event, now: float) -> tuple[ControlSt
         _on_tick(update)
     else:
         assert_never(event)
-    # When a mission has ended, its driver loses its lease, even if it only waits for control. Otherwise the driver
-    # could arm the vehicle next to the pilot who landed it.
+    # When a mission has ended, the driver of the mission loses its lease, even if the driver only waits for control.
+    # Otherwise the driver could arm the vehicle next to the pilot who landed it.
     lease = update.state.lease
     mission = update.state.missions.get(lease.key) if lease is not None else None
     if mission is not None and mission.outcome is not None:
@@ -179,7 +179,7 @@ def _on_driver(update: StateUpdate, event: DriverEvent) -> None:
 
 
 def _open_stream(update: StateUpdate, event: StreamOpened) -> None:
-    """Create a lease for the driver or refuse its stream. A second stream of the same instance replaces the first."""
+    """Create a lease for the driver or refuse its stream. A second stream of an instance replaces its first stream."""
     mission = update.mission(event.key, event.identity)
     if mission.outcome is not None:
         update.act(RefuseStream(event.lease_id, *ended_refusal(mission.outcome)))
@@ -221,7 +221,7 @@ def _grant_control(update: StateUpdate, lease_id: int) -> None:
 
 
 def _return_control(update: StateUpdate, event: ControlReturned) -> None:
-    """Return home after the last control point. Otherwise hover until the driver requests the next one."""
+    """Return home after the last control point. Otherwise hover until the driver requests the next control point."""
     lease = update.state.lease
     if lease is None or lease.key != event.key or not update.state.drives:
         return
@@ -286,7 +286,7 @@ def _fail_transit(update: StateUpdate, event: TransitFailed) -> None:
 
 
 def _on_motion(update: StateUpdate, event: MotionEvent) -> None:
-    """Handle the beginning or end of a motion. The end of a motion that was already replaced changes nothing."""
+    """Handle the beginning or end of a motion. The end of a replaced motion changes nothing."""
     motion = update.state.motion
     match event:
         case MotionBegan(motion_id, kind):
@@ -359,7 +359,10 @@ def _lose_position(update: StateUpdate, reason: str) -> None:
 
 
 def _change_grant(update: StateUpdate, event: GrantChanged) -> None:
-    """Revoke the mission of a removed grant, even under a pilot. The mission of a changed grant continues."""
+    """Revoke the mission of a removed grant, even while a pilot has control.
+
+    The mission of a changed grant continues.
+    """
     before = event.before
     after = event.after
     removed = frozenset({before.key} if before is not None else ())
@@ -397,7 +400,7 @@ def _on_system(update: StateUpdate, event: SystemEvent) -> None:
             if update.state.touring != key:  # a mission over points of interest must not stop its own task
                 update.stop_task()
             grace = update.state.grace
-            # A transit that is refused repeatedly must not restart the grace each time.
+            # A transit that is refused repeatedly must not restart the grace period each time.
             kept = grace if grace is not None and grace.key == key else None
             update.set(grace=kept, authority=Authority.SYSTEM)
             update.adopt(update.mission(key, identity))
@@ -500,7 +503,7 @@ def _on_tick(update: StateUpdate) -> None:
 
 
 def _end_grace(update: StateUpdate) -> None:
-    """Fail the mission, because the driver or the position did not come back in time."""
+    """Fail the mission, because the grace period of a lost driver or position has ended."""
     grace = update.state.grace
     update.set(grace=None)
     mission = update.state.missions.get(grace.key) if grace is not None else None

@@ -34,7 +34,7 @@ class ModeKind(Enum):
 
 @dataclass(frozen=True, slots=True)
 class FlightMode:
-    """Flight mode, identified by the autopilot's name for it."""
+    """Flight mode, identified by its name in the autopilot."""
 
     name: str = "UNKNOWN"
     kind: ModeKind = ModeKind.OTHER
@@ -175,7 +175,7 @@ class ControlLease:
 
 
 class TaskKind(Enum):
-    """Task of the system. The values equal those of a policy's takeover."""
+    """Task of the system. The values equal the values of a policy's takeover."""
 
     HOVER = "hover"
     RETURN = "returnToLaunch"
@@ -191,7 +191,8 @@ class SystemTask:
         task_id: Unique id.
         kind: Kind of the task.
         key: Key of the mission, for a mission over points of interest.
-        begun_by_others: True if the system did not cause the descent of the autopilot, so a pilot may have chosen it.
+        begun_by_others: True if the system did not cause the descent of the autopilot, so a pilot may have chosen the
+            descent.
     """
 
     task_id: int
@@ -228,7 +229,7 @@ class ActiveMotion:
 class Grace:
     """Grace period after the loss of the driver or the position.
 
-    When it ends without recovery, the mission has failed.
+    If the grace period ends without recovery, the mission has failed.
     """
 
     until: float
@@ -328,7 +329,7 @@ class ControlState:
 
     @property
     def touring(self) -> str | None:
-        """Key of the mission over points of interest that the system is flying; None if there is none."""
+        """Key of the mission over points of interest that the system is flying; None if it flies no such mission."""
         return self.task.key if self.task is not None and self.task.kind is TaskKind.TOUR else None
 
     @property
@@ -373,24 +374,27 @@ class ControlState:
 
     @property
     def in_transit(self) -> bool:
-        """True if the system flies a transit for a waiting driver. The grace of the driver does not expire meanwhile."""
+        """True if the system flies a transit for a waiting driver.
+
+        The driver's grace period does not expire meanwhile.
+        """
         lease = self.lease
         flight = self.flight
         return lease is not None and flight is not None and not lease.granted and lease.key == flight.key
 
     @property
     def deadline(self) -> float | None:
-        """Time at which the next Tick has an effect; None if there is none."""
+        """Time from which a Tick has an effect; None if no deadline is set."""
         grace = self.grace if not self.in_transit else None
         deadlines = (grace.until if grace else None, self.motion.hover_at if self.motion else None)
         return min((deadline for deadline in deadlines if deadline is not None), default=None)
 
     def flies_for(self, key: str) -> bool:
-        """Return True if the vehicle is armed for this mission."""
+        """Return True if the vehicle is armed for the mission with this key."""
         return self.vehicle.armed and self.active == key
 
     def armed_for_other(self, key: str) -> bool:
-        """Return True if the vehicle is armed for a different mission."""
+        """Return True if the vehicle is armed for a mission with another key."""
         return self.vehicle.armed and self.mission is not None and self.mission.key != key
 
     def observed(self, vehicle: VehicleFacts) -> ControlState:

@@ -30,7 +30,7 @@ from fractus_core.control.state import (
 )
 
 MAX_MISSIONS = 200
-"""Number of missions that are remembered."""
+"""Maximum number of missions that the state contains."""
 
 DRIVER_LOST = "driver lost"
 GRANT_REMOVED = "the grant was removed"
@@ -74,7 +74,7 @@ class StateUpdate:
     # Missions
 
     def mission(self, key: str, identity: str) -> Mission:
-        """Return the mission of a grant. Create it if it is new, and drop the oldest missions above the limit."""
+        """Return the mission of a grant. Create a missing mission, and keep the latest `MAX_MISSIONS`."""
         mission = self.state.missions.get(key)
         if mission is None:
             mission = Mission(key, identity)
@@ -85,13 +85,13 @@ class StateUpdate:
         return mission
 
     def update_mission(self, mission: Mission, **changes: Any) -> Mission:
-        """Change fields of a mission and return it."""
+        """Change fields of a mission, and return the changed mission."""
         changed = replace(mission, **changes)
         self.set(missions={**self.state.missions, mission.key: changed})
         return changed
 
     def end_mission(self, mission: Mission | None, kind: OutcomeKind, reason: str) -> Mission | None:
-        """Set the outcome of a mission that has none, save it, and end the grace of its driver."""
+        """Set and save the outcome of a mission that has none, and end the grace period of its driver."""
         if mission is None or mission.outcome is not None:
             return mission
         if self.state.grace is not None and self.state.grace.key == mission.key:
@@ -100,7 +100,7 @@ class StateUpdate:
         return self.update_mission(mission, outcome=Outcome(kind, reason))
 
     def adopt(self, mission: Mission) -> None:
-        """Make a mission the active one: the vehicle flies for it from now on."""
+        """Make a mission the active mission, for which the vehicle flies from now on."""
         if self.state.active != mission.key:
             self.set(speed_mps=None)
         self.set(active=mission.key, removed=None)
@@ -115,7 +115,7 @@ class StateUpdate:
             self.set(motion=None)
 
     def lose_lease(self, reason: str) -> None:
-        """Take the lease from a driver that has control or waits for it, and report the reason to it."""
+        """Take the lease from a driver that has control or waits for control, and report the reason to the driver."""
         lease = self.state.lease
         self.stop_motion(StopKind.LOST, "ControlLost", reason)
         self.drop_lease()
@@ -126,9 +126,9 @@ class StateUpdate:
     def drop_lease(self) -> None:
         """Remove the lease, and end the control authority of the driver.
 
-        If a driver with authority opens a second stream, the lease of the second stream is not granted yet. The
-        authority must end with that lease as well. Otherwise the service would mistake a pilot who arms the vehicle for
-        the driver.
+        If a driver with authority opens a second stream, the lease of the second stream is not granted yet. If the
+        second lease is removed before it is granted, the authority must end too. Otherwise the service would mistake a
+        pilot who arms the vehicle for the driver.
         """
         self.set(lease=None)
         if self.state.authority is Authority.DRIVER:
@@ -151,7 +151,7 @@ class StateUpdate:
     def stop_task(self) -> None:
         """Stop the system task.
 
-        If the autopilot itself is returning, it continues, but no system task supervises it.
+        If the autopilot itself is returning, the return continues, but no system task supervises it.
         """
         if self.state.task is not None:
             self.act(StopSystemTask(self.state.task.task_id))

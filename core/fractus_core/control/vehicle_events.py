@@ -46,7 +46,7 @@ FLEW_HOME_ALONE = "the autopilot returned by itself while the mobility service w
 
 
 def on_vehicle(update: StateUpdate, event: VehicleEvent) -> None:
-    """Handle a change of the vehicle, or a command to it."""
+    """Handle a change of the vehicle, or a command of the system to the vehicle."""
     match event:
         case VehicleObserved(vehicle):
             update.state = update.state.observed(vehicle)
@@ -194,7 +194,7 @@ def _on_armed(update: StateUpdate) -> None:
 
 
 def _on_disarmed(update: StateUpdate) -> None:
-    """Handle the stop of the motors. A driver that has control keeps it."""
+    """Handle the stop of the motors. A driver that has control keeps control."""
     mission = update.state.mission
     update.stop_task()
     update.set(returning=False, unattended=0, armed_by_others=False)
@@ -221,9 +221,9 @@ def _on_foreign_mode(update: StateUpdate) -> None:
     if unconfirmed is not None and vehicle.mode == unconfirmed[0] and update.now < unconfirmed[1] and not piloted:
         update.set(unconfirmed=None)
         if vehicle.mode.comes_down and state.authority is Authority.SYSTEM and not state.returning:
-            update.follow_descent(_descent(vehicle.mode))  # the task that requested it has ended
+            update.follow_descent(_descent(vehicle.mode))  # the task that requested this mode has ended
         return  # the system requested this mode itself, but the acknowledgements were lost
-    # The failsafe flag stays set for the rest of the flight. A later mode change may therefore be that of a pilot.
+    # The failsafe flag stays set for the rest of the flight. A later mode change may therefore be caused by a pilot.
     begins = vehicle.failsafe and not state.failsafe_seen
     text = vehicle.failsafe_text if update.now - vehicle.failsafe_text_at < FAILSAFE_TEXT_S else ""
     if vehicle.silent_s >= LINK_CUT_S and vehicle.mode.kind is ModeKind.RETURNING and not text:
@@ -231,7 +231,7 @@ def _on_foreign_mode(update: StateUpdate) -> None:
     by_failsafe = (begins or text) and not piloted
     reason = f"the autopilot's own failsafe took the drone ({text or vehicle.mode.name})"
     if by_failsafe and vehicle.mode.kind is ModeKind.BRAKING:
-        # No pilot has control, and the vehicle would hover until its battery is low.
+        # Return, because no pilot has control. Without the return, the vehicle would hover until its battery is low.
         update.seize(TaskKind.RETURN, "AutopilotFailsafe", reason, (), OutcomeKind.FAILED)
     elif by_failsafe and vehicle.mode.comes_down:
         update.audit("takeover", vehicle.mode.name, "system", reason, "AutopilotFailsafe")

@@ -1,4 +1,4 @@
-"""Paths across the antimeridian, which programs draw around the world unless they are cut there (RFC 7946, 3.1.9)."""
+"""Cuts paths at the antimeridian (RFC 7946, 3.1.9). Programs would draw an uncut path around the world."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ Position = tuple[float, ...]
 def cut_path(points: Sequence[Position]) -> list[list[Position]]:
     """Return the parts of a path between its crossings of the antimeridian.
 
-    The parts of a crossing end and begin at longitudes of 180 and -180 degrees, with the other values interpolated. The leg
-    between two points is the shorter connection.
+    At a crossing, one part ends at a longitude of 180 or -180 degrees, and the next part begins at the longitude with
+    the opposite sign. The other values at the crossing are interpolated. The leg between two points is the shorter
+    connection.
 
     Args:
         points: Points in order.
@@ -37,7 +38,7 @@ def cut_path(points: Sequence[Position]) -> list[list[Position]]:
 
 
 def _turn(start: float, end: float) -> float:
-    """Return the degrees to add to the end so that it is at most 180 degrees from the start."""
+    """Return the degrees to add to the end so that the end is at most 180 degrees from the start."""
     if end - start > 180.0:
         return -360.0
     return 360.0 if end - start < -180.0 else 0.0

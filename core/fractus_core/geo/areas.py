@@ -18,13 +18,13 @@ from fractus_core.geo.distances import distance_m
 from fractus_core.local_frame import LocalFrame
 
 _SEGMENTS = (8, 32)
-"""Straight pieces per quarter of a circle, minimum and maximum. The area is accurate to 0.4 %."""
+"""Minimum and maximum number of straight pieces that replace a quarter of a circle. The area is accurate to 0.4 %."""
 
 _CORNER_M = 0.01
-"""Distance between corners and circle that determines the number of pieces, within the limits of `_SEGMENTS`."""
+"""Distance of corners from their circle, which determines the number of pieces within the limits of `_SEGMENTS`."""
 
 MAX_EXTENT_M = 1_000_000.0
-"""Largest distance of a point of an area from its center. A local frame is meaningless beyond it."""
+"""Largest distance of a point of an area from its center. A local frame is meaningless beyond this distance."""
 
 _MIN_CURVATURE_M = 6_335_000.0
 """Smallest radius of curvature of the ellipsoid."""
@@ -113,7 +113,7 @@ def corridor(frame: LocalFrame, points: Iterable[Point], radius_m: float) -> Bas
 
 
 def _circumscribed(radius_m: float) -> tuple[float, int]:
-    """Return the distance from the centre to the corners of a polygon around a circle, and its pieces per quarter."""
+    """Return the distance from the centre to the corners of a polygon around a circle, and the pieces per quarter."""
     needed = math.ceil(math.pi / 4 / math.acos(radius_m / (radius_m + _CORNER_M)))
     fewest, maximum = _SEGMENTS
     segments = min(max(needed, fewest), maximum)
@@ -124,7 +124,7 @@ def check_extent(area: Area) -> None:
     """Reject an area of continental size.
 
     Raises:
-        InvalidObject: Names the first point that is too far away.
+        InvalidObject: A point is too far away. The error names the first such point.
     """
     centre = area_center(area)
     for i, point in enumerate(area.polygon.exterior if area.polygon is not None else ()):
@@ -143,7 +143,10 @@ def area_center(area: Area) -> Point:
 
 
 def center_of(points: Iterable[Point]) -> Point:
-    """Return the center of points on the sphere. It is also correct across the antimeridian and near the poles."""
+    """Return the center of points on the sphere.
+
+    The result is also correct across the antimeridian and near the poles.
+    """
     rad = np.radians([(p.lat, p.lon) for p in points])
     lat = rad[:, 0]
     lon = rad[:, 1]
@@ -212,7 +215,7 @@ def _cut(shape: BaseGeometry) -> Iterator[BaseGeometry]:
 
 
 def _unwrapped(frame: LocalFrame, ring: BaseGeometry) -> list[tuple[float, float]]:
-    """Return lon, lat of a ring, each longitude within 180 degrees of its neighbour."""
+    """Return lon, lat of the points of a ring. Each longitude is within 180 degrees of the longitude before it."""
     lats, lons = frame.latlon_array(shapely.get_coordinates(ring))
     # Multiples of 360 degrees are exact numbers, so the ring stays closed.
     lons[1:] -= 360.0 * np.cumsum(np.round(np.diff(lons) / 360.0))
@@ -230,9 +233,12 @@ def _turns(ring: Sequence[tuple[float, float]]) -> bool:
 
 
 def _beside_pole(rings: Iterable[Sequence[tuple[float, float]]]) -> BaseGeometry:
-    """Return the area enclosed by rings in the longitude/latitude plane. A pole is a line in this plane that no edge crosses."""
+    """Return the area enclosed by rings in the longitude/latitude plane.
+
+    No edge crosses the line that represents a pole in this plane.
+    """
     exterior, *holes = rings
-    # The longitudes of a hole may differ by 360 degrees from those of the exterior.
+    # The longitudes of a hole may differ by 360 degrees from the longitudes of the exterior.
     turned = (_closed(_shifted(hole, shift)) for hole in holes for shift in (-360.0, 0.0, 360.0))
     return _closed(exterior).difference(shapely.union_all(list(turned)))
 
@@ -254,7 +260,7 @@ def _near(lon: float, reference: float) -> float:
 
 
 def _points(frame: LocalFrame, ring: BaseGeometry) -> tuple[Point, ...]:
-    """Return the corners of a ring without the repetition of the first."""
+    """Return the corners of a ring without a repetition of the first corner."""
     lats, lons = frame.latlon_array(shapely.get_coordinates(ring)[:-1])
     return tuple(
         Point(lat=round(lat, 9), lon=round(lon, 9)) for lat, lon in zip(lats.tolist(), lons.tolist(), strict=True)
@@ -270,7 +276,7 @@ Line = npt.NDArray[np.float64]
 """The corners of a line in order, in metres, one per row."""
 
 _AT_ONCE = 64
-"""Number of pieces compared with all others at a time. For 30,000 pieces this makes a million pairs."""
+"""Number of pieces that are compared with all pieces in one step. For 30,000 pieces this makes a million pairs."""
 _MAX_PAIRS = 2_500_000
 """Maximum number of pairs of pieces that are examined, which takes a second.
 
@@ -281,8 +287,8 @@ Two thousand parallel pieces reach the maximum.
 def count_crossings(lines: Sequence[Line], at_most: int) -> int:
     """Count the pairs of straight pieces that cross, within a line and between lines. Touching pieces do not count.
 
-    The count is a cheap check before computations that take longer the more often lines cross. Pieces are looked up by
-    their bounding boxes: n pieces with k nearby pairs cost O(n log n + k).
+    The count is a cheap check before computations whose duration grows with the number of crossings. Pieces are looked
+    up by their bounding boxes: n pieces with k nearby pairs cost O(n log n + k).
 
     Args:
         lines: Lines of two or more corners each.
@@ -309,9 +315,9 @@ def count_crossings(lines: Sequence[Line], at_most: int) -> int:
 
 
 def _cross(a: Line, b: Line, c: Line, d: Line) -> npt.NDArray[np.bool_]:
-    """Return True if the pieces from a to b cross those from c to d.
+    """Return True if the pieces from a to b cross the pieces from c to d.
 
-    Two pieces cross if the ends of each are on both sides of the other.
+    Two pieces cross if each piece has its ends on different sides of the other piece.
     """
     apart = _side(a, b, c) * _side(a, b, d) < 0
     return apart & (_side(c, d, a) * _side(c, d, b) < 0)

@@ -10,7 +10,7 @@ from fractus_core.api.geometry import Point
 from fractus_core.local_frame import FLATTENING, SEMI_MAJOR_AXIS_M, ecef
 
 CHORDS_TO_M = 200_000.0
-"""Up to this distance, geodesic distances are computed from chords, beyond it by Karney's algorithm."""
+"""Maximum distance that is computed from the chord. Longer geodesic distances are computed with Karney's algorithm."""
 
 
 def geodesic_m(a: Point, b: Point) -> float:

@@ -138,7 +138,7 @@ class Authority:
         }
 
     def is_current(self, data: Data, identity: str, now: datetime) -> bool:
-        """Return True if a component certificate is from this authority, for this identity, and not due for renewal."""
+        """Return True if this authority issued a component certificate for this identity, and renewal is not due."""
         try:
             certificate = x509.load_pem_x509_certificate(base64.b64decode(data["tls.crt"]))
             certificate.verify_directly_issued_by(self.certificate)

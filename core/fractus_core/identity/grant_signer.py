@@ -45,8 +45,8 @@ class GrantSigner:
         now = self._clock()
         key, certificate = self._present_signer(now)
         before = replaces.spec.issued_at if replaces is not None else None
-        # Ignore a time of issue after the expiry of the certificate. It is forged or damaged, and the certificate does
-        # not permit a later one.
+        # Ignore a time of issue after the expiry of the certificate. Such a time is forged or damaged, and the
+        # certificate does not permit a later time.
         if before is not None and before.tzinfo is not None and before < certificate.not_valid_after_utc:
             self._last_issued = max(self._last_issued, before)
         # The time must increase even if the clock stops or goes back, because nodes keep the latest Grant.

@@ -16,7 +16,7 @@ from fractus_core.linking.values import PathMetrics
 GROUP = "fractus.linking"
 
 DIRECT_BONUS = 1e3
-"""With `preferDirect` a direct link beats any bandwidth. Among direct links the faster one wins."""
+"""With `preferDirect` a direct link beats any bandwidth. Among direct links the faster link wins."""
 
 
 class PathHeuristic(Protocol):

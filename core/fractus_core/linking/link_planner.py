@@ -66,7 +66,7 @@ class Horizon:
 
 @dataclass(frozen=True, slots=True)
 class Solution:
-    """Best sum of scores from each step on by state, and the best next state."""
+    """For each step and each state: the best sum of scores from this step to the end, and the best next state."""
 
     values: tuple[tuple[float, ...], ...]
     moves: tuple[tuple[int, ...], ...]
@@ -75,7 +75,7 @@ class Solution:
 def solve(horizon: Horizon) -> Solution:
     """Maximise the sum of scores, from the last step backwards."""
     states = range(len(horizon.direct) + 1)
-    # Values and moves of the steps from `step` on, the nearest step last.
+    # Values and moves of `step` and all later steps, in reverse order of time.
     values = [tuple(0.0 for _ in states)]
     moves = [tuple(states)]
     for step in range(horizon.steps - 1, -1, -1):
@@ -164,7 +164,7 @@ def plan_link(
 
 
 def _score_without_path(scores: Sequence[float]) -> float:
-    """Return the score of having no path. It is so low that a switch to the worst link is an improvement."""
+    """Return the score of a step without any path. It is so low that a switch to the worst link is an improvement."""
     return min(scores, default=0.0) - max(map(abs, scores), default=0.0)
 
 
@@ -191,7 +191,7 @@ def _while_up(
         return current, "Dwell"
     kept = horizon.score(current, 0) + solution.values[1][current]
     if solution.values[0][current] - kept <= horizon.switch_cost * settings.hysteresis:
-        # An idle link costs nothing, so the drone leaves a link only for another one.
+        # An idle link costs nothing, so the drone leaves a link only for another link.
         return current, "Keep" if move == current else "Hysteresis"
     return (move, "BetterPeer") if move else (current, "Keep")
 

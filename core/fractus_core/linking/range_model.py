@@ -19,13 +19,13 @@ MAX_FACTOR = 2.0
 RATE_SMOOTHING = 0.3
 """Weight of a new bandwidth measurement."""
 RANGE_MARGIN = 1.02
-"""A link that works at some distance is expected to work at this multiple of the distance, too."""
+"""A link that works at a distance is also expected to work at the distance multiplied by this factor."""
 RECOVERY_SHARE = 0.98
-"""Share of the distance at which a link broke. A beacon from this distance shows that the link was not out of range."""
+"""A beacon from at least this share of the distance at which a link broke shows that the range was not the cause."""
 
 FIRST_RETRY_S = 1.0
 MAX_RETRY_S = 60.0
-"""First and longest delay before another attempt to connect to a peer. The delay doubles with each failure."""
+"""Shortest and longest delay before another attempt to connect to a peer. The delay doubles with each failure."""
 MAX_IDLE_RETRY_S = 4.0
 """Longest delay while the drone has no link. An attempt interrupts no traffic in this state."""
 
@@ -62,7 +62,7 @@ def next_attempt_s(learned: LearnedRange, *, linked: bool) -> float:
 
     Args:
         learned: Experience with the peer.
-        linked: True if a link to another peer is up or coming up, which the attempt would end.
+        linked: True if a link to another peer is up or coming up. The attempt would end that link.
     """
     if not learned.failures:
         return float("-inf")
@@ -100,7 +100,7 @@ class RangeModel:
     _before_loss: dict[str, tuple[float, float]] = field(default_factory=dict)
 
     def retain(self, names: Collection[str]) -> None:
-        """Forget all peers except the named ones."""
+        """Forget all peers except the named peers."""
         for by_name in (self.ranges, self._before_loss):
             for name in by_name.keys() - set(names):
                 del by_name[name]

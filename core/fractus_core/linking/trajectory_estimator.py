@@ -14,7 +14,7 @@ from fractus_core.linking.values import LocalPosition, Track
 from fractus_core.local_frame import LocalFrame
 
 ARRIVED_M = 5.0
-"""Distance to a waypoint within which the drone counts as having reached it, in metres."""
+"""Distance to a waypoint, in metres, within which the waypoint counts as reached."""
 MIN_SPEED_MPS = 0.5
 """Speed below which the drone counts as standing, so that its direction is ignored, in m/s."""
 ON_COURSE = 0.5
@@ -69,7 +69,7 @@ class TrajectoryEstimator:
         self._next: int | None = None
 
     def estimate(self, sample: TelemetrySample) -> tuple[LocalFrame, Track]:
-        """Return the local frame, and the drone's track in that frame."""
+        """Return the local frame, and the drone's position and expected motion in it."""
         if self._frame is None:
             self._frame = LocalFrame(sample.lat, sample.lon)
         position = (*self._frame.xy(sample.lat, sample.lon), sample.above_home_m)

@@ -35,7 +35,7 @@ class Peer:
     Attributes:
         name: Name of the node.
         position: Position of the node in the local frame.
-        range_m: Declared range of the direct link: the smaller one of both ends, in metres.
+        range_m: Declared range of the direct link, in metres: the smaller range of the two interfaces.
         offers: Performance of the link well inside its range.
     """
 

@@ -12,7 +12,7 @@ from fractus_core.api.plans import Rejection
 from fractus_core.planning.inventory import Host, Settings
 
 INSUFFICIENT = "InsufficientResources"
-"""Reason for a node that would be suitable with more free resources."""
+"""Reason for the rejection of a node that would be suitable with more free resources."""
 
 
 class Ledger:

@@ -21,7 +21,7 @@ _MAX_SAMPLES = 200_000
 _MAX_CROSSINGS = 1_000_000
 """Maximum number of crossings of outline and lattice rows.
 
-Without it, a region that is a millimetre wide and kilometres long would need too many rows.
+Without this maximum, a region that is a millimetre wide and kilometres long would need too many rows.
 """
 _ACROSS = 4
 """Number of samples across a narrow area. With fewer samples, a corridor could lie between two rows."""
@@ -35,7 +35,7 @@ _CHUNK = 2048
 _TABLE = 2_000_000
 """Maximum lattice size for a table of ranks. Larger lattices use binary search."""
 _REMEMBERED = 4_000_000
-"""Maximum number of runs that are cached (about 64 MB). Beyond it, runs are computed again when needed."""
+"""Maximum number of runs that are cached (about 64 MB). If there are more runs, they are computed again when needed."""
 
 
 class Samples:
@@ -113,7 +113,7 @@ class CoverScene:
         xy: Positions in metres east and north, shape (n, 2).
         reach_m: Range of direct links to the drone in metres, shape (n,).
         share: Share of the area to cover, 0 to 1.
-        kept: Candidates with an instance, which they keep if it adds coverage.
+        kept: Candidates that have an instance already. A candidate keeps its instance if the instance adds coverage.
         covered_by: Discs that are already covered: x, y, range, shape (m, 3).
         newly_covered_by: Discs that new instances cover: x, y, range. They count after the kept candidates were
             selected.
@@ -140,7 +140,8 @@ class Pick:
 CoverStrategy = Callable[[CoverScene, Callable[[str], bool]], Sequence[Pick]]
 """Function that selects candidates of a scene in order.
 
-Its second argument is a function that returns True if a candidate fits. It is called once for each candidate.
+Its second argument is a function that returns True if a candidate fits. This function is called once for each
+candidate.
 """
 
 
@@ -201,7 +202,7 @@ class _State:
         return total - int(self._before[-1]) >= self._scene.share * total
 
     def best(self) -> int | None:
-        """Return the candidate that adds most coverage, the first of equal ones, or None if none adds coverage."""
+        """Return the first candidate that adds most coverage, or None if no candidate adds coverage."""
         while True:
             best = int(np.argmax(self._bounds)) if len(self._bounds) else -1
             if best < 0 or self._bounds[best] <= 0:

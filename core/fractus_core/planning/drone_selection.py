@@ -158,7 +158,7 @@ def _legal_first(
 
 
 def _parked_in_range(builder: PlanBuilder, area: OperationArea, leader: Component, flying: Sequence[str]) -> list[str]:
-    """Return the drones parked in range of the start, and reject the nearest ones out of range."""
+    """Return the drones parked in range of the start, and reject the nearest drones out of range."""
     located = builder.located
     settings = builder.settings
     first = leader.control_points[0] if leader.control_points else None
@@ -196,7 +196,10 @@ def _depots_around(builder: PlanBuilder, center: Point) -> Iterable[str]:
 
 
 def _flying_past(builder: PlanBuilder, leader: Component) -> list[str]:
-    """Return the drones whose flights for other applications visit all points of interest. Reject some other drones."""
+    """Return the drones whose flights for other applications visit all points of interest.
+
+    Store rejections of some other drones.
+    """
     poi = builder.spec.points_of_interest
     visiting = []
     listed = 0
@@ -221,7 +224,7 @@ def _flying_past(builder: PlanBuilder, leader: Component) -> list[str]:
 def _rank(
     builder: PlanBuilder, estimator: MissionEstimator, drone: Drone, components: list[Component], *, used: bool
 ) -> _Ranked | None:
-    """Return the drone with its score. If it fails a requirement, store the rejection and return None."""
+    """Return the drone with its score. If the drone fails a requirement, store the rejection and return None."""
     leader = builder.spec.driver or components[0]
     kept = builder.was_selected(drone.name, shared=used)
     home = home_of(drone, builder.inventory.depots)

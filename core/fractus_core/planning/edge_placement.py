@@ -27,7 +27,7 @@ class Location:
         index: Index of the location in the component.
         nodes: Edge nodes in the location: current hosts first, then the nearest first.
         hosts: Selected nodes.
-        checked: Number of nodes at the beginning of `nodes` that were checked. None of them is free any more.
+        checked: Number of nodes at the beginning of `nodes` that were checked. None of these nodes is free any more.
     """
 
     component: Component
@@ -140,7 +140,7 @@ class _NodeMatching:
                 self._builder.ledger.release(name, location.component)
 
     def _assign(self, location: Location, visited: set[Location], *, first: bool) -> bool:
-        """Assign another node to a location. Return False if no node is left for it."""
+        """Assign another node to a location. Return False if no node is left."""
         while location.checked < len(location.nodes):
             name = location.nodes[location.checked]
             location.checked += 1

@@ -36,7 +36,7 @@ from fractus_core.policy.footprint import MAX_SIGHT_M
 from fractus_core.policy.selectors import application_reference, node_attributes, policy_applies
 
 ROUNDING_M = 0.01
-"""Tolerance of the granted area's outline. It reduces the number of points to a third."""
+"""Tolerance of the granted area's outline. This tolerance reduces the number of points to a third."""
 
 MAX_ROUNDING_M = 0.16
 """Maximum tolerance for an outline with more points than a ring may have."""
@@ -45,13 +45,16 @@ AROUND_CORRIDOR_M = 100.0
 """Zones further than this from the corridor of a drone do not affect its route."""
 
 _PERMITTING_KINDS = frozenset({"inclusion", "grant"})
-"""Kinds of policies that allow something only in their zones. Their zones out of reach are therefore kept."""
+"""Kinds of policies that allow something only in their zones.
+
+Grants therefore also contain their zones out of reach.
+"""
 
 _Bounds = tuple[Point, float]
 """A position, and the distance in metres within which a zone may affect the node."""
 
 FIXED_NODE_REACH_M = 1000.0
-"""Zones further than this from a fixed node do not affect it, unless its camera may see them."""
+"""Zones further than this from a fixed node do not affect it, unless the node's camera may see them."""
 
 
 def compile_grants(
@@ -360,7 +363,7 @@ _DISTORTION = 1.05
 
 
 def surely_beyond(zone: Zone | None, base: Point, reach_m: float) -> bool:
-    """Return True if a zone is obviously out of reach. This quick test returns False in all other cases."""
+    """Return True if a quick test shows that a zone is out of reach. If the test is inconclusive, return False."""
     if zone is None or zone.spec.area.polygon is None:
         return zone is not None and _circle_beyond(zone.spec.area, base, reach_m)
     ring = zone.spec.area.polygon.exterior

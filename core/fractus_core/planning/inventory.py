@@ -36,7 +36,7 @@ class Host:
 
     @property
     def is_cloud(self) -> bool:
-        """True if the node accepts cloud pods, by its class or in addition to it."""
+        """True if the node accepts cloud pods, because of its class or of the label `CLOUD_LABEL`."""
         return self.labels.get(CLASS_LABEL) == "cloud" or self.labels.get(CLOUD_LABEL) == "true"
 
 

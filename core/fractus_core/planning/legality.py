@@ -1,4 +1,4 @@
-"""Legality of a mission's route before takeoff, judged by the policy engine that also judges it in flight."""
+"""Legality of a mission's route before takeoff, judged by the policy engine that also judges the flight."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ MAX_LISTED = 50
 """Maximum number of legs that a plan lists."""
 
 TAKEOFF_ALTITUDE_M = 10.0
-"""Assumed takeoff altitude if the first position has none, as in the mobility service, in metres above home."""
+"""Takeoff altitude, in metres above home, if the first position has no altitude. The mobility service uses the same."""
 
 MAX_ROUTES = 10
 """Maximum number of routes that are judged for one plan."""
 
 MAX_SEARCHES = 20
-"""Maximum number of searches for detours around zones for one plan. Each of them blocks the operator for up to 80 ms."""
+"""Maximum number of searches for detours around zones for one plan. Each search blocks the operator for up to 80 ms."""
 
 MAX_SKIP_TARGETS = 100
 """Maximum number of waypoints that are judged as the next target of a driver that skips a denied waypoint."""
@@ -137,7 +137,7 @@ class RouteJudge:
         if key not in self._known and not held:
             self._known[key] = MissionRoute((), mission.distance_m, mission.needed_min)
         elif key not in self._known:
-            # A policy that applies at the start or the end of the mission may apply at any time between.
+            # A policy that applies at the start or the end of the mission may apply at any time between start and end.
             during = UncertainTime(time_s + mission.needed_min * 60, time_s)
             cruise_mps = min(self._settings.cruise_speed_mps, mobility.max_speed)
             now = Situation(
@@ -265,7 +265,7 @@ class _Flight:
         self._arrive(request)
 
     def _stranded(self, following: list[MissionLeg]) -> str:
-        """Return a note if a driver that skips a denied waypoint cannot reach any of the following ones either."""
+        """Return a note if a driver that skips a denied waypoint cannot reach any of the following waypoints either."""
         left = list(takewhile(lambda leg: leg.flown_by == "driver", following))[:MAX_SKIP_TARGETS]
         ends = [GotoArgs(leg.end.lat, leg.end.lon, leg.end.alt, leg.end.altitude_reference) for leg in left]
         if not ends or any(judge(Call("Goto", end), self.now, self.driver).permits for end in ends):
@@ -295,7 +295,7 @@ class _Flight:
         return None
 
     def _permitted(self, parts: list[GotoArgs]) -> list[GotoArgs]:
-        """Return the legs of a route as the engine permits them, or an empty list if it denies one."""
+        """Return the legs of a route as the engine permits them, or an empty list if the engine denies a leg."""
         now = self.now
         permitted = []
         for part in parts:

@@ -49,7 +49,9 @@ class PlannedLink:
 def plan_links(
     application: Application, plan: DeploymentPlanSpec, drone: Drone | None, edge_nodes: Mapping[str, EdgeNode]
 ) -> tuple[PlannedLink, ...]:
-    """Return the direct links of a plan. Each edge node with a hybrid component that the drone's components use has one.
+    """Return the direct links of a plan.
+
+    There is one link for each edge node with a hybrid component that the drone's components use.
 
     Args:
         application: Application of the plan.

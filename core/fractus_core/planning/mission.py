@@ -118,7 +118,7 @@ def stay_minutes(spec: ApplicationSpec) -> float:
 
 
 def home_of(drone: Drone, depots: Mapping[str, Depot]) -> Position | None:
-    """Return the parking position of a drone on the ground, or None if it is unknown."""
+    """Return the parking position of a drone on the ground, or None if the position is unknown."""
     depot = depots.get(drone.spec.depot or "")
     position = drone.spec.home or (depot.spec.location if depot is not None else None)
     return Position(lat=position.lat, lon=position.lon) if position is not None else None

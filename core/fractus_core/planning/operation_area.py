@@ -30,8 +30,9 @@ from fractus_core.geo import (
 )
 
 MAX_CROSSINGS = 50_000
-"""Maximum number of crossings of paths and region edges, for which their union takes about a second. A hundred times as many
-take minutes. A survey of 220 lines in each direction has 50,000 crossings and takes 0.1 s."""
+"""Maximum number of crossings of paths and region edges. The union of paths and regions with this number takes about a
+second, and with a hundred times as many it takes minutes. A survey of 220 lines in each direction has 50,000 crossings
+and takes 0.1 s."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,7 +134,7 @@ def check_crossings(spec: ApplicationSpec, route: Sequence[Position]) -> None:
 
 
 def start_of(point: ControlPoint, depots: Mapping[str, Depot]) -> Position | None:
-    """Return the start of a control point, or None if it is open.
+    """Return the start of a control point, or None if the start is open.
 
     Raises:
         InvalidObject: The depot is unknown.

@@ -54,7 +54,7 @@ def instance_name(application: str, component: Component, node: str | None = Non
 
 
 class PlanBuilder:
-    """Builds a plan step by step. Checks nodes, and stores placements, bookings and rejections."""
+    """Builds a plan step by step: checks nodes, and stores placements, bookings and rejections."""
 
     def __init__(
         self,
@@ -106,7 +106,7 @@ class PlanBuilder:
         )
 
     def reject(self, component: Component, node: str, check: Check, *, far: bool = False) -> None:
-        """Store why a node cannot host a component. `far` means that it is out of range."""
+        """Store why a node cannot host a component. `far` means that the node is out of range."""
         rejections = self._far if far else self._rejected
         rejections.setdefault((component.name, node), check.rejection(component, node))
 

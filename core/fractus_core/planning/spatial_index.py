@@ -33,7 +33,7 @@ _MIN_CURVATURE_RADIUS_M = _SEMI_MINOR_AXIS_M**2 / SEMI_MAJOR_AXIS_M
 _HALF_GLOBE_M = 20_100_000.0
 """Upper bound of all geodesic distances."""
 _TIE_M = 1e-3
-"""Points whose distances are equal to the millimetre are ordered by name."""
+"""Points with equal distances, rounded to a multiple of this, are ordered by name."""
 _ROUNDING_M = 1e-6
 """Rounding error of Earth-centred coordinates, with a margin."""
 _INITIAL_SLOTS = 16
@@ -141,7 +141,7 @@ class SpatialIndex:
         certain = chords[(chords > beyond_m) & (chords <= min(within_m, _HALF_GLOBE_M))]
         limit_m = min(within_m, _HALF_GLOBE_M)
         if len(certain) >= count:
-            # All nearer points, and points at the same distance as the last one, have chords up to this arc.
+            # All nearer points, and points at the same distance as the last result, have chords up to this arc.
             limit_m = min(_longest_arc(float(np.partition(certain, count - 1)[count - 1])) + _TIE_M, limit_m)
         lower_m = _shortest_chord(beyond_m) - _ROUNDING_M
         slots = np.flatnonzero((chords >= lower_m) & (chords <= limit_m + _ROUNDING_M))
@@ -178,7 +178,7 @@ class SpatialIndex:
         return [names[i] for i in order], xy[order]
 
     def _chords(self, lat: float, lon: float) -> _Floats:
-        """Return the chord length to the point in each slot, in metres. It is infinite for free slots."""
+        """Return the chord length to the point in each slot, in metres. The length is infinite for free slots."""
         chords = self._xyz - np.array(ecef(lat, lon))
         lengths: _Floats = np.sqrt(np.einsum("ij,ij->i", chords, chords))
         return lengths
@@ -321,7 +321,7 @@ class NodeLocations:
         self.homeless.discard(name)
 
     def upsert_depot(self, depot: Depot) -> None:
-        """Add or move a depot, along with the drones that have no other home."""
+        """Add or move a depot, and the drones whose parking position is the depot."""
         self._store_depot(depot)
         self._update_stands_at(depot.name)
 

@@ -29,7 +29,7 @@ _PERMITTING_KINDS = frozenset({"inclusion", "grant"})
 The approximation of a zone of these policies must not exceed the zone.
 """
 OPERATION_AREA = "operation-area"
-"""Policy name that verdicts use for the fence that every grant implies."""
+"""Policy name in verdicts of the operation area, which is a fence of every grant."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +47,10 @@ class Rule:
         return math.isfinite(self.valid_from_s) or math.isfinite(self.valid_until_s)
 
     def in_force(self, time_s: float) -> bool:
-        """Return True if the policy may be in its validity window at a time."""
+        """Return True if the policy is valid at a time.
+
+        At an uncertain time, the policy is valid if it is valid at any time between the two readings.
+        """
         if isinstance(time_s, UncertainTime):
             return self.valid_from_s <= time_s and time_s.earliest < self.valid_until_s
         return self.valid_from_s <= time_s < self.valid_until_s
@@ -64,7 +67,7 @@ class PolicyZone:
     schedule: tuple[ActiveTime, ...] = ()
 
     def in_force(self, time_s: float) -> bool:
-        """Return True if the policy is valid and its zone active at a time, or may be at an uncertain time."""
+        """Return True if policy and zone are active at a time, or at one of the readings of an uncertain time."""
         if not self.rule.in_force(time_s):
             return False
         return active_at(self.schedule, time_s) or (
@@ -83,7 +86,7 @@ class AirVolume:
 
 
 class PolicyIndex:
-    """Spatial index of the zones of policies, and the policies without zones, which hold everywhere."""
+    """Spatial index of the zones of policies, and the policies without zones, which apply everywhere."""
 
     __slots__ = ("_tree", "everywhere", "zones")
 
@@ -181,7 +184,7 @@ class CompiledGrant:
         return tuple(zone.in_force(time_s) for zone in self.timed_zones)
 
     def locate(self, now: Situation) -> tuple[float, float] | None:
-        """Return the drone's position in metres of the frame, or None while it is unknown."""
+        """Return the drone's position in metres of the frame, or None while the position is unknown."""
         return None if now.lat is None or now.lon is None else self.frame.xy(now.lat, now.lon)
 
 
@@ -360,7 +363,8 @@ def _inclusion(frame: LocalFrame, rule: Rule, policy: GrantedPolicy) -> Inclusio
 
 
 # Altitudes: metres above home for every datum, and altitude bands of zones in those metres. The height of terrain is
-# known only if the ground is taken as level with home, and the height of mean sea level only if home is known.
+# known only if the ground is assumed to be level with home. The height of mean sea level is known only if home is
+# known.
 
 
 def altitude_above_home_m(value: float, reference: Reference, home: Home | None, flat_terrain: bool) -> float | None:
@@ -392,7 +396,10 @@ def band_limits_m(band: AltitudeBand | None, home: Home | None, flat_terrain: bo
 def band_may_overlap(
     band: AltitudeBand | None, lower_m: float, upper_m: float, home: Home | None, flat_terrain: bool
 ) -> bool:
-    """Return True if altitudes from `lower_m` to `upper_m` above home may touch a band. A band of unknown datum may."""
+    """Return True if altitudes from `lower_m` to `upper_m` above home may touch a band.
+
+    A band with an unknown datum counts as touched.
+    """
     if band is None:
         return True
     floor_m, ceiling_m = band_limits_m(band, home, flat_terrain)
@@ -402,7 +409,10 @@ def band_may_overlap(
 def band_surely_contains(
     band: AltitudeBand | None, lower_m: float, upper_m: float, home: Home | None, flat_terrain: bool
 ) -> bool:
-    """Return True if altitudes from `lower_m` to `upper_m` above home lie inside a band. False if its datum is unknown."""
+    """Return True if altitudes from `lower_m` to `upper_m` above home lie inside a band.
+
+    Return False if the band's datum is unknown.
+    """
     if band is None:
         return True
     known = all(
@@ -416,12 +426,12 @@ def band_surely_contains(
 def band_gap_m(
     band: AltitudeBand | None, lower_m: float, upper_m: float, home: Home | None, flat_terrain: bool
 ) -> float:
-    """Return the vertical distance of altitudes from `lower_m` to `upper_m` above home to a band, 0 if they may touch."""
+    """Return the vertical distance between a band and altitudes from `lower_m` to `upper_m` above home, at least 0."""
     floor_m, ceiling_m = band_limits_m(band, home, flat_terrain)
     return max(floor_m - upper_m, lower_m - ceiling_m, 0.0)
 
 
 def band_depth_m(band: AltitudeBand | None, altitude_m: float, home: Home | None, flat_terrain: bool) -> float:
-    """Return the distance of an altitude above home to the nearest limit of a band, negative if it is outside the band."""
+    """Return the distance of an altitude above home to the nearest limit of a band, negative outside the band."""
     floor_m, ceiling_m = band_limits_m(band, home, flat_terrain)
     return min(altitude_m - floor_m, ceiling_m - altitude_m)

@@ -13,7 +13,7 @@ from fractus_core.api.methods import METHODS_OF, Service
 from fractus_core.api.policies import FaceMethod, Fallback, FilterAction
 
 STATIONARY_MPS = 0.5
-"""Below this horizontal and vertical speed a drone counts as stationary: it turns on the spot, within its tracking
+"""A drone whose horizontal and vertical speed are lower counts as stationary: it turns on the spot, within its tracking
 margin."""
 
 Action = Literal["allow", "correct", "deny", "takeover"]
@@ -102,8 +102,8 @@ class CaptureArgs:
 class UncertainTime(float):
     """Unix time of a clock that was set back. Either the reading before or the reading after the step may be right.
 
-    The value of the number is the later reading. A restriction holds if it holds at any time between the readings. A
-    permission holds only if it holds at both readings.
+    The value of the number is the later reading. A restriction applies if it is in force at any time between the
+    readings. A permission applies only if it is in force at both readings.
     """
 
     earliest: float
@@ -278,7 +278,7 @@ class Situation:
 
     @property
     def is_moving(self) -> bool:
-        """True if the drone is too fast to turn on the spot, or may be when a command takes effect."""
+        """True if the drone is too fast to turn on the spot, or may be too fast when a command takes effect."""
         moves = math.hypot(self.north_mps, self.east_mps) >= STATIONARY_MPS or abs(self.down_mps) >= STATIONARY_MPS
         return moves or self.is_pending_motion
 
@@ -367,7 +367,7 @@ class Verdict:
 
 
 def distinct(names: Iterable[str]) -> tuple[str, ...]:
-    """Return the names in their order, each once, without empty ones."""
+    """Return the names in their order, without duplicates and empty names."""
     return tuple(dict.fromkeys(name for name in names if name))
 
 

@@ -64,7 +64,7 @@ def judge(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
         verdict = settle_correction(call, verdict, lambda corrected: _judge_once(corrected, now, grant))
     if verdict.brake_first or not now.is_moving:
         return verdict
-    # A moving drone stops first if it is taken over, or if it is on its way into a fence.
+    # A moving drone stops before the result is carried out if the drone is taken over or is on its way into a fence.
     changes_course = verdict.permits and call.method in _COURSE_METHODS
     must_brake = verdict.action == "takeover" or (changes_course and must_stop_first(now, grant))
     return replace(verdict, brake_first=True) if must_brake else verdict
@@ -101,12 +101,12 @@ def _with_unknown_motion(now: Situation) -> Situation:
 # Access to methods
 
 PICTURE_METHODS = frozenset({"CaptureImage", "RetrieveImage"})
-"""Methods that return pictures. A denial applies to them if the picture may show one of its zones. They are permitted only
-inside the operation area."""
+"""Methods that return pictures. A policy that denies such a method applies if the picture may show one of the policy's
+zones. The methods are permitted only inside the operation area."""
 
 
 def judge_access(call: Call, now: Situation, grant: CompiledGrant) -> Verdict | None:
-    """Return the denial of a method that may not be used here and now, or None."""
+    """Return the denial of a method that is not permitted at the present place and time, or None."""
     method = call.method
     if method not in grant.methods:
         return deny(
@@ -160,7 +160,10 @@ def _outside_operation_area(method: str, now: Situation, grant: CompiledGrant) -
 
 
 def _is_allowed(index: PolicyIndex, now: Situation, grant: CompiledGrant) -> bool:
-    """Return True if at least one policy of an index certainly holds, for an uncertain time at both readings."""
+    """Return True if at least one policy of an index certainly applies.
+
+    At an uncertain time, at least one policy must apply at each of the two readings.
+    """
     readings = {float(now.time_s), earliest_time(now.time_s)}
     return all(_rules_here(index, replace(now, time_s=t), grant, 0.0, certain=True) for t in readings)
 
@@ -173,7 +176,7 @@ def _rules_here(
     *,
     certain: bool = False,
 ) -> list[Rule]:
-    """Return the policies of an index that hold at the present position, by priority.
+    """Return the policies of an index that apply at the present position, by priority.
 
     While the position is unknown, the result contains every policy in force, or, with `certain`, every policy in force
     that has no zones.
@@ -247,7 +250,7 @@ def _judge_picture(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
 
 
 def _judge_access_only(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
-    """Allow a method for which the access check is sufficient: it stops the drone, brings it home, or does not move it.
+    """Allow a method that needs only the access check, because it stops the drone, brings it home, or does not move it.
 
     PointGimbal belongs here because pictures are judged by the measured camera direction.
     """

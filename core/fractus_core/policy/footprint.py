@@ -22,9 +22,9 @@ With a field of view of 5 degrees, 8 megapixels resolve 0.3 m at this distance.
 MAX_HALF_VIEW_DEG = 80.0
 """Maximum half angle of a view, including errors. A camera with a wider view is assumed to see everything around it."""
 _MAX_TURN_DEG = 60.0
-"""Largest yaw error for which tangents bound the turned corners. For larger errors, a circle bounds them."""
+"""Maximum yaw error for which tangents bound the possible positions of a corner. For a larger error, a circle does."""
 _ARC_DEG = 15.0
-"""Step of the arc that closes a sector."""
+"""Angle between neighbouring points of the arc that closes a sector."""
 _SIDES = 24
 _CIRCLE = tuple(
     (math.sin(2 * math.pi * i / _SIDES) / math.cos(math.pi / _SIDES),
@@ -92,7 +92,7 @@ def joined_footprint(views: Sequence[Footprint]) -> Footprint:
 
 
 def exposure_footprint(poses: Sequence[Situation], frame: LocalFrame) -> Footprint | None:
-    """Return the footprint of a picture taken while the camera moves through these poses. None if one is unknown."""
+    """Return the footprint of a picture taken while the camera moves through these poses. None if a pose is unknown."""
     views = [footprint(now, frame) for now in poses]
     known = [view for view in views if view is not None]
     return joined_footprint(known) if known and len(known) == len(views) else None
@@ -209,7 +209,7 @@ def _sees_vertical(axis: Vector, right: Vector, up: Vector, half_view: tuple[flo
 
 
 def _sector(position: XY, now: Situation, axis: Vector, corners: list[Vector], error_deg: float) -> Footprint:
-    """Return everything within sight between the left and right sides of a picture that shows the horizon."""
+    """Return the footprint of a picture that shows the horizon: everything in sight between its two sides."""
     ahead = math.atan2(axis[1], axis[0])
     turns = [math.remainder(math.atan2(east, north) - ahead, 2 * math.pi) for north, east, _ in corners]
     left = min(turns) - math.radians(error_deg)
@@ -235,7 +235,7 @@ def _turned(corners: list[XY], error_deg: float) -> list[XY]:
     turn = math.radians(error_deg)
     c = math.cos(turn)
     s = math.sin(turn)
-    # The ends of each corner's arc, and the intersection of the tangents there.
+    # The ends of each corner's arc, and the intersection of the tangents at these ends.
     return [
         point
         for e, n in corners

@@ -19,10 +19,10 @@ from fractus_core.policy.limits import limit_forbids_altitudes
 Floats = NDArray[np.float64]
 
 CORNER_M = 0.1
-"""Distance of waypoints beyond the margin of their legs, so that rounding makes no leg illegal."""
+"""Distance that waypoints keep from fences in addition to the margin of legs, so that rounding makes no leg illegal."""
 
 _SIMPLIFY_TOLERANCE_M = 0.2
-"""Tolerance when simplifying a shape with many corners. The shape is grown by this amount first."""
+"""Tolerance when simplifying a shape with many corners. The shape is grown by this amount before it is simplified."""
 _MAX_EXACT_CORNERS = 24
 """Shapes with at most this number of corners are not simplified."""
 _SEGMENTS = 3
@@ -43,7 +43,7 @@ class FreeSpace:
 
     @classmethod
     def between(cls, now: Situation, grant: CompiledGrant, lower_m: float, upper_m: float, room_m: float) -> FreeSpace:
-        """Return the space that a grant permits between two altitudes, with a clearance beyond the engine's margin."""
+        """Return the space that a grant permits between two altitudes, with clearance in addition to the margin."""
         moving = replace(grant, operation_area=grant.flight_area, operation_area_border=grant.flight_area_border)
         slack = now.height_margin_m
         required_areas = [
@@ -131,7 +131,7 @@ def _outline(shape: BaseGeometry, away_m: float) -> BaseGeometry:
 
 
 def _corners(shape: BaseGeometry, turning: float) -> Floats:
-    """Return the corners that turn one way, with their neighbours, shape (n, 6).
+    """Return the corners that turn in one direction, with their neighbours, shape (n, 6).
 
     Direction 1 is left, with the shape on the left.
     """

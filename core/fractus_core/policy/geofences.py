@@ -29,29 +29,33 @@ SEVERITY: dict[GeofenceAction, int] = exhaustive(
 """Severity of each action. A higher value takes more control from the application."""
 
 HOME_RADIUS_M = 5.0
-"""A leg that ends within this distance of home counts as a return. A leg that starts within it counts as a departure.
+"""A leg that ends within this distance of home counts as a return.
 
-Both are permitted regardless of the position of the operation area.
+A leg that starts within this distance counts as a departure. Returns and departures are permitted regardless of the
+position of the operation area.
 """
 
 STATIONARY_LEG_M = 0.5
 """A leg that covers no more ground than this counts as a pure change of altitude."""
 
 EXTRA_MARGIN_M = 0.25
-"""Distance beyond the margin that a corrected target keeps, so that it never lies on a border."""
+"""Distance from fences that a corrected target keeps in addition to the margin, so that it never lies on a border."""
 
 ALTITUDE_TOLERANCE_M = 0.5
-"""Altitudes closer than this count as equal. Neither a barometer nor a controller is more accurate."""
+"""Altitudes that differ by less than this count as equal. Neither a barometer nor a controller is more accurate."""
 
 RTL_CONE_SLOPE = 3.0
-"""Slope of the autopilot's return cone: it climbs at most to this multiple of its distance from home, or higher if its
-owner configures that (ArduPilot parameter RTL_CONE_SLOPE)."""
+"""Slope of the autopilot's return cone: a returning drone climbs at most to this multiple of its distance from home.
+The owner of the drone may configure a steeper cone (ArduPilot parameter RTL_CONE_SLOPE)."""
 
 BISECTION_STEPS = 24
 """Number of bisection steps to find the point where a leg is far enough from a fence. The error is below 1 mm."""
 
 _SAMPLES = 24
-"""Number of sample points on the illegal part of a leg at which its distance to the border must not shrink."""
+"""Number of sample points on the part of a leg that is too close to a fence.
+
+The distance to the fence must not shrink from one point to the next.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +77,7 @@ class Breach:
 
     @property
     def severity(self) -> int:
-        """Severity of the reaction. If a leg only comes too close to the fence, the request is denied at most."""
+        """Severity of the reaction. If a leg only comes too close to the fence, the strictest reaction is a denial."""
         return SEVERITY[self.action] if self.enters else min(SEVERITY[self.action], SEVERITY["ignore"])
 
 
@@ -126,7 +130,7 @@ _EFFECTS: dict[Takeover, str] = exhaustive(
 
 
 def _check_operation_area(leg: Leg, now: Situation, grant: CompiledGrant, margin_m: float) -> Iterator[Breach]:
-    """Check the fence that every grant implies: fly to the operation area and stay there."""
+    """Check the fence of every grant: the drone must fly to the operation area and stay in this area."""
     operation_area = grant.operation_area
     border = grant.operation_area_border
     if operation_area is None or border is None or grant.flight_area is None or grant.flight_area_border is None:
@@ -204,7 +208,8 @@ def _check_exclusion(
 def _certain_path(leg: Leg, now: Situation) -> BaseGeometry:
     """Return the part of a leg that the drone certainly flies, even if it is already braking as hard as it can.
 
-    `Leg.braking_path` overestimates the path to rest. An overestimate must not permit legs past a fence.
+    `Leg.braking_path` overestimates the path until the drone stands still. An overestimate must not permit legs past a
+    fence.
     """
     braking_s = math.hypot(now.north_mps, now.east_mps) / (2 * now.airframe.accel_mps2)
     end = leg.start[0] + now.east_mps * braking_s, leg.start[1] + now.north_mps * braking_s
@@ -212,12 +217,12 @@ def _certain_path(leg: Leg, now: Situation) -> BaseGeometry:
 
 
 def _is_level_with(zone: PolicyZone, now: Situation, grant: CompiledGrant) -> bool:
-    """Return True if the drone is between the altitudes of a zone, or comes to rest there."""
+    """Return True if the drone is between the altitudes of a zone, or comes to rest between them."""
     return band_may_overlap(zone.band, *altitude_range_to_stop_m(now), now.home, grant.flat_terrain)
 
 
 def _comes_level(zone: PolicyZone, leg: Leg, now: Situation, grant: CompiledGrant, height_margin_m: float) -> bool:
-    """Return True if a leg of a drone below or above a zone comes between its altitudes, or too close to them.
+    """Return True if a leg of a drone below or above a zone comes between the zone's altitudes, or too close to them.
 
     A drone that is already too close may continue at its altitude. Because altitudes are inaccurate, a leg may come
     closer by at most ALTITUDE_TOLERANCE_M. No number of legs may lead into the nearer half of the margin.
@@ -232,10 +237,10 @@ def _comes_level(zone: PolicyZone, leg: Leg, now: Situation, grant: CompiledGran
 
 
 def _leaves_height(zone: PolicyZone, leg: Leg, now: Situation, grant: CompiledGrant, height_margin_m: float) -> bool:
-    """Return True if a drone that is too close below or above a zone sinks or climbs on the spot until it is far enough.
+    """Return True if a drone that is too close below or above a zone sinks or climbs on the spot far enough.
 
-    A leg to another place does not count. The axes move independently, so a drone next to a zone could come over or under
-    the zone before it reaches its altitude.
+    A leg to another place does not count. The autopilot controls the axes independently, so a drone beside a zone could
+    come over or under the zone before it reaches the altitude of the target.
     """
     west, south, east, north = shapely.bounds(leg.ground)
     if max(east - west, north - south) > STATIONARY_LEG_M:
@@ -245,8 +250,8 @@ def _leaves_height(zone: PolicyZone, leg: Leg, now: Situation, grant: CompiledGr
     def gap_m(lower_m: float, upper_m: float) -> float:
         return band_gap_m(zone.band, lower_m, upper_m, now.home, grant.flat_terrain)
 
-    # The farther one of the two altitudes is the end of the leg, because the leg passes all altitudes at which the
-    # drone could come to rest.
+    # The altitude that is farther from the zone is the end of the leg, because the leg passes all altitudes at which
+    # the drone could come to rest.
     end_m, rest_m = (max(map(gap_m, heights, heights)) for heights in ((leg.lower_m, leg.upper_m), present))
     closest_m = gap_m(leg.lower_m, leg.upper_m)
     return 0.0 < closest_m >= gap_m(*present) - 1e-6 and end_m >= height_margin_m and end_m > rest_m + 1e-6
@@ -282,7 +287,7 @@ def _crossing_reason(zone: PolicyZone, leg: Leg) -> str:
     inside_m = zone.shape.intersection(leg.line).length
     if inside_m >= 0.05:
         return f"the leg crosses zone {zone.name} for {inside_m:.1f} m"
-    # A moving drone sweeps more ground than the line from its point of rest to the target.
+    # A moving drone sweeps more ground than `leg.line`, which begins at the point where the drone comes to rest.
     return f"the {'leg' if zone.shape.intersects(leg.line) else 'turn onto the leg'} touches zone {zone.name}"
 
 
@@ -299,7 +304,7 @@ def _check_inclusion(
 def _leaves_by_height(fence: Inclusion, shape: BaseGeometry, leg: Leg, now: Situation, grant: CompiledGrant) -> bool:
     """Return True if a drone is inside the zones at its present altitude, but not at all altitudes of a leg.
 
-    Such a leg leaves the zones by its altitude, even if it leads into them in the horizontal plane.
+    Such a leg leaves the zones because of its altitude, even if it leads into them in the horizontal plane.
     """
     if shape.covers(leg.ground):
         return False
@@ -341,7 +346,7 @@ def _clearance_outside(shape: BaseGeometry, braking_path: BaseGeometry) -> float
 
 
 def _stays_inside(shape: BaseGeometry, border: BaseGeometry, leg: Leg, now: Situation, margin_m: float) -> bool:
-    """Return True if a leg keeps its margin inside a shape, or leads back into it."""
+    """Return True if a leg keeps its margin inside a shape, or leads back into the shape."""
     ground = leg.ground
     if shape.covers(ground) and not border.dwithin(ground, margin_m):
         return True
@@ -360,7 +365,7 @@ def _stays_inside(shape: BaseGeometry, border: BaseGeometry, leg: Leg, now: Situ
 
 
 def _leads_out(shape: BaseGeometry, leg: Leg, margin_m: float, clearance_m: float) -> bool:
-    """Return True if a leg that starts in or too close to an excluded shape leads away from it."""
+    """Return True if a leg that starts in or too close to an excluded shape leads away from the shape."""
     if clearance_m > 0 and shape.distance(leg.ground) < clearance_m - 1e-6:
         return False
     border = shape.boundary
@@ -380,14 +385,14 @@ def _leads_away(shape: BaseGeometry, leg: Leg, certain: BaseGeometry) -> bool:
 
 
 def _path_from_rest(certain: BaseGeometry, leg: Leg) -> BaseGeometry:
-    """Return the line from the earliest point of rest to the target."""
+    """Return the line from the first point at which the drone can stop, the end of `certain`, to the target."""
     return shapely.linestrings((shapely.get_coordinates(certain)[-1], leg.target))
 
 
 def _only_gains_distance(
     leg: Leg, keeps: Callable[[BaseGeometry], bool], clearance: Callable[[BaseGeometry], float]
 ) -> bool:
-    """Return True if a leg that begins too close to a fence moves away until it is far enough, and then stays so.
+    """Return True if a leg that begins too close to a fence moves away from it, and never comes too close again.
 
     Distances are measured to the original fence, because growing or shrinking a shape of ten thousand corners takes seconds.
     """

@@ -47,7 +47,7 @@ def judge_goto(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
     """Judge a Goto.
 
     A moving drone may be unable to begin a leg because its turn is too wide. The leg is then permitted after a stop if
-    both the stop and the leg from the point of rest are legal: see `Verdict.brake_first`.
+    the stop is legal, and the leg from the point where the drone comes to rest is legal: see `Verdict.brake_first`.
     """
     args = call.args
     position = grant.locate(now)
@@ -78,7 +78,7 @@ def _shortened(verdict: Verdict, args: GotoArgs) -> bool:
 
 
 def _judge_after_stop(request: _Request, target: XY) -> Verdict | None:
-    """Judge a leg that begins with a stop. None if the stop itself breaks a fence or an altitude limit."""
+    """Judge a leg that begins with a stop. Return None if the stop itself breaks a fence or an altitude limit."""
     now = request.now
     grant = request.grant
     position = request.position
@@ -92,7 +92,7 @@ def _judge_after_stop(request: _Request, target: XY) -> Verdict | None:
     transit_grant = replace(grant, operation_area=grant.flight_area, operation_area_border=grant.flight_area_border)
     if find_breaches(braking, now, transit_grant, now.margin_m, now.height_margin_m):
         return None
-    # The leg begins at the point of rest, so a zone entered while braking would count as already entered.
+    # The leg begins where the drone comes to rest, so a zone entered while braking would count as already entered.
     bounds, unknown = altitude_bounds(
         grant, now, AirVolume(braking.ground, now.margin_m, braking.lower_m, braking.upper_m)
     )
@@ -104,7 +104,7 @@ def _judge_after_stop(request: _Request, target: XY) -> Verdict | None:
 
 
 def _judge_from(request: _Request, target: XY) -> Verdict:
-    """Judge the leg from the position of a request to a target."""
+    """Judge the leg from the drone's position in a request to a target."""
     args = request.args
     now = request.now
     grant = request.grant
@@ -163,7 +163,7 @@ def _is_beyond_frame(args: GotoArgs, grant: CompiledGrant) -> bool:
 
 
 def _permitted_leg(request: _Request, aim: _Aim, notes: list[Correction], adjusting: bool) -> _Aim | Verdict:
-    """Return the permitted part of a leg, or the verdict that forbids it."""
+    """Return the permitted part of a leg, or the verdict that forbids the leg."""
     now = request.now
     grant = request.grant
     leg = goto_leg(now, request.position, aim.target, aim.altitude_m)
@@ -197,7 +197,7 @@ def _objection(request: _Request, aim: _Aim) -> Verdict | None:
 
 
 def _within_limits(request: _Request, leg: Leg, aim: _Aim, notes: list[Correction]) -> _Aim | Verdict:
-    """Return the aim corrected to the limits of altitude and speed, or the verdict that forbids it."""
+    """Return the end of a leg corrected to the limits of altitude and speed, or the verdict that forbids the leg."""
     now = request.now
     grant = request.grant
     air = AirVolume(leg.ground, now.margin_m, leg.lower_m, leg.upper_m)
@@ -251,7 +251,7 @@ def check_return(target: XY, altitude_m: float, now: Situation, grant: CompiledG
 
 
 def _last_legal_point(leg: Leg, breaches: list[Breach]) -> XY | None:
-    """Return the farthest point of a leg that no breached fence forbids, or None if the leg to it is too short."""
+    """Return the farthest point of a leg that no breached fence forbids, or None if that leg is too short."""
     length_m = math.dist(leg.stop, leg.target)
     x, y = leg.stop
     tx, ty = leg.target

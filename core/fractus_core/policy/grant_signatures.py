@@ -27,7 +27,7 @@ SIGNATURE_ANNOTATION = f"{GROUP}/signature"
 SIGNER_ANNOTATION = f"{GROUP}/signed-by"
 
 DOCUMENT_SIGNING = ObjectIdentifier("1.3.6.1.5.5.7.3.36")
-"""Extended key usage of RFC 9336. No TLS certificate has it."""
+"""Extended key usage of RFC 9336, which TLS certificates do not have."""
 
 MAX_CLOCK_SKEW = timedelta(minutes=5)
 """Largest difference between the clocks of the signer and of the issuer of its certificate."""
@@ -84,7 +84,7 @@ def sign(
 
 
 def read_authorities(pem: bytes) -> tuple[x509.Certificate, ...]:
-    """Return the authorities in a ca.crt. There are several during a rotation.
+    """Return the authorities in a ca.crt. There are several authorities during a rotation.
 
     Raises:
         ValueError: It contains no certificate.

@@ -34,7 +34,7 @@ def stopping_distance_m(speed_mps: float, accel_mps2: float, position_gain: floa
 
 
 def reaction_s(situation: Situation, accel_mps2: float) -> float:
-    """Return the seconds at unchanged speed before braking takes effect: latency plus half the time to full braking."""
+    """Return the seconds of unchanged speed before braking: latency plus half the time until full braking."""
     return situation.latency_s + accel_mps2 / (2 * situation.airframe.jerk_mps3)
 
 
@@ -77,7 +77,7 @@ def _velocity_change(present: XY, target_velocity: XY, accel: float, jerk: float
 
 
 MAX_PENDING_VELOCITIES = 4
-"""Above this number of pending velocities, the corners of their bounding box replace them."""
+"""If there are more pending velocities, the corners of their bounding box replace them."""
 
 
 def _bounding_velocities(velocities: tuple[tuple[float, float, float], ...]) -> tuple[tuple[float, float, float], ...]:
@@ -140,7 +140,7 @@ def motion_before_reaction(situation: Situation) -> MotionBeforeReaction:
 
 
 def stop_point(situation: Situation, position: XY) -> XY:
-    """Return the point of rest in frame metres if the drone is commanded to stop now."""
+    """Return the point, in frame metres, where the drone comes to rest if it is commanded to stop now."""
     speed = math.hypot(situation.north_mps, situation.east_mps)
     # A velocity below the noise of GNSS has no meaningful direction.
     if speed < 0.05:
@@ -168,7 +168,7 @@ def _turn(situation: Situation, position: XY, stop: XY, target: XY) -> tuple[XY,
         target: Point to fly to.
 
     Returns:
-        The middle corner of the triangle, and points of rest of a drone that is stopped during the turn.
+        The middle corner of the triangle, and the points where a drone that is stopped during the turn comes to rest.
     """
     speed = math.hypot(situation.north_mps, situation.east_mps)
     if speed < STATIONARY_MPS:
@@ -193,7 +193,7 @@ def _turn(situation: Situation, position: XY, stop: XY, target: XY) -> tuple[XY,
     run = reaction.run_m + slack + reaction.speed_mps * change / (2 * accel)
     run = max(run, math.hypot(stop[0] - position[0], stop[1] - position[1]))
     corner = position[0] + ahead[0] * run, position[1] + ahead[1] * run
-    # `toward` is now the velocity from the point of rest to the target.
+    # `toward` is now the velocity from the point where the drone comes to rest to the target.
     change_s = math.dist(present, toward) / accel
     stops = []
     for share in _TURNING:
@@ -233,7 +233,7 @@ class Leg:
 
     Attributes:
         start: Position of the drone.
-        stop: Point of rest if the drone brakes now, on the way to `turn`.
+        stop: Point where the drone comes to rest if it brakes now, on the way to `turn`.
         turn: Middle corner of the triangle in which the drone turns, or `stop` if it turns on the spot.
         target: End of the leg.
         lower_m: Lowest altitude above home on the leg.
@@ -283,12 +283,15 @@ class Leg:
 
     @cached_property
     def braking_path(self) -> BaseGeometry:
-        """Part of the leg that the drone flies regardless of any command."""
+        """Line from the drone to the point where it comes to rest if it brakes now.
+
+        No command can shorten this part of the leg.
+        """
         return shapely.points(self.start) if self.start == self.stop else shapely.linestrings((self.start, self.stop))
 
     @cached_property
     def line(self) -> BaseGeometry:
-        """Straight line from the point of rest to the target."""
+        """Straight line to the target from the point where the drone comes to rest if it brakes now."""
         return shapely.points(self.stop) if self.stop == self.target else shapely.linestrings((self.stop, self.target))
 
 
@@ -317,7 +320,8 @@ def velocity_leg(now: Situation, position: XY, args: VelocityArgs) -> Leg:
     """Return the leg of a drone that changes to a velocity, keeps it for the hold time, and stops.
 
     Latency may delay the beginning of the motion, its end, or neither. The ground of the leg is the convex hull of the
-    drone's positions in all three cases. The target is the point of rest in the case that ends last.
+    drone's positions in all three cases. The target is the point where the drone comes to rest in the case that ends
+    last.
     """
     airframe = now.airframe
     reaction = motion_before_reaction(now)
@@ -363,7 +367,7 @@ def _displacements(
 ) -> list[XY]:
     """Return displacements whose hull contains the motion from one velocity to another and to rest.
 
-    The last displacement is that of the point of rest.
+    The last displacement leads to the point where the drone comes to rest.
     """
     accel, gain = control
     change_s = math.dist(present, target_velocity) / accel

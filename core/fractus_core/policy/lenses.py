@@ -56,7 +56,7 @@ def _half_view(lens: CameraLens | None, half: float, aspect: float) -> tuple[flo
 def _corner(angle: float, aspect: float) -> tuple[float, float] | None:
     """Return the tangents of a corner at an angle.
 
-    They are the largest ones if rays bend outward more the farther out they are.
+    The tangents are upper bounds if rays that are farther from the axis bend outward more.
     """
     if angle >= math.pi / 2:
         return None

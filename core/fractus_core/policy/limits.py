@@ -1,6 +1,7 @@
 """Limits on altitude and speed.
 
-Enforced limits correct a value, and other limits deny it. Corrections are judged again until nothing is left to correct.
+Enforced limits correct a value, and other limits deny it. A corrected value is judged again until no further correction
+is needed.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from fractus_core.policy.compiled_grant import (
 from fractus_core.policy.decision_types import Args, Call, Situation, Verdict, deny, distinct
 
 ROUNDING_SLACK = 1e-6
-"""Tolerance that keeps a value corrected to a limit from breaking the limit by rounding."""
+"""Tolerance of limits. With it, a value that was corrected to a limit does not break the limit because of rounding."""
 MIN_LEG_ALTITUDE_M = 2.0
 """Lowest altitude above home at the end of a motion other than landing, unless an altitude limit permits less."""
 
@@ -298,12 +299,12 @@ def _source(bound: Bound) -> str:
 # Corrections of corrections
 
 MAX_ROUNDS = 8
-"""Maximum number of successive corrections. Each may climb or sink into the limits of further zones, and few zones
+"""Maximum number of successive corrections. A corrected altitude may violate the limits of further zones, but few zones
 overlap."""
 
 
 def settle_correction(call: Call, first: Verdict, judge: Callable[[Call], Verdict]) -> Verdict:
-    """Judge a correction again until nothing is left to correct.
+    """Judge a correction again until no further correction is needed.
 
     A corrected altitude may lie in the band of another zone whose limits were not considered before. So each correction
     is judged like a call that requests it.

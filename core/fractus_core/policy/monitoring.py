@@ -1,4 +1,4 @@
-"""Continuous check of a flying drone: its state, and its path to the point of rest after a stop."""
+"""Continuous check of a flying drone: its state, and the path on which the drone comes to rest after a stop."""
 
 from __future__ import annotations
 
@@ -42,8 +42,8 @@ TRACKING_SHARE = 0.3
 """Tracking margin of the monitor, as a fraction of the tracking margin of permitted legs."""
 
 AIM_SHARE = 0.1
-"""A drone counts as flying to a target if its course misses the target by at most this fraction of the distance. Gusts turn
-its velocity."""
+"""A drone counts as flying to a target if its course misses the target by at most this fraction of the distance. Gusts
+may turn the drone's course."""
 
 SINKING_MPS = 0.5
 """Vertical speed used by two rules: a drone that climbs more slowly may continue while its altitude limits are unknown, and
@@ -53,7 +53,7 @@ CLIMBING_MPS = 0.2
 """Maximum climb or sink rate of a drone that holds its altitude."""
 
 DEEPER_M = 0.6
-"""A drone on the wrong side of a fence is stopped again only if it moves this much farther in."""
+"""A drone on the wrong side of a fence is stopped again only if it moves this much farther onto that side."""
 
 
 def monitor(
@@ -66,9 +66,9 @@ def monitor(
 ) -> Verdict | None:
     """Return what the system must do about a flying drone now.
 
-    The check covers the path from the present position to the point of rest after a stop commanded now, with the
-    position error around it. This margin is smaller than that of permitted legs, so that a leg flown as permitted never
-    triggers the monitor.
+    The check covers the path from the present position to the point where the drone comes to rest if it is commanded to
+    stop now, with the position error around the path. This margin is smaller than that of permitted legs, so that a leg
+    flown as permitted never triggers the monitor.
 
     Args:
         now: State of the drone.
@@ -76,8 +76,8 @@ def monitor(
         system_flies: True if the system or the autopilot already flies the drone. Only a deterioration counts then, because
             the system's route leads back from the wrong side of a fence or from above a limit.
         fences_changed: True if other fences may have been in force when the drone's motion was judged. An accelerating drone
-            is faster when it receives a stop, and the room for that has not been judged, so it is stopped early. A leg
-            whose remaining part is no longer legal is stopped too.
+            is faster when it receives a stop, and its longer stopping path has not been judged, so it is stopped early.
+            A leg whose remaining part is no longer legal is stopped too.
         current_leg: Leg under way if it was permitted under this grant. The autopilot then brakes for its end without a
             command.
 
@@ -96,7 +96,8 @@ def monitor(
     start = grant.frame.xy(lat, lon)
     margin = now.position_error_m + TRACKING_SHARE * now.airframe.tracking_m
     outlooks = [(start, now), *pending_outcomes(now, start)] if fences_changed else []
-    # An accelerating drone flies on a leg that was judged with room for it, and brakes at its end in time.
+    # Ignore acceleration, because the judgement of the current leg considered it, and the drone brakes in time for the
+    # end of the leg.
     now = replace(now, forward_mps2=min(now.forward_mps2 or 0.0, 0.0))
     stop = stop_point(now, start)
     ahead = (
@@ -111,7 +112,8 @@ def monitor(
     if worst is not None:
         return replace(worst, brake_first=worst.action == "takeover" and now.is_moving)
     for outcome_position, outcome in outlooks:
-        # The drone may still come to rest before the fence. Stop it now. It is taken over only if it passes the fence.
+        # The drone may still come to rest before the fence. Stop it now. The system takes it over only if it passes the
+        # fence.
         further = _stopping_path(
             outcome,
             outcome_position,
@@ -132,7 +134,8 @@ def monitor(
         if worst is not None:
             return replace(worst, brake_first=worst.action == "takeover" and now.is_moving)
     rest_m = _altitude_after_stop_m(now, level_m)
-    # No rule has checked a climb that the autopilot started, and its end is unknown. So its tolerance is smaller.
+    # No rule has checked a climb that the autopilot started, and the final altitude is unknown. So the tolerance is
+    # smaller.
     unjudged_climb = system_flies and current_leg is None and now.down_mps < -CLIMBING_MPS
     correction = _check_altitude(
         now, grant, start, stop, rest_m, sinks_back=system_flies, share=0.5 if unjudged_climb else 1.0
@@ -150,11 +153,11 @@ def _worst(findings: list[tuple[int, Verdict]]) -> Verdict | None:
 
 
 def _rest_position(now: Situation, start: XY, stop: XY, target: XY) -> XY:
-    """Return the point of rest of a drone that flies to a target.
+    """Return the point where a drone that flies to a target comes to rest.
 
     The result is the target while the drone can brake for it as planned. A drone commanded to stop flies on for its
-    reaction time, but it already brakes for the target. So its point of rest may lie beyond the target only by the
-    distance of that reaction and by its tracking error.
+    reaction time, but it already brakes for the target. So it overshoots the target at most by the distance covered in
+    the reaction time plus its tracking error.
     """
     (dx, dy), (tx, ty) = ((x - start[0], y - start[1]) for x, y in (stop, target))
     run = math.hypot(dx, dy)
@@ -190,7 +193,7 @@ def _rest_altitude_m(now: Situation, current_leg: GotoArgs | None, grant: Compil
 
 
 def _altitude_after_stop_m(now: Situation, rest_m: float) -> float:
-    """Return the altitude of rest, and consider that the drone may already have received a command to stop its climb.
+    """Return the altitude at which the drone comes to rest, considering a pending command that already stops its climb.
 
     `rest_m` assumes that the command is sent now. If a pending command already ends the climb or descent, the drone
     comes to rest earlier by the distance that it covers during the latency. Only altitude limits use this result.
@@ -250,7 +253,7 @@ def _rest_of_leg(now: Situation, grant: CompiledGrant, start: XY, leg: GotoArgs,
 
 @dataclass(frozen=True, slots=True)
 class _StoppingPath:
-    """Path to the point of rest after a stop, with its ends and their altitudes above home."""
+    """Path on which a drone comes to rest after a stop, with its ends and their altitudes above home."""
 
     air: AirVolume
     present: BaseGeometry
@@ -297,7 +300,7 @@ class _Finding:
 def _fence_reactions(
     now: Situation, grant: CompiledGrant, ahead: _StoppingPath, *, system_flies: bool
 ) -> list[tuple[int, Verdict]]:
-    """Return the reactions of fences, each with the priority of its policy."""
+    """Return the verdicts that fences require, each with the priority of its policy."""
     findings: list[tuple[int, _Finding | None]] = [
         (zone.rule.spec.priority, _check_exclusion(zone, ahead, now, grant.flat_terrain))
         for zone in grant.exclusions.near(ahead.air, now, grant.flat_terrain)
@@ -345,7 +348,7 @@ def _check_exclusion(zone: PolicyZone, ahead: _StoppingPath, now: Situation, fla
 
 
 def _leaves_altitudes(fence: Inclusion, ahead: _StoppingPath, now: Situation, flat: bool) -> bool:
-    """Return True if a drone moves farther away from the altitudes of all zones it must stay in."""
+    """Return True if a drone that must stay in one of several zones moves farther away from the altitudes of all."""
     around = [zone.band for zone in fence.zones if zone.shape.intersects(ahead.present)]
     rest_m, depth_now_m = (
         max((band_depth_m(band, m, now.home, flat) for band in around), default=math.inf)
@@ -395,8 +398,8 @@ def _check_altitude(
         now: State of the drone.
         grant: Permissions and restrictions that apply.
         start: Present position.
-        stop: Point of rest.
-        rest_m: Altitude of rest.
+        stop: Point where the drone comes to rest.
+        rest_m: Altitude at which the drone comes to rest.
         sinks_back: True if a sinking drone is exempt from upper limits. Lower limits do not apply during takeoff and
             landing.
         share: Fraction of the tolerance by which a drone may come to rest above an upper limit.
@@ -437,7 +440,7 @@ class _LimitViolation:
 
 
 def _altitude_correction(violation: _LimitViolation, now: Situation, grant: CompiledGrant, stop: XY) -> Verdict:
-    """Return the correction to an altitude, or a stop if zones block the way to it."""
+    """Return the correction to an altitude, or a stop if zones block the way to this altitude."""
     names = (violation.bound.name,) if violation.bound.name else ()
     column = vertical_leg(stop, min(now.altitude_m, violation.height_m), max(now.altitude_m, violation.height_m))
     if find_breaches(column, now, grant, 0.0, 0.0):

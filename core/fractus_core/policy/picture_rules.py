@@ -19,7 +19,7 @@ _FILTER_ORDER: tuple[FilterAction, ...] = exhaustive(
 """Filters from mildest to strictest, which is also the order of their application."""
 _FALLBACK_ORDER: tuple[Fallback, ...] = exhaustive(Fallback, ("blurAverage", "black", "refuse"))
 _WHOLE_PICTURE_FILTERS: frozenset[FilterAction] = frozenset({"blurMedian", "blurAverage", "black"})
-"""Filters of the whole picture. After them, no face is recognisable."""
+"""Filters of the whole picture. No face is recognisable in the filtered picture."""
 
 
 def judge_privacy(now: Situation, grant: CompiledGrant) -> Verdict:
@@ -90,7 +90,7 @@ def _satisfied(required: Filter, applied_filters: Sequence[Filter]) -> bool:
 
 
 def rules_in_view(index: PolicyIndex, now: Situation, grant: CompiledGrant) -> list[Rule]:
-    """Return the policies of an index that hold at the camera's position, or whose zones a picture may show.
+    """Return the policies of an index that apply at the camera's position, or whose zones a picture may show.
 
     While the position is unknown, the result contains every policy in force.
     """

@@ -18,7 +18,7 @@ MIN_RETURN_ALTITUDE_M = 10.0
 """Lowest altitude above home of a return flight below a zone, because the terrain is not known."""
 
 ZONE_FLOOR_CLEARANCE_M = 0.5
-"""Distance below a zone's floor beyond the margin, because a drone does not hold its altitude exactly."""
+"""Distance kept below a zone's floor in addition to the margin, because a drone does not hold its altitude exactly."""
 
 MAX_LOWERED_ALTITUDES = 4
 """Maximum number of altitudes just below a zone at which a return route is searched.
@@ -30,9 +30,9 @@ The drone waits during a search, and a search without a result takes a second or
 def return_altitudes_m(now: Situation, grant: CompiledGrant, worthwhile_m: float) -> tuple[float, ...]:
     """Return the altitudes above home at which the system flies a drone home, best first.
 
-    The preferred altitude is the return altitude, or the present altitude if that is higher. It is limited to the altitude
-    limits of the straight route, then to those at the present position, then to those that hold everywhere. Altitudes
-    just below the surrounding zones follow.
+    The preferred altitude is the return altitude, or the present altitude if that is higher. The first result is this
+    altitude limited to the altitude limits along the straight route. The next results are limited to the limits at the
+    present position, and to the limits that apply everywhere. Altitudes just below the surrounding zones follow.
 
     Args:
         now: Position, home and airframe. Position and home are known.
@@ -56,9 +56,9 @@ def return_altitudes_m(now: Situation, grant: CompiledGrant, worthwhile_m: float
 
 
 def _altitudes_below_zones_m(lane: BaseGeometry, now: Situation, grant: CompiledGrant) -> list[float]:
-    """Return altitudes above home just below the zones around a lane, highest first.
+    """Return altitudes above home just below the zones around the straight line to home (`lane`), highest first.
 
-    The zones are at most the lane's length away.
+    Only zones are considered whose distance from the line is at most the length of the line.
     """
     room_m = now.height_margin_m + ZONE_FLOOR_CLEARANCE_M
     flat = grant.flat_terrain
@@ -110,7 +110,7 @@ def may_change_altitude(now: Situation, grant: CompiledGrant, altitude_m: float)
     present = vertical_leg(position, now.altitude_m, now.altitude_m)
 
     def broken(leg: Leg, room_m: float) -> set[str]:
-        # Both legs have the same ground, so a breach of one zone has the same reason in both.
+        # The two legs have the same ground, so a breach of one zone has the same reason for each leg.
         return {breach.reason for breach in find_breaches(leg, now, grant, now.margin_m, room_m)}
 
     on_the_way = broken(column, now.height_margin_m)
@@ -118,7 +118,7 @@ def may_change_altitude(now: Situation, grant: CompiledGrant, altitude_m: float)
 
 
 def descent_enters_fence(now: Situation, grant: CompiledGrant) -> bool:
-    """Return True if a drone whose point of rest breaks no fence would break one during its descent from there."""
+    """Return True if a drone that stops without breaking a fence would break a fence in the descent after the stop."""
     position = grant.locate(now)
     if position is None:
         return False

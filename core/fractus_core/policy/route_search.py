@@ -17,19 +17,22 @@ from fractus_core.policy.free_space import Floats, FreeSpace
 from fractus_core.policy.kinematics import XY
 
 CLEARANCES_M = (1.5, 0.25)
-"""Clearances of legs beyond the engine's margin: the preferred one, and the smallest. A drone that reached a waypoint
-within a metre then finds its next leg legal."""
+"""Distances from fences that legs keep in addition to the engine's margin: the preferred and the smallest distance. A
+drone that reached a waypoint within a metre then finds its next leg legal."""
 
 MAX_LEGS_TESTED = 3000
 """A search gives up after this number of legs, about half a second of work."""
 
 MAX_EXCESS = 1.2
-"""Maximum ratio of the length of a route to that of the shortest route. It makes the search quicker, and usually the route
-is only a percent or two longer."""
+"""Maximum ratio of the length of a route to that of the shortest route. A higher ratio makes the search quicker.
+Usually the route is only a percent or two longer than the shortest route."""
 
 QUICK_MAX_LEGS_TESTED = 250
 QUICK_MAX_EXCESS = 5.0
-"""The same limits for a search that only decides if a route exists while a caller waits: about 25 ms."""
+"""Values of `MAX_LEGS_TESTED` and `MAX_EXCESS` for a search that only decides if a route exists.
+
+Such a search takes about 25 ms, while its caller waits.
+"""
 
 _MAX_CLEARANCE_DETOUR = 1.2
 _MAX_ROUNDING_M = 1.5
@@ -81,7 +84,10 @@ def find_route(
 def route_steps(
     start: XY, target: XY, now: Situation, grant: CompiledGrant, altitude_m: float, *, from_m: float | None = None
 ) -> RouteSteps:
-    """Search as `find_route` in steps of a fraction of a millisecond. The generator returns the route."""
+    """Run the search of `find_route` as a generator that returns the route.
+
+    Each step takes a fraction of a millisecond.
+    """
     numbers = (*start, *target, altitude_m, altitude_m if from_m is None else from_m)
     if now.home is None or not now.is_plausible or not all(math.isfinite(number) for number in numbers):
         return None
@@ -112,7 +118,7 @@ def quick_route(
     from_m: float | None = None,
     max_excess: float = MAX_EXCESS,
 ) -> tuple[XY, ...] | None:
-    """Search as `find_route`, but give up after `QUICK_MAX_LEGS_TESTED` legs and use the smallest clearance."""
+    """Run the search of `find_route` with the smallest clearance, and give up after `QUICK_MAX_LEGS_TESTED` legs."""
     if now.home is None or not now.is_plausible:
         return None
     heights_m = (altitude_m, altitude_m if from_m is None else from_m)
@@ -123,7 +129,7 @@ def quick_route(
 def _spaces(
     now: Situation, grant: CompiledGrant, heights_m: tuple[float, float], room_m: float
 ) -> tuple[FreeSpace, FreeSpace]:
-    """Return the free space of a route at the first altitude, and that of its first leg.
+    """Return the free space of a route at the first altitude, and the free space of its first leg.
 
     The first leg starts at the second altitude.
     """
@@ -146,7 +152,7 @@ def _length_m(start: XY, route: tuple[XY, ...]) -> float:
 
 
 def _intersection(before: XY, first: XY, second: XY, after: XY) -> XY | None:
-    """Return the intersection of two legs when both are extended. None if it is far away or behind."""
+    """Return the point where two extended legs meet. Return None if the point is far away or behind the first leg."""
     ux = first[0] - before[0]
     uy = first[1] - before[1]
     vx = second[0] - after[0]
@@ -176,7 +182,7 @@ class _Search:
         self._max_excess = max_excess
         self._max_legs = max_legs
         self._ends = (start, target)
-        # The ends count as corners without neighbours, so that every line is tangent to them.
+        # The ends count as corners without neighbours, so that every line counts as a tangent at an end.
         self._nodes: Floats = np.asarray([start * 3, target * 3])
         self._cost = np.asarray([0.0, math.inf])
         self._parent = [-1, -1]
@@ -223,7 +229,7 @@ class _Search:
         return len(self._clear) >= self._max_legs
 
     def rounded(self, route: tuple[XY, ...]) -> RouteSteps:
-        """Merge neighbouring waypoints if their legs meet a little farther on, because each waypoint costs a stop."""
+        """Merge neighbouring waypoints if their extended legs meet nearby, because the drone stops at each waypoint."""
         points = [self._ends[0], *route]
         i = 1
         while i + 2 < len(points):
@@ -259,7 +265,7 @@ class _Search:
         self._push([node], 1)
 
     def _push(self, begins: list[int], first: int) -> None:
-        """Queue the tangents from some nodes to all nodes from a number on."""
+        """Queue the tangents from the nodes `begins` to all nodes whose index is at least `first`."""
         froms = self._nodes[begins]
         tos = self._nodes[first:]
         along = tos[None, :, :2] - froms[:, None, :2]
@@ -280,7 +286,7 @@ class _Search:
         return self._clear[key]
 
     def _test(self, begin: int, end: int) -> bool:
-        """Return True if a leg is legal. Obstacles that block it are added."""
+        """Return True if a leg is legal. Otherwise add the obstacles that block the leg."""
         a, b = (self._ends[n] if n <= _TARGET else self._position(n) for n in (begin, end))
         space = self._leaving if begin == _START else self._space
         blockers = space.blockers(shapely.linestrings((a, b)))
@@ -326,7 +332,10 @@ class _Search:
 
 
 def _tangent(along: Floats, corners: Floats) -> NDArray[np.bool_]:
-    """Return True for lines through corners that leave both neighbours of the corner on one side. Shapes broadcast."""
+    """Return True for each line through a corner that has both neighbours of the corner on one side.
+
+    Arrays are broadcast.
+    """
     before = corners[..., 2:4] - corners[..., :2]
     after = corners[..., 4:] - corners[..., :2]
     left = along[..., 0] * before[..., 1] - along[..., 1] * before[..., 0]

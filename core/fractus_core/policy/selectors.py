@@ -25,7 +25,7 @@ def policy_selects(
 def policy_applies(
     policy: PolicySpec, owner: ApplicationReference, component: str, attributes: Mapping[str, object]
 ) -> bool:
-    """Return True if a policy applies, as `policy_selects`, given the references that a grant contains."""
+    """Return the result of `policy_selects`, computed from the references that a grant contains."""
     selected = policy.selector.applications
     unknown = policy.kind != "grant"
     if selected is not None:

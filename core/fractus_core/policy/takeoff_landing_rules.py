@@ -56,7 +56,7 @@ def judge_arm(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
 
 
 def judge_land(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
-    """Judge a descent to the ground from the point of rest."""
+    """Judge a descent to the ground from the point where the drone comes to rest."""
     position = grant.locate(now)
     if position is None:
         return DENY_POSITION_UNKNOWN

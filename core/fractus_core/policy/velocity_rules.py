@@ -74,11 +74,11 @@ class _Setpoint:
 
     @property
     def leg(self) -> Leg:
-        """Leg of the present arguments."""
+        """Leg that results from the present arguments."""
         return self.sweep(self.args)
 
     def sweep(self, args: VelocityArgs) -> Leg:
-        """Return the leg of a velocity."""
+        """Return the leg that results from a velocity."""
         if args not in self._legs:
             self._legs[args] = velocity_leg(self.now, self.position, args)
         return self._legs[args]

@@ -58,5 +58,5 @@ def children(
 
 
 def deployment_plan(application: Application, plan: DeploymentPlanSpec) -> Body:
-    """Return the DeploymentPlan of an Application. It has the name of the Application."""
+    """Return the DeploymentPlan of an Application. The DeploymentPlan has the name of the Application."""
     return owned_object(kinds.DEPLOYMENT_PLAN, application, application.name, {}, spec=plan.to_dict())

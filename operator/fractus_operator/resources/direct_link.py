@@ -131,5 +131,8 @@ def retargeted(services: Iterable[Body], pods: Sequence[PodView]) -> list[Body]:
 
 
 def _target(instance: str, pods: Iterable[PodView]) -> str | None:
-    """Return the lowest address of the instance's pods that take calls, so that the result is stable, or None."""
+    """Return an address of the instance's pods that take calls, or None.
+
+    The lowest address is used, so that the result is stable.
+    """
     return min((pod.ip for pod in pods if pod.instance == instance and pod.takes_calls and pod.ip), default=None)

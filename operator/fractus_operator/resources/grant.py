@@ -19,7 +19,10 @@ _LABELS = (
 
 
 def grant(application: Application, spec: GrantSpec) -> Body:
-    """Return the Grant of an instance. It is cluster-scoped, so labels instead of an owner reference name its owner."""
+    """Return the Grant of an instance.
+
+    A Grant is cluster-scoped, so labels name its Application, not an owner reference.
+    """
     namespace, _ = application.key
     body = kinds.GRANT.header(grant_name(namespace, spec.instance))
     body["metadata"]["labels"] = {
@@ -33,7 +36,10 @@ def grant(application: Application, spec: GrantSpec) -> Body:
 
 
 def regranted(observed: Body, spec: GrantSpec) -> Body:
-    """Return an existing Grant with another spec, in the form that `grant` builds from an Application."""
+    """Return the manifest of an existing Grant with a new spec.
+
+    The metadata has the same fields as a manifest from `grant`.
+    """
     body = kinds.GRANT.header(observed["metadata"]["name"])
     present = observed["metadata"].get("labels") or {}
     body["metadata"]["labels"] = {label: present[label] for label in _LABELS if label in present}

@@ -27,7 +27,7 @@ _PUBLIC = ("tls.crt", "ca.crt")
 _FIRST_CHECK = timedelta(minutes=1)
 """If a pod is not ready for this time, its Secret is created again, in case it was deleted.
 
-The time doubles each time.
+The time doubles after each creation.
 """
 _MAX_CHECK = timedelta(hours=1)
 
@@ -59,7 +59,7 @@ class SecretState:
     write_failed: bool = False
 
     def may_be_lost(self, pods: Sequence[PodView], now: datetime) -> bool:
-        """Return True if it is time to check the Secret, because pods that are not ready may wait for it."""
+        """Return True if it is time to check the Secret, because pods that are not ready may wait for the Secret."""
         ready = all(pod.ready for pod in pods)
         if pods and ready:
             self.check_at = now + _FIRST_CHECK
@@ -91,7 +91,7 @@ class Certificate:
 
 
 class Certificates:
-    """Issues certificates of instances when they are due.
+    """Issues the certificates of instances that are missing or due for renewal.
 
     Args:
         authority: Signs the certificates.

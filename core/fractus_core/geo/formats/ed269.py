@@ -39,10 +39,10 @@ _OF_FEATURE = frozenset({"identifier", "applicability", "geometry", *_DESCRIBED}
 _WITHOUT_EFFECT = frozenset(
     {"country", "type", "region", "reason", "regulationExemption", "uSpaceClass", "zoneAuthority"}
 )
-"""Fields of a feature that state neither area nor altitude nor time. They are noted."""
+"""Fields of a feature that state neither area nor altitude nor time. An import lists them in its notes."""
 _TRANSLATIONS = frozenset({"localizedMessages"})
 _LISTS = ("features", "UASZoneList")
-"""Names of the list of features. Authorities publish both."""
+"""Names of the list of features. Files of authorities use either name."""
 _OF_FILE = frozenset({"title", "description", "formatVersion", "createdAt", *_LISTS})
 _OF_VOLUME = frozenset(
     {
@@ -209,11 +209,11 @@ def read_band(
 
 
 def read_schedule(value: Any, field: str) -> list[dict[str, Any]]:
-    """Return the active times of the zone. Empty means always.
+    """Return the active times of the zone. If the result is empty, the zone is always active.
 
     Args:
         value: List of the periods in which the zone applies.
-        field: Its path in the file.
+        field: Path of the list in the file.
 
     Raises:
         InvalidObject: A period cannot be represented exactly.
@@ -239,7 +239,7 @@ def read_schedule(value: Any, field: str) -> list[dict[str, Any]]:
 
 
 def _daily(day: dict[str, Any], field: str) -> dict[str, Any]:
-    """Return days and times of day in UTC. Empty means always."""
+    """Return days and times of day in UTC. An empty result means that the zone is always active."""
     reject_unknown_fields(day, _OF_DAY, field)
     value = day.get("day") or []
     named = value if isinstance(value, list) else [value]

@@ -29,7 +29,7 @@ _OF_PROPERTIES = frozenset({"identifier", "limitedApplicability", "extendedPrope
 _WITHOUT_EFFECT = frozenset(
     {"country", "variant", "region", "reason", "regulationExemption", "zoneAuthority", "dataSource"}
 )
-"""Properties that state neither area nor altitude nor time. They are noted."""
+"""Properties that state neither area nor altitude nor time. An import lists them in its notes."""
 _OF_GEOMETRY = frozenset({"type", "coordinates", "layer", "bbox"})
 _OF_EXTENT = frozenset({"subType", "radius"})
 
@@ -66,7 +66,7 @@ def read_ed318(text: str, without: Collection[str] = (), drop: Collection[str] =
 
 
 def is_ed318(features: Collection[dict[str, Any]]) -> bool:
-    """Return True if a feature has the identifier, and the texts or the variant, of ED-318."""
+    """Return True if a feature has an identifier as in ED-318, and also texts or a variant as in ED-318."""
     stated = [feature.get("properties") for feature in features]
     return any(
         "identifier" in properties and ("variant" in properties or isinstance(properties.get("name"), list))

@@ -34,7 +34,10 @@ _OF_COLLECTION = _OF_FEATURE | {
     "features", "name", "title", "description", "generator", "copyright", "license", "attribution", "links", "timestamp", "timeStamp",
     "totalFeatures", "numberMatched", "numberReturned", "xy_coordinate_resolution", "exceededTransferLimit",
 }  # fmt: skip
-"""Members of a FeatureCollection that do not affect zones: those of GeoJSON, and those that map servers add."""
+"""Members of a FeatureCollection that do not affect zones.
+
+Some are defined by GeoJSON, and map servers add the others.
+"""
 _OF_GEOMETRY = frozenset({"type", "coordinates", "geometries", "bbox", "crs"})
 _AREAS = ("Polygon", "MultiPolygon", "GeometryCollection")
 _STYLE = frozenset({"fill", "fill-opacity", "stroke", "stroke-width", "stroke-opacity", "marker-color"})
@@ -49,7 +52,7 @@ _WGS84 = frozenset(
         "urn:ogc:def:crs:EPSG::4326",
     }
 )
-"""Names of WGS 84 in GeoJSON files of 2008, which may name a reference system. All of them mean lon before lat."""
+"""Names of WGS 84 in files of GeoJSON 2008, which may name a reference system. With all names, lon comes before lat."""
 
 
 def read_geojson(text: str, without: Collection[str] = (), drop: Collection[str] = ()) -> Imported:
@@ -190,7 +193,9 @@ def _read_geometry(
 
 
 def _check_lines(geometry: dict[str, Any], field: str) -> None:
-    """Reject lines that enclose an area, and lines beside polygons, which belong to a zone but have no area.
+    """Reject lines that enclose an area, and lines beside polygons.
+
+    A line beside a polygon belongs to a zone but has no area.
 
     Raises:
         InvalidObject: A line may be part of a zone, or its coordinates are invalid.
@@ -211,7 +216,7 @@ def _check_lines(geometry: dict[str, Any], field: str) -> None:
 
 
 def _simple_geometries(geometry: dict[str, Any], field: str) -> Iterator[tuple[dict[str, Any], str]]:
-    """Yield the geometries of a collection, each with its path, or the geometry itself."""
+    """Yield the geometries of a collection, or the geometry itself if it is not a collection, each with its path."""
     if geometry.get("type") != "GeometryCollection":
         yield geometry, field
         return
@@ -241,7 +246,7 @@ def _flat(coordinates: Any) -> Any:
 def write_geojson(zones: Iterable[Zone]) -> Exported:
     """Return a FeatureCollection with a polygon for each zone, cut at the antimeridian.
 
-    `read_geojson` reads it back.
+    `read_geojson` can read the result.
 
     Raises:
         InvalidObject: A zone contains a pole.

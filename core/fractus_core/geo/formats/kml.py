@@ -105,7 +105,7 @@ def _reject_overlay(title: str) -> None:
 def _check_elements(
     builder: ZoneBuilder, title: str, element: ElementTree.Element, known: Collection[str], field: str = ""
 ) -> None:
-    """Note unknown elements and data, and reject those that may state the size, altitude or time of a zone."""
+    """Note unknown elements and data. Reject elements and data that may state the size, altitude or time of a zone."""
     unknown: dict[str, list[Any]] = {}
     for child in element:
         if _tag(child) not in {*known, *_DATA}:
@@ -153,7 +153,10 @@ def _read_placemark(builder: ZoneBuilder, name: FeatureName, placemark: ElementT
 
 
 def _shape(element: ElementTree.Element) -> list[list[Any]]:
-    """Return the coordinates below an element without heights, for stable names. Invalid ones stay texts."""
+    """Return the coordinates below an element without heights, for stable names.
+
+    Invalid coordinates are returned as text.
+    """
     texts = [e.text or "" for e in element.iter() if _tag(e) == "coordinates"]
     try:
         return [_positions(text, "") for text in texts]
@@ -177,7 +180,7 @@ def _spec(builder: ZoneBuilder, title: str, polygon: ElementTree.Element, field:
 
 
 def _other_geometries(element: ElementTree.Element) -> list[ElementTree.Element]:
-    """Return the geometries below an element that are not polygons. Rings of polygons are no geometries of their own."""
+    """Return the geometries below an element that are not polygons. Rings of polygons are omitted."""
     found = []
     for child in element:
         if _tag(child) in _OTHERS:
@@ -188,7 +191,7 @@ def _other_geometries(element: ElementTree.Element) -> list[ElementTree.Element]
 
 
 def _line(element: ElementTree.Element) -> list[tuple[float, float]]:
-    """Return the points of a line or ring as lon, lat. A ring without the repetition of its first point is closed."""
+    """Return the points of a line or ring as lon, lat. The first point of a ring is repeated at the end."""
     tag = _tag(element)
     field = f"{tag}.coordinates"
     points = [parse_point(pair, field) for pair in _positions(_text(element, "coordinates"), field)]
@@ -198,7 +201,7 @@ def _line(element: ElementTree.Element) -> list[tuple[float, float]]:
 
 
 def _data(element: ElementTree.Element) -> dict[str, Any]:
-    """Return the custom data of an element by name. A displayed name is a part of the value."""
+    """Return the custom data of an element by name. If the data has a display name, the value contains it."""
     data = (e for child in element if _tag(child) in _DATA for e in child.iter() if _tag(e) not in _AROUND_DATA)
     values: dict[str, Any] = {}
     for e in data:
@@ -211,7 +214,10 @@ def _data(element: ElementTree.Element) -> dict[str, Any]:
 def _rings(
     builder: ZoneBuilder, title: str, shape: ElementTree.Element, boundary: str, field: str
 ) -> list[list[dict[str, float]]]:
-    """Return all rings of a polygon's boundaries of one kind. Some programs write several rings into one boundary."""
+    """Return all rings of a polygon's outer or inner boundaries.
+
+    Some programs write several rings into one boundary.
+    """
     texts = [e.text or "" for b in shape if _tag(b) == boundary for e in b.iter() if _tag(e) == "coordinates"]
     path = f"{field}.{boundary}.coordinates"
     return [builder.ring(title, _positions(text, path), path) for text in texts]
@@ -241,7 +247,7 @@ def write_kml(zones: Iterable[Zone]) -> Exported:
 
 
 def kml_document(marks: Iterable[str]) -> str:
-    """Return the KML document of placemarks."""
+    """Return a KML document that contains the placemarks."""
     return (
         '<?xml version="1.0" encoding="UTF-8"?>\n<kml xmlns="http://www.opengis.net/kml/2.2">\n<Document>\n'
         f"{''.join(marks)}</Document>\n</kml>\n"

@@ -32,7 +32,7 @@ _OF_FENCE = frozenset({"version", "polygons", "circles", "breachReturn"})
 def read_qgc_plan(text: str, without: Collection[str] = ()) -> Imported:
     """Read zones from the polygons and circles of the fence.
 
-    The description of a zone states if it is for inclusion.
+    The description of a zone states if its shape is for inclusion.
 
     Args:
         text: Content of the file.

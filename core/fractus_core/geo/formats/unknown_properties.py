@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from typing import Any
 
 EMPTY: tuple[Any, ...] = (None, "", [], {})
-"""Values that state nothing."""
+"""Values without content, which cannot state a limit."""
 
 _WORD = re.compile(r"[^\W\d_]+")
 _CAPITALS = re.compile(r"(?<=[a-z])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])")
@@ -32,7 +32,10 @@ _LIMIT_WORD = re.compile(
     )""",
     re.VERBOSE,
 )
-"""Whole words of names. Short words are listed here because longer words contain them by accident."""
+"""Whole words in the name of a property that may state a limit.
+
+Short words are matched whole because longer words contain them by accident.
+"""
 
 _LIMIT_STEM = re.compile(
     r"""
@@ -47,7 +50,10 @@ _LIMIT_STEM = re.compile(
     """,
     re.VERBOSE,
 )
-"""Parts of names. Many programs write names without a separator (`maxalt`, `bufferzone`, `validfrom`)."""
+"""Parts of words in the name of a property that may state a limit.
+
+Many programs write names without a separator (`maxalt`, `bufferzone`, `validfrom`).
+"""
 
 _HARMLESS_NAMES = frozenset(
     {
@@ -62,7 +68,10 @@ _HARMLESS_NAMES = frozenset(
         "labelcolor", "labelscale", "labelopacity", "filloutline", "strokeoutline",
     }
 )  # fmt: skip
-"""Names of identifiers, addresses and colours, in lower case without separators. Their values are not judged."""
+"""Names of properties with identifiers, addresses and colours, in lower case without separators.
+
+The values of these properties are not judged.
+"""
 
 _LIMIT_TEXT = re.compile(
     r"""
@@ -83,7 +92,8 @@ _LIMIT_TEXT = re.compile(
     """,
     re.VERBOSE | re.IGNORECASE,
 )
-"""Numbers that are not a part of a word, lengths, flight levels, vertical datums, dates and times in texts."""
+"""Parts of texts that may state a limit: numbers outside words, lengths, flight levels, vertical datums, dates and
+times."""
 
 
 def may_state_limit(name: str, value: Any) -> bool:

@@ -26,7 +26,7 @@ DESCRIPTION_LENGTH = 1024
 """Longest description of a zone, in characters."""
 
 IMPORTED_NAME = f"{GROUP}/imported-name"
-"""Annotation of an imported Zone: the name that it has in the file."""
+"""Annotation of an imported Zone: the name of the zone in the file."""
 
 MAX_RADIUS_M = 200_000.0
 """Largest radius of a circle."""
@@ -41,10 +41,10 @@ MAX_POINTS = 300_000
 millions of intermediate points."""
 
 _CLOSED = 0.05
-"""Largest distance of the ends of a line around an area, as a share of its length."""
+"""A line encloses an area if the distance between its ends is at most this share of its length."""
 
 CORNERS = 64
-"""Corners of the polygon that replaces a circle in formats without circles."""
+"""Number of corners of the polygon that replaces a circle in formats without circles."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,8 +106,8 @@ class _Part:
     def names(self) -> Iterator[str]:
         """Yield names of the zone, the preferred one first.
 
-        They depend on the feature alone: in an updated file, a zone keeps its name when others are added, removed or
-        reordered, and another zone never gets its name.
+        They depend on the feature alone: in an updated file, a zone keeps its name when other zones are added, removed
+        or reordered, and another zone never gets its name.
         """
         feature = self.feature
         stem = _slug(feature.identifier or feature.given or "zone")
@@ -301,7 +301,7 @@ class ZoneBuilder:
 
 
 def _stable_names(parts: Sequence[_Part]) -> list[str]:
-    """Return the name of each part: its first name that no other part has, or its last one."""
+    """Return the name of each part: its first name that no other part has, or its last name."""
     names = [""] * len(parts)
     pending = {i: list(part.names()) for i, part in enumerate(parts)}
     while pending:
@@ -456,7 +456,7 @@ def parse_ring(value: Any, field: str, *, lat_first: bool = False, planar: bool 
 
 
 def _simplified(ring: Sequence[Any], field: str) -> list[tuple[float, float]]:
-    """Return the points of a ring of lon, lat without those that lie within `MAX_BEND_M` of the ring of the others.
+    """Return a ring of lon, lat with fewer points. Omitted points lie within `MAX_BEND_M` of the resulting ring.
 
     Algorithm: Douglas-Peucker (GEOS), O(n log n), in metres around the middle of the ring.
 
@@ -472,7 +472,7 @@ def _simplified(ring: Sequence[Any], field: str) -> list[tuple[float, float]]:
 
 
 def _pieces(start: Point, end: Point) -> int:
-    """Return the number of parts of a straight line of degrees that bend by at most `MAX_BEND_M` each."""
+    """Return the number of parts of a straight line of degrees such that each part bends by at most `MAX_BEND_M`."""
     lat = math.radians(min(max(abs(start.lat), abs(end.lat)), 89.0))
     lon_deg = abs(end.lon - start.lon)
     width_m = math.radians(min(lon_deg, 360.0 - lon_deg)) * math.cos(lat) * EARTH_RADIUS_M

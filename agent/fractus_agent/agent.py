@@ -187,7 +187,7 @@ class Agent:
         self._on_change()
 
     def _on_change(self) -> None:
-        """Notify the parts that depend on a change of another part."""
+        """Notify the parts of the agent after one of them has changed."""
         if self._has_mobility():
             self._mobility.set()
         if self._has_direct_interface():

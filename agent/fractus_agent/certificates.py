@@ -18,7 +18,10 @@ from fractus_runtime.files import check_regular
 CERTIFICATE_FILES = ("tls.crt", "tls.key", "ca.crt")
 
 _IGNORE_DATES = 0x200000
-"""X509_V_FLAG_NO_CHECK_TIME of OpenSSL, because the caller checks the dates with its own clock."""
+"""X509_V_FLAG_NO_CHECK_TIME of OpenSSL: OpenSSL ignores the validity dates.
+
+The caller checks the dates with its own clock.
+"""
 
 
 class InvalidCertificate(Exception):
@@ -41,7 +44,7 @@ class ValidityPeriod:
         return self.not_before + (self.not_after - self.not_before) * (2 / 3 + jitter)
 
     def has_begun(self, now: datetime) -> bool:
-        """Return True if the period has begun. One minute of clock difference is tolerated."""
+        """Return True if the validity period has begun. One minute of clock difference is tolerated."""
         return now >= self.not_before - timedelta(minutes=1)
 
 

@@ -36,7 +36,7 @@ _OUTCOMES: dict[OutcomeKind, GrantPhase] = {
     OutcomeKind.FAILED: "Failed",
 }
 REVIEW_INTERVAL_S = 60.0
-"""Seconds after which reports are compared again."""
+"""Seconds after which the reports are compared with the last written reports, even if no Grant has changed."""
 DISK_INTERVAL_S = 5.0
 """Seconds after which failed disk operations are repeated."""
 UNVERIFIED_TIMEOUT_S = 120.0
@@ -108,7 +108,7 @@ def serialize_grant(grant: Grant) -> bytes:
 
 
 def mission_outcome(grant: Grant, missions: Mapping[str, Outcome]) -> tuple[GrantPhase, str] | None:
-    """Return the final phase of a Grant and the reason, None while its mission is running."""
+    """Return the final phase of a Grant and the reason for this phase. Return None while the mission is running."""
     outcome = missions.get(grant.spec.mission_key)
     return (_OUTCOMES[outcome.kind], outcome.reason) if outcome is not None else None
 
@@ -129,7 +129,10 @@ def grant_report(grant: Grant, missions: Mapping[str, Outcome], problem: str | N
 
 
 def keep_final_phase(report: ReportedGrant, reported: ReportedGrant | None) -> ReportedGrant:
-    """Return the report. If the previous report has a final phase, return that one, because a final phase never changes."""
+    """Return the report, or the previous report if the phase in the previous report is final.
+
+    A final phase never changes.
+    """
     if reported is None or reported.phase not in ENDED:
         return report
     return reported.model_copy(update={"observed_generation": report.observed_generation})
@@ -208,9 +211,9 @@ class GrantSynchronizer:
         self._grants: dict[str, Grant] = {}
         self._unusable: dict[str, ReportedGrant] = {}
         self._digests: dict[str, tuple[bytes, bytes | None]] = {}
-        """Digests of each Grant as received, and of its file as written."""
+        """Two digests by Grant: digest of the received Grant, and digest of the written file (None if unreadable)."""
         self._written: dict[str, GrantSpec] = {}
-        """Spec of each Grant as last stored, in case its file cannot be read."""
+        """Last stored spec by Grant. It is used if the file of the Grant cannot be read."""
         self._unstored: dict[str, str] = {}
         self._unremoved: set[str] = set()
         self._generation = 0
@@ -342,7 +345,10 @@ class GrantSynchronizer:
             return None
 
     def _defer(self, body: Object, reason: str) -> None:
-        """Keep the stored Grant for a while, because a new authority may be about to arrive."""
+        """Keep the stored Grant, because this node may not have received the new authority yet.
+
+        `expire_unverified` removes the stored Grant after `UNVERIFIED_TIMEOUT_S`.
+        """
         name = body["metadata"]["name"]
         if name not in self._unverified:
             log.warning("grants: unknown authority, not stored yet (grant=%s error=%s)", name, reason)
@@ -375,7 +381,7 @@ class GrantSynchronizer:
             except OSError:
                 if not self._remove_outdated(grant):
                     raise
-                stored = self._directory.write(grant)  # The removal may have freed enough space.
+                stored = self._directory.write(grant)  # The removal may have freed the required space.
             if stored:
                 log.info("grants: stored (grant=%s identity=%s)", grant.name, grant.spec.identity)
             self._written[grant.name] = grant.spec.unsigned
@@ -397,7 +403,7 @@ class GrantSynchronizer:
         except FileNotFoundError:
             return False
         except OSError as error:
-            # Possibly out of file descriptors. The services still use the stored version.
+            # This process may have no free file descriptor. The services still use the stored version.
             log.warning("grants: stored Grant not readable (grant=%s error=%s)", grant.name, error)
             stored = self._written.get(grant.name)
         except (ValueError, InvalidObject) as error:

@@ -123,7 +123,8 @@ class NodeIdentity:
                 self._backoff.succeeded()
             except SigningRefused as refusal:
                 self._set_refused(refusal)
-                # The operator of a new installation publishes its authority soon. Other refusals last longer.
+                # NoAuthority ends soon: the operator of a new installation has not published its authority yet.
+                # Refusals for other reasons last longer.
                 pause_s = self._backoff.delay_s()
                 delay_s = min(5.0, pause_s) if refusal.reason == "NoAuthority" else max(30.0, pause_s)
             except (KubeError, RetryLater, OSError) as error:

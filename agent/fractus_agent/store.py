@@ -176,7 +176,10 @@ class Store:
         self._last_event_s: dict[str, float] = {}
 
     def watch_ages_s(self) -> dict[str, float]:
-        """Return the seconds since the last event or list of each watched kind, by its plural."""
+        """Return the seconds since the last watch event or list response for each watched kind.
+
+        The keys are the plural names of the kinds.
+        """
         now_s = time.monotonic()
         return {plural: now_s - event_s for plural, event_s in self._last_event_s.items()}
 
@@ -193,7 +196,7 @@ class Store:
         """Create a Drone or EdgeNode.
 
         Raises:
-            Conflict: It exists already.
+            Conflict: The object exists already.
             Invalid: The API server refused the object.
         """
         return await self._client.create(_KINDS[body["kind"]], body, strict=False)
@@ -202,7 +205,7 @@ class Store:
         """Replace a Drone or EdgeNode with the same resourceVersion.
 
         Raises:
-            Conflict: It has changed since it was read.
+            Conflict: The object was changed since it was read.
             Invalid: The API server refused the object.
         """
         return await self._client.replace(_KINDS[body["kind"]], body)
@@ -263,10 +266,10 @@ class Store:
                 await self._client.delete(_SIGNING_REQUEST, ("", name))
 
     async def grants(self) -> AsyncGenerator[GrantList, None]:
-        """Yield the node's Grants, first after a list and then after each change.
+        """Yield the node's Grants once after a list, and again after each change.
 
-        Only a valid NodeGrants object is authoritative. If it does not exist yet, was deleted, is withheld or damaged,
-        the drone keeps its Grants.
+        Only a valid NodeGrants object is authoritative. If the object does not exist yet, was deleted, is withheld or
+        damaged, nothing is yielded, and the drone keeps its Grants.
         """
         target = _WatchTarget(
             self._own_client, _NODE_GRANTS, {"fieldSelector": f"metadata.name={self._node}"}, NODE_GRANTS_NAMESPACE

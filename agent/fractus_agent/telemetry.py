@@ -131,7 +131,7 @@ class TelemetryFeed:
         tls: Directory of the node's certificate, which is the identity of the client.
         node: Name of the node, from which the server name is derived.
         serial: Returns the number of certificate changes. The feed reconnects when it changes.
-        on_change: Called after each message and each loss.
+        on_change: Called after each message and each loss of the connection.
 
     Attributes:
         latest: Latest telemetry, None before the first message.

@@ -1,4 +1,4 @@
-"""Files of an audit log: hash chain, segments and verification. Needs no key and no writer."""
+"""Files of an audit log: hash chain, segments and verification. Reads files only, and needs no key."""
 
 from __future__ import annotations
 
@@ -109,8 +109,8 @@ def first_sequence(path: Path) -> int:
 def logs(paths: Iterable[Path]) -> dict[Path, list[Path]]:
     """Return the logs of files and directories, each with its files in order.
 
-    The current file of a log selects the whole log, and a segment selects itself. A directory selects all logs of which it
-    contains a file or a checkpoint. The current file is listed even if it is missing.
+    The current file of a log selects the whole log. A segment selects only itself. A directory selects all logs of
+    which it contains a file or a checkpoint. The current file is listed even if it is missing.
     """
     files_by_log: dict[Path, set[Path]] = {}
     for path in paths:

@@ -1,4 +1,7 @@
-"""Checkpoints of an audit log: its last entry, signed by the node. Copies elsewhere prove later that no entry was removed."""
+"""Checkpoints of an audit log: its last entry, signed by the node.
+
+A copy on another computer later proves that no entry was removed.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +32,7 @@ class InvalidCheckpoint(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Checkpoint:
-    """An entry that an audit log contained, after all entries before it.
+    """An entry that an audit log contained at some time. The log then also contained all entries before this entry.
 
     Attributes:
         log: Name of the log, without directory and extension.
@@ -71,7 +74,7 @@ def sign_checkpoint(log: str, entry: ChainEntry, time: str, tls: Path) -> bytes:
 
 
 def parse_status_checkpoint(text: str) -> Checkpoint | None:
-    """Return a checkpoint in the form of a node's status, LOG:NUMBER:HASH, or None if the text has another form."""
+    """Parse a checkpoint of a node's status, LOG:NUMBER:HASH. Return None if the text does not have this format."""
     match = _STATUS_FORM.fullmatch(text)
     return Checkpoint(match["log"], "", ChainEntry(int(match["number"]), match["hash"]), False) if match else None
 

@@ -189,7 +189,8 @@ def _keep(path: Path, former: Path) -> None:
         path.replace(former)
         return
     spare.replace(former)
-    spare.unlink(missing_ok=True)  # the rename had no effect if both were names of the same file
+    # If `former` was already a name of the same file, the rename had no effect and `spare` still exists.
+    spare.unlink(missing_ok=True)
 
 
 def remove_file(path: Path) -> bool:

@@ -26,7 +26,10 @@ CERTIFICATE_EXPIRY = "fractus_certificate_expiry_timestamp_seconds"
 """Metric name shared by all workloads that have a certificate."""
 
 MAX_CONNECTIONS = 4
-"""Connections served at the same time. Further ones wait in the kernel's queue. Any host that reaches the node can connect."""
+"""Limit of connections that are served at the same time. Further connections wait in the kernel's queue.
+
+The limit is needed because any host that reaches the node can connect.
+"""
 REQUEST_TIMEOUT_S = 5.0
 MAX_REQUEST_BYTES = 8192
 RETRY_S = 1.0

@@ -27,7 +27,7 @@ _OK = 0
 _CANCELLED = 1
 _UNKNOWN = 2
 _SERVER_FAULTS = frozenset({2, 4, 12, 13, 14, 15})
-"""gRPC status codes that are errors of a server. The others are results for the caller."""
+"""gRPC status codes that are errors of a server. All other codes are results for the caller."""
 
 _tracer: trace.Tracer = trace.NoOpTracer()
 
@@ -157,7 +157,7 @@ def child_span(name: str) -> Iterator[Span]:
 
 
 def set_verdict(span: Span, action: str, code: str, policies: Sequence[str]) -> None:
-    """Add a verdict without its reason, which may contain positions."""
+    """Add a verdict to a span. Omit the reason of the verdict, because it may contain positions."""
     span.set_attribute("fractus.verdict.action", action)
     if code:
         span.set_attribute("fractus.verdict.code", code)

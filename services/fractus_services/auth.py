@@ -23,7 +23,7 @@ log = logging.getLogger(__name__)
 
 FILES = ("tls.key", "tls.crt", "ca.crt")
 MAX_SEEN = 256
-"""Maximum number of remembered certificates. The least recently used one is forgotten."""
+"""Maximum number of remembered certificates. The least recently used certificate is forgotten."""
 MAX_SKEW_S = 60.0
 """Maximum time by which the validity of a client certificate may start in the future, in seconds."""
 

@@ -218,7 +218,7 @@ class GrantFiles:
             self._problems.pop(path, None)
             return None
         except OSError as error:
-            # A disk error removes no Grant for good.
+            # After a disk error, the Grant returns when the file can be read again.
             if self._problems.get(path) != str(error):
                 log.critical("grants: cannot read file, it grants nothing (file=%s error=%s)", path_text(path), error)
                 self._refused(path_text(path.name), str(error))

@@ -73,7 +73,7 @@ class GrantVerifier:
         self._restore()
 
     def reload_authorities(self) -> bool:
-        """Read ca.crt if it changed. Return True if it did."""
+        """Read ca.crt if the file has changed. Return True if the file has changed."""
         try:
             stat = self._path.stat()
             stamp = (stat.st_mtime_ns, stat.st_size, stat.st_ino)

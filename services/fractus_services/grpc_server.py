@@ -56,7 +56,7 @@ _MAX_COUNTED = 1_000
 
 
 class RateLimiter:
-    """A token bucket for each caller, so that a flood affects its sender only."""
+    """A token bucket for each caller, so that a flood of calls affects only the caller that sends it."""
 
     def __init__(self, rate: float = CALLS_PER_S, burst: float = CALL_BURST) -> None:
         self._rate = rate

@@ -39,7 +39,8 @@ class Acceptor:
         directory: Directory of this node's certificate, key and authority. Read for each session, because they are
             renewed.
         refusal: Returns the reason why a node may not link to this node now, empty if it may.
-        on_session: Runs while a session lasts. It moves traffic to the link, and back at the end.
+        on_session: Runs while a session lasts. It moves traffic to the link at the start of the session, and back to
+            the cloud path at its end.
         max_peers: Limit of concurrent sessions.
     """
 

@@ -75,7 +75,7 @@ class Beacons(asyncio.DatagramProtocol):
             self._on_beacon(node)
 
     def error_received(self, exc: Exception) -> None:
-        """Handle a beacon that was not sent. The device may be down, or another device may have its name now."""
+        """Handle a failure to send a beacon. The device may be down, or its name may now belong to another device."""
         log.debug("links: beacon not sent (error=%s)", exc)
         self._broken.set()
 

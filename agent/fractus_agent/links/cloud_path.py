@@ -19,12 +19,16 @@ PROBE_TIMEOUT_S = 2.0
 SILENT_S = 4.0
 """Time without a response after which the path counts as unreachable, in seconds."""
 STEADY_S = 5.0
-"""Time with responses after which an unreachable path counts as reachable again, in seconds.
+"""Time for which an unreachable path must respond before it counts as reachable again, in seconds.
 
-If the path fails again within this time, it stays unreachable. A path that fails often therefore causes few switches.
+If the path fails again within this time, the path stays unreachable. A path that fails often therefore causes few
+switches.
 """
 LATENCY_SAMPLES = 10
-"""Number of samples whose minimum is the latency. Larger samples include a handshake, or queueing behind pictures."""
+"""Number of recent samples whose minimum is the latency.
+
+Samples above the minimum include a TLS handshake, or the time of waiting in a queue behind pictures.
+"""
 
 _LATENCY_MS = {"Ethernet": 1.0, "WiFi": 5.0, "5G": 15.0, "4G": 60.0, "BLE": 60.0}
 """Expected one-way latency to the cloud by technology, until it is measured."""
@@ -41,7 +45,7 @@ class ReachabilityMonitor:
         self._recovered_s: float | None = None
 
     def on_request(self, now_s: float) -> None:
-        """Record a request. Without requests the path does not become unreachable."""
+        """Record a request. The path becomes unreachable only if a request has no response for `SILENT_S`."""
         if self._pending_since_s is None:
             self._pending_since_s = now_s
 

@@ -48,7 +48,7 @@ class ConnectionDrain:
                 continue
             task: asyncio.Task[object] = asyncio.create_task(self._redirector.switch(selected, planned=True))
             self._on_link[task] = on_link
-            await asyncio.sleep(0)  # lets the switch write the map or fail
+            await asyncio.sleep(0)  # run the task until it has written the map or failed
             if task.done():
                 del self._on_link[task]
                 task.result()

@@ -35,7 +35,8 @@ class Connector:
     Args:
         node: Name of this node.
         directory: Directory of this node's certificate, key and authority.
-        on_session: Runs while a session lasts. It moves traffic to the link, and back at the end.
+        on_session: Runs while a session lasts. It moves traffic to the link at the start of the session, and back to
+            the cloud path at its end.
         on_change: Called after each change of `link`, with the reason.
         address_of: Returns the address of a peer on the link.
 
@@ -117,7 +118,7 @@ class Connector:
             flush.cancel()
 
     async def _hold(self, session: Session) -> str:
-        """Keep a session until it ends, and return the reason of its end."""
+        """Keep a session until it ends, and return the reason why it ended."""
         traffic = asyncio.create_task(self._on_session(session))
         heartbeats = asyncio.create_task(session.run())
         try:

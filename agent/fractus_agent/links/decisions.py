@@ -26,7 +26,7 @@ from fractus_core.linking.range_model import expected_range
 from fractus_agent.redirector.nft_maps import Endpoint
 
 BEACON_TIMEOUT_S = 2.0
-"""A peer that should be in range counts as absent after this time without a beacon, in seconds."""
+"""Seconds without a beacon after which a peer counts as absent although it should be in range."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -87,7 +87,8 @@ class DeviceAddresses:
                 # marked, and `clear` does not take it down.
                 mark = {"ifalias": alias} if len(alias.encode()) < _MAX_ALIAS_BYTES else {}
                 await route.link("set", index=index, state="up", **mark)
-            # Other addresses go first, because deleting a primary address deletes the secondary ones with it.
+            # Delete other addresses before this address is added. Otherwise this address could become the secondary
+            # address of another one, and the kernel deletes secondary addresses together with their primary address.
             for other in await _addresses(route, index):
                 if other in LINK_LOCAL and other != address:
                     await _delete_address(route, index, other)

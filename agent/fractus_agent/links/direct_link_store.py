@@ -63,7 +63,7 @@ class DirectLinkStore:
             self.apply(event)
 
     def restore(self) -> None:
-        """Read the files, and remove temporary ones."""
+        """Read the files of the DirectLinks, and remove temporary files."""
         self._directory.mkdir(parents=True, exist_ok=True, mode=0o700)
         remove_temporary_files(self._directory)
         for path in list_files(self._directory, ".json"):
@@ -76,7 +76,7 @@ class DirectLinkStore:
             self._on_change()
 
     def apply(self, event: WatchEvent) -> None:
-        """Apply one watch event."""
+        """Apply one watch event of DirectLinks: store, change or remove their files."""
         match event:
             case Listed(bodies):
                 names = {body["metadata"]["name"] for body in bodies}
@@ -136,12 +136,15 @@ def _contains(path: Path, content: bytes) -> bool:
 
 
 def virtual_endpoint(service: LinkedService) -> Endpoint | None:
-    """Return the endpoint that clients of a service call, None if it is not IPv4 and so cannot be translated."""
+    """Return the endpoint that clients of a service call.
+
+    Return None if the address of the endpoint is not IPv4, because the agent translates IPv4 addresses only.
+    """
     return _endpoint(service.virtual.address, service.virtual.port, service.virtual.protocol)
 
 
 def pod_endpoint(service: LinkedService) -> Endpoint | None:
-    """Return the endpoint of the pod that provides a service, None without a ready pod."""
+    """Return the endpoint of the pod that provides a service. Return None if no pod is ready."""
     if service.target is None:
         return None
     return _endpoint(service.target.address, service.target.port, service.virtual.protocol)

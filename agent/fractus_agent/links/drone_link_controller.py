@@ -50,11 +50,14 @@ DECISION_INTERVAL_S = 0.5
 PROBE_INTERVAL_S = 3.0
 """Seconds between two bandwidth measurements of a link that is up."""
 PROBE_SAMPLES = 3
-"""Number of measurements of which the best counts. A probe that competes with traffic measures only the unused bandwidth."""
+"""Number of recent measurements, of which the highest is used as the bandwidth.
+
+A probe that competes with traffic measures only the unused bandwidth.
+"""
 MIN_LEAVE_S = 2.0
 """Shortest time before the predicted end of a link's range at which traffic moves back to the cloud path, in seconds."""
 SHUTDOWN_DRAIN_S = 2.0
-"""Seconds for which connections may finish if the agent ends or no link is planned."""
+"""Seconds for which connections may finish on the link after the agent is stopped, or after no link is planned."""
 DEFAULT_LATENCY_MS = 5.0
 """Expected latency of a link before its first measurement, in milliseconds."""
 
@@ -234,7 +237,10 @@ class DroneLinkController:
         return traffic
 
     def _heuristic(self, application: str, link: DirectLink) -> PathHeuristic | None:
-        """Return the heuristic of an application, or None if it is unknown. Its traffic then takes the cloud path."""
+        """Return the heuristic of an application.
+
+        Return None if the heuristic is unknown: the cloud path is then used.
+        """
         selected = link.spec.heuristic
         try:
             return self._heuristics.find(selected.kind, selected.metric)

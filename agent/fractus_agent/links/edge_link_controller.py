@@ -173,7 +173,7 @@ class EdgeLinkController:
         return {service: f"{pod.address}:{pod.port}" for service, pod in by_service if pod is not None}
 
     def _port(self, service: Endpoint) -> int:
-        """Return the port of a service on the link address. It stays the same while the agent runs."""
+        """Return the port of a service on the link address. The port stays the same while the agent runs."""
         if service not in self._ports:
             taken = set(self._ports.values())
             self._ports[service] = next(port for port in range(FIRST_PORT, LAST_PORT + 1) if port not in taken)

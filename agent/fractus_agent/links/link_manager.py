@@ -117,7 +117,7 @@ class LinkManager:
 
     def _on_links_changed(self) -> None:
         links = self._direct_links.links
-        if self._drone_controller is not None and links:  # without links the controller ends
+        if self._drone_controller is not None and links:  # without links, this manager ends the controller
             self._drone_controller.set_links(links)
         if self._edge_controller is not None:
             self._edge_controller.set_links(links)
@@ -126,9 +126,9 @@ class LinkManager:
         self._on_change()
 
     def _report_interface(self) -> None:
-        """Report the conditions of an edge node, or of a drone whose interface is not usable.
+        """Set the conditions of the DirectLinks that no link controller sets.
 
-        No link controller sets them.
+        These are all conditions of an edge node, and the conditions of a drone whose interface is not usable.
         """
         links = self._direct_links.links
         if self._end == "node":
@@ -173,7 +173,7 @@ class LinkManager:
         return direct_interface(node.spec.interfaces) if node is not None else None
 
     async def _use(self, interface: Interface) -> None:
-        """Use an interface, with an audit log.
+        """Use an interface until cancelled, and write an audit log of the link decisions.
 
         Raises:
             OSError: The directory of audit logs cannot be created.
@@ -198,13 +198,14 @@ class LinkManager:
         def make_table(callers: Callers) -> None:
             ruleset.create(device, ports, clients=is_drone, callers=callers)
 
-        # The new table replaces the table of an earlier agent. It already contains the guarded endpoints.
+        # The new table replaces the table of an earlier agent. The new table contains the guarded endpoints from its
+        # creation on.
         guarded_endpoints = allowed_callers if is_drone else isolated_pods
         guards = guarded_endpoints(self._direct_links.links)
         make_table(guards)
         netlink = Netlink(NETLINK_NETFILTER)
         conntrack = Conntrack(netlink)
-        # The targets of connections that an earlier agent redirected are unknown.
+        # Delete connections that an earlier agent redirected, because their targets are unknown.
         conntrack.delete_all()
         maps = NftMaps(netlink, make_table, guards)
         namespaces = PodNamespaces(self._pods if is_drone else None)
@@ -243,7 +244,7 @@ class LinkManager:
                 with suppress(RedirectFailed):
                     ruleset.remove()
             finally:
-                # The entries are deleted after the table, because the table would mark new connections.
+                # Delete the connection tracking entries after the table, because the table would mark new connections.
                 with suppress(NetlinkError):
                     conntrack.delete_all()
                 netlink.close()
@@ -340,7 +341,10 @@ async def _clean_up(interface: Interface | None, node: str) -> bool:
 
 
 async def _raise_when_done(task: asyncio.Task[None]) -> None:
-    """Raise the error of a task when it fails. Unlike an await of the task, cancellation does not end the task."""
+    """Wait until a task has ended, and raise its error if it failed.
+
+    If this wait is cancelled, the task continues. `await task` would cancel the task.
+    """
     await asyncio.wait({task})
     task.result()
 

@@ -1,4 +1,4 @@
-"""Status of DirectLinks: the part of each end, and the write intervals."""
+"""Status of DirectLinks: the fields that each end of the link writes, and the intervals between writes."""
 
 from __future__ import annotations
 

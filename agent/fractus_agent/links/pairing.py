@@ -28,7 +28,8 @@ HEARTBEAT_S = 0.1
 LOSS_TIMEOUT_S = 0.6
 """The link counts as lost after this time without a message, in seconds.
 
-Traffic must be back on the cloud path within a second. The rest of that second covers a peer whose process was not scheduled.
+Traffic must be back on the cloud path within a second. The remaining 0.4 s are for a peer whose process was not
+scheduled.
 """
 
 MAX_LINE_BYTES = 64 * 1024
@@ -42,7 +43,10 @@ ACKNOWLEDGEMENT_TIMEOUT_S = 2.0
 BURST_LIMIT_S = 0.15
 SMOOTHING = 0.2
 MAX_ECHO_AGE_S = 60.0
-"""Maximum age of an echoed heartbeat. An older or future one was not sent in this session."""
+"""Maximum age of an echoed heartbeat, in seconds.
+
+An echo of an older heartbeat, or of a time in the future, was not sent in this session.
+"""
 MAX_REASON_CHARS = 200
 """Maximum length of the peer's reason for a refusal, which is logged and audited."""
 

@@ -16,9 +16,15 @@ WINDOW_S = 0.1
 WINDOWS = 30
 """Number of windows that are kept."""
 CONFIRMING_SHARE = 0.8
-"""Share of the measured bandwidth from which traffic confirms the measurement, so that no probe disturbs the traffic."""
+"""Share of the measured bandwidth. Traffic with at least this share of the bandwidth confirms the measurement.
+
+No probe is then sent, which would disturb the traffic.
+"""
 MAX_CONFIRMATIONS = 3
-"""Limit of successive confirmations. Traffic that does not fill the link would otherwise hide a higher bandwidth."""
+"""Limit of successive confirmations by traffic. The next measurement is then a probe.
+
+Without this limit, traffic that does not fill the link would hide a higher bandwidth.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +48,10 @@ class TrafficRates:
         self._windows: deque[tuple[float, dict[Endpoint, tuple[int, int]]]] = deque(maxlen=WINDOWS)
 
     def update(self, now_s: float, counts: Mapping[Endpoint, tuple[int, int]]) -> None:
-        """Add the current counters. A counter restarts when its service changes its path."""
+        """Add the current values of the byte counters.
+
+        The counter of a service restarts when the service changes its path.
+        """
         if self._last is not None and now_s > self._last[0]:
             moved = {service: _bytes_since(self._last[1].get(service), now) for service, now in counts.items()}
             self._windows.append((now_s - self._last[0], moved))
@@ -50,7 +59,10 @@ class TrafficRates:
 
     @property
     def peak_mbps(self) -> float:
-        """Highest rate of all services together in one window, in both directions because radios share the channel."""
+        """Highest total rate of all services in one window, in Mbit/s.
+
+        The rates of both directions are added, because the radios of the link share one channel.
+        """
         return max(
             (8e-6 * sum(s + r for s, r in moved.values()) / span_s for span_s, moved in self._windows), default=0.0
         )

@@ -18,7 +18,10 @@ JOIN_TIMEOUT_S = 8.0
 JOIN_POLL_S = 0.2
 REPLY_BYTES = 16 * 1024
 CHANNEL_MHZ = 2412
-"""Frequency on which a new ad hoc network is created. Nodes that join later find it."""
+"""Frequency on which a new ad hoc network is created, in MHz.
+
+Nodes that join later use the frequency of the network.
+"""
 
 _JOINED = "COMPLETED"
 
@@ -50,7 +53,7 @@ class WpaSupplicant:
         command = " ".join(words)
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK) as client:
             try:
-                client.bind("")  # any free abstract name
+                client.bind("")  # the kernel selects a free abstract name
                 client.connect(str(self._path))
                 async with asyncio.timeout(REPLY_TIMEOUT_S):
                     await loop.sock_sendall(client, command.encode())

@@ -90,9 +90,11 @@ class TcpConnection:
 
     @property
     def is_quiet(self) -> bool:
-        """True if all data has arrived and been read, and the server was the last one to send, QUIET_MS ago or more.
+        """True if the connection is between two calls.
 
-        The age of the last ACK counts too, because a large request on a slow link is acknowledged piece by piece.
+        This requires that all data has arrived and was read, that the server was the last to send, and that neither
+        data nor an ACK was received for QUIET_MS. The ACK is included, because a large request on a slow link is
+        acknowledged piece by piece.
         """
         delivered = self.queued == 0 and self.unacknowledged == 0 and self.unread == 0
         idle_ms = min(self.received_ms, self.acknowledged_ms)

@@ -61,7 +61,7 @@ _EXPRESSION_DATA = 2
 _COUNTER_BYTES = 1
 
 _MARK = struct.Struct("=HHHHI")
-"""Connection mark as the data of an element."""
+"""Encoding of a connection mark as the data of a map element."""
 _MARK_DATA = _ELEMENT_DATA | NLA_F_NESTED
 
 ENDPOINTS = 4096
@@ -175,7 +175,9 @@ class NftMaps:
             self._callers = dict(callers)
 
     def recreate_table(self) -> None:
-        """Create the table again, for another device. It contains the callers. The next write adds all other elements.
+        """Create the table again, for another device.
+
+        The new table contains the callers. The next write adds all other elements.
 
         Raises:
             RedirectFailed: nft refused the table.
@@ -241,7 +243,7 @@ def _address_and_port(endpoint: Endpoint) -> bytes:
 
 
 def _mark_element(service: Endpoint, number: int) -> bytes:
-    """Encode an element of the map of marks. Only its end depends on the number, so the beginning is cached."""
+    """Encode an element of the map of marks. Only its end depends on the service number, so the rest is cached."""
     return _mark_element_prefix(service) + _mark(number)
 
 

@@ -247,7 +247,10 @@ class Redirector:
             self._numbers = dict(numbers)
 
     def _old_paths_of(self, numbers: Mapping[Endpoint, int]) -> list[_OldPath]:
-        """Return the paths of services with these numbers, with their current connections."""
+        """Return the path of each service with its current connections.
+
+        `numbers` contains the number of each service.
+        """
         connections: dict[Endpoint, set[bytes]] = {service: set() for service in numbers}
         # Connections on an earlier path stay on that path, which may still work.
         older = frozenset[bytes]().union(*(path.connections for path in self._old_paths))

@@ -75,7 +75,7 @@ class NodeObjectFile:
             return False
 
     def _truncate(self) -> None:
-        """Empty the file in place, because a file can be truncated on a full disk."""
+        """Empty the file in place, because this works even if the disk is full."""
         try:
             descriptor = open_regular(self._path, os.O_WRONLY | os.O_CREAT, 0o600)
         except UnsuitableFile:

@@ -192,7 +192,10 @@ def _flight_status(snapshot: TelemetrySnapshot) -> dict[str, Any]:
 
 
 def report_intervals(kind: str, status: Object) -> ReportIntervals:
-    """Return the intervals of a status. They are shortest in flight, so that a silent drone is noticed soon."""
+    """Return the minimum intervals between writes of a status.
+
+    The intervals are shortest for a drone in flight, so that the operator soon notices if its reports stop.
+    """
     if kind != "Drone":
         return EDGE_INTERVALS
     airborne = is_airborne(status["flightState"], status.get("lastFlightState"))
@@ -200,7 +203,7 @@ def report_intervals(kind: str, status: Object) -> ReportIntervals:
 
 
 def due_s(old: Object | None, new: Object, since_s: float, intervals: ReportIntervals) -> float:
-    """Return the seconds until the new status is due, or 0 if it is due now.
+    """Return the seconds until the new status must be written, or 0 if it must be written now.
 
     Args:
         old: Status as last written, None for none.
@@ -284,7 +287,7 @@ class StatusReporter:
         return self._monotonic() - self._last_s
 
     def notify(self) -> None:
-        """Check soon if the status has changed."""
+        """Wake the task that writes the status, so that it checks if the status has changed."""
         self._changed.set()
 
     async def run(self) -> None:
@@ -292,7 +295,7 @@ class StatusReporter:
         await repeat("status", self.step, self._changed)
 
     async def step(self) -> float:
-        """Write the status if it is due. Return the seconds until it is due without further changes."""
+        """Write the status if it is due. Return the seconds until the next check, if nothing changes before."""
         body = self._body()
         if body is None:
             return 5.0

@@ -28,7 +28,7 @@ HASH_ANNOTATION = f"{GROUP}/description-hash"
 DESCRIPTION_CHECK_INTERVAL_S = 10.0
 """Seconds between checks of the description on the node."""
 RESYNC_INTERVAL_S = 300.0
-"""Seconds between reads of the object. Each status write returns the object as well."""
+"""Seconds between reads of the object from the API server. Each status write also returns the object."""
 _KINDS: dict[str, type[Drone] | type[EdgeNode]] = {"Drone": Drone, "EdgeNode": EdgeNode}
 _KIND_OF_CLASS = {"drone": "Drone", "edge": "EdgeNode"}
 

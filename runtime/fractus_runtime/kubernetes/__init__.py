@@ -1,4 +1,7 @@
-"""Kubernetes client on top of the official one: reads, writes, informers and leader election. Objects are plain dicts."""
+"""Kubernetes client on top of the official client: reads, writes, informers and leader election.
+
+Objects are plain dicts.
+"""
 
 from fractus_runtime.kubernetes.access import (
     Access,

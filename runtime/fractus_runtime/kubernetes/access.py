@@ -146,7 +146,8 @@ def with_tokens(configuration: Configuration, token: Callable[[], Awaitable[str]
         except KubeError:
             if not token_configuration.api_key["BearerToken"]:
                 raise
-            # The current token is valid for twice `life_s`. If it is not, the API server rejects it.
+            # Continue with the current token, which should be valid for twice `life_s`. If the API server rejects
+            # the token, a new one is requested.
             renew_at_s = time.monotonic() + life_s / 10
 
     token_configuration.refresh_api_key_hook = renew_if_due

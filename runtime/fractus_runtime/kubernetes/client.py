@@ -44,7 +44,8 @@ async def _lines(content: aiohttp.StreamReader, silence_s: float | None) -> Asyn
     """Iterate over the lines of a stream, with their line ends. The last line may be cut off and have no line end."""
     rest = b""
     while True:
-        # The timeout of aiohttp ends with the connection, even if the reader is not notified.
+        # When the connection ends, the timeout of aiohttp ends too. If aiohttp does not notify this reader of the end,
+        # the reader would wait forever without this timeout.
         async with asyncio.timeout(silence_s):
             chunk = await content.readany()
         if not chunk:

@@ -206,7 +206,10 @@ class Connection:
 
 
 def _socket(address: aiohttp.AddrInfoType) -> socket.socket:
-    """Create a socket with keep-alive. Without it, a watch does not detect a dead connection, because it sends nothing."""
+    """Create a socket with keep-alive.
+
+    A watch sends nothing, so without keep-alive it would not detect a dead connection.
+    """
     new_socket = socket.socket(*address[:3])
     new_socket.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
     for option, value in _KEEPALIVE.items():

@@ -1,4 +1,4 @@
-"""Errors of requests to the API server, by how a caller handles them."""
+"""Errors of requests to the API server: one class for each way in which a caller handles an error."""
 
 from __future__ import annotations
 

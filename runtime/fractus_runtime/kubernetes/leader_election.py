@@ -90,7 +90,7 @@ class Lease:
         try:
             while True:
                 requested_s = self._time()
-                # After a failed renewal there is time for another one.
+                # The pause is so short that there is time for another attempt after a failed renewal.
                 pause_s = min(_RETRY_S, self._duration_s / _RETRIES)
                 try:
                     async with asyncio.timeout(_RESPONSE_SHARE * self._duration_s):

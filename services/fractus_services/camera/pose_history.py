@@ -21,7 +21,7 @@ HISTORY_S = 30.0
 ALTITUDE_ERROR_M = 1.0
 TILT_ERROR_DEG = 5.0
 YAW_ERROR_DEG = 15.0
-"""Bounds of the autopilot's errors: altitude, roll and pitch together, and yaw."""
+"""Bounds of the autopilot's errors: altitude error, angle of the combined roll and pitch error, and yaw error."""
 MAX_TURN_DEG_S = 60.0
 MAX_ACCELERATION_MPS2 = 5.0
 """Maximum turn rate and acceleration of a multicopter between two measurements."""
@@ -73,7 +73,7 @@ class _Gap:
 
     @classmethod
     def between(cls, measurement: Measurement, neighbour: Measurement, *, gimbal: bool) -> _Gap:
-        """Return the half of the gap between two measurements that is nearer to the first one."""
+        """Return the half of the gap between two measurements that is nearer to the first measurement."""
         moved_s = abs(neighbour.position_at - measurement.position_at)
         turned_s = abs(neighbour.attitude_at - measurement.attitude_at)
         attitude = measurement.situation.attitude or _LEVEL
@@ -94,7 +94,7 @@ class _Gap:
         )
 
     def merge(self, other: _Gap) -> _Gap:
-        """Return the maximum of each bound."""
+        """Return a gap with the larger value of each bound of the two gaps."""
         return _Gap(
             max(self.moved_s, other.moved_s),
             max(self.turned_s, other.turned_s),
@@ -132,7 +132,7 @@ class PoseHistory:
         return self._now() - self._measurements[-1].position_at if self._measurements else math.inf
 
     def add(self, measurement: Measurement) -> None:
-        """Append the latest measurement, and drop those that are older than `HISTORY_S`."""
+        """Append the latest measurement, and drop measurements that are older than `HISTORY_S`."""
         self._measurements.append(measurement)
         while self._measurements[0].received_at < measurement.received_at - HISTORY_S:
             self._measurements.popleft()

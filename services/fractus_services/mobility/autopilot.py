@@ -25,7 +25,7 @@ Permit = Callable[[], None]
 """Called before each transmission of a command. Raises an exception if the command must no longer be sent."""
 
 BEING_SET = "they are being set"
-"""Problem of failsafes that have not been read back yet."""
+"""Problem that is reported for failsafes that have not been read back yet."""
 
 LANDED_MAX_AGE_S = 2.0
 """Maximum age of the landed state relative to the other messages."""
@@ -43,13 +43,13 @@ DEFAULT_ERROR_M = 1.5
 """Default 1-sigma position error if the GPS reports none, in metres."""
 
 MAX_POSITION_AGE_S = 1.0
-"""Age from which a position counts as unknown. At the rate of 20 Hz in flight, 20 successive positions were lost."""
+"""Age from which a position counts as unknown, in seconds. In flight, 20 positions are due in this time (20 Hz)."""
 
 WIND_MAX_AGE_S = 10.0
 """Maximum age of the wind estimate."""
 
 READY_MAX_AGE_S = 5.0
-"""Maximum age of the reported readiness. At the rate of 1 Hz, four successive messages were lost."""
+"""Maximum age of the reported readiness, in seconds. Five messages are due in this time (1 Hz)."""
 
 CHECKS_TEXT_MAX_AGE_S = 40.0
 """Maximum age of a text that states a failed pre-arm check. ArduCopter repeats these texts every 30 s while a check fails."""
@@ -333,7 +333,7 @@ class Autopilot(Protocol):
         """Stop the motors. The autopilot refuses in the air."""
 
     async def set_home(self, lat: float, lon: float, amsl_m: float) -> None:
-        """Set home, so that arming elsewhere does not move it."""
+        """Set home to a position. If the vehicle later arms at another position, home does not move there."""
 
     async def request_home(self) -> None:
         """Request the home position now."""
@@ -362,7 +362,7 @@ class Autopilot(Protocol):
         """Fly with a velocity over ground. The autopilot stops the drone if no further setpoint arrives in time."""
 
     async def set_rates(self, flying: bool) -> None:
-        """Request the message rates, higher in the air."""
+        """Request the message rates, which are higher in the air."""
 
 
 class Failsafes(Protocol):
@@ -378,7 +378,7 @@ class Failsafes(Protocol):
         """Update the altitude of the autopilot's own return flight."""
 
     def concerns(self, name: str) -> bool:
-        """Return True if a parameter is set or read by the failsafes."""
+        """Return True if the failsafes set or read the parameter with this name."""
 
     def learn(self, status: FailsafeStatus) -> FailsafeStatus:
         """Update the vehicle's dynamics from the parameters known so far."""
@@ -389,13 +389,13 @@ class ReturnLimits(Protocol):
 
     @property
     def limited(self) -> bool:
-        """True while the vehicle has values that this service set."""
+        """True while the vehicle has parameter values that this service set in place of the owner's values."""
 
     async def limit(self, bounds: ReturnBounds) -> tuple[str, ...]:
         """Limit the parameters to the bounds, and undo unnecessary limits. Return the changes as sentences."""
 
     async def lift(self, idle: Callable[[], bool]) -> None:
-        """Restore the owner's values."""
+        """Restore the parameter values of the vehicle's owner."""
 
 
 class Fence(Protocol):

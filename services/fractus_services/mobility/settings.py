@@ -17,7 +17,7 @@ class MobilitySettings:
     # Arming
 
     arming_timeout_s: float = 3.0
-    """Seconds to wait for the journal, and for the armed state after the autopilot accepted the command."""
+    """Seconds to wait until the journal is written, and then until the autopilot reports that the motors are armed."""
 
     arming_retry_s: float = 2.0
     """Seconds between arming attempts."""
@@ -40,10 +40,10 @@ class MobilitySettings:
     """Assumed speed of legs while the vehicle's parameters are unknown."""
 
     waypoint_radius_m: float = 5.0
-    """A leg that ends within this distance of the next waypoint of the path counts as reaching it."""
+    """A leg that ends within this distance of the next waypoint of the path counts as reaching the waypoint."""
 
     home_moved_m: float = 2.0
-    """Distance in space above which home counts as moved. Smaller distances are within the margins of legs."""
+    """Three-dimensional distance above which home counts as moved. Smaller distances are within the margins of legs."""
 
     home_timeout_s: float = 2.0
     """Seconds to wait for HOME_POSITION after home was set."""
@@ -54,7 +54,7 @@ class MobilitySettings:
     """Seconds between attempts of a system task."""
 
     max_return_attempts: int = 6
-    """Number of refused attempts to return, after which the drone lands where it is."""
+    """Number of refused attempts to return after which the drone lands at its current position."""
 
     settle_timeout_s: float = 10.0
     """Longest time for which the stop setpoint is repeated until the drone is at rest, in seconds."""
@@ -69,7 +69,10 @@ class MobilitySettings:
     """Seconds of the vehicle's clock between stop setpoints."""
 
     position_problem_timeout_s: float = 60.0
-    """Seconds for which a return waits until the position is trusted again. The drone then lands where it is."""
+    """Seconds for which a return waits until the position is trusted again.
+
+    If the position is then still not trusted, the drone lands at its current position.
+    """
 
     # Supervision and verification of the failsafes
 
@@ -86,7 +89,10 @@ class MobilitySettings:
     """Seconds between attempts to remove the fence and limits of a mission."""
 
     lower_after_s: float = 5.0
-    """Seconds without need for the fence after which it is removed, so that a repeated arming attempt still finds it."""
+    """Seconds after which a fence that no mission needs is removed.
+
+    A repeated arming attempt in this time can still use it.
+    """
 
     verify_min_retry_s: float = 0.5
     """Shortest time between two checks of the failsafes."""
@@ -95,7 +101,7 @@ class MobilitySettings:
     """Longest time between two verifications on the ground, after repeated failures."""
 
     verify_interval_s: float = 10.0
-    """Seconds between verifications in flight, because the message about a change by another station may be lost."""
+    """Seconds between verifications in flight. They detect a change by another station even if its message was lost."""
 
     unverified_timeout_s: float = 60.0
     """Seconds for which the failsafes of a connected, flying vehicle may be unverified before the system brings it home."""
@@ -103,10 +109,10 @@ class MobilitySettings:
     # Authorization of calls
 
     driver_rest_factor: float = 1.0
-    """Pause after a judgement for the driver in control, as a multiple of the time that the judgement took."""
+    """Pause after a call of the driver in control was judged, as a multiple of the time that judging the call took."""
 
     others_rest_factor: float = 4.0
-    """Pause after a judgement for all other callers together, as a multiple of the time that the judgement took.
+    """Pause after a call of any other caller was judged, as a multiple of the time that judging the call took.
 
     The pauses reserve time for the monitor: a flood of calls takes only a part of the event loop's time.
 """
@@ -168,7 +174,7 @@ class MobilitySettings:
     """Seconds at the target after which a leg with a heading is complete in any case."""
 
     speed_timeout_s: float = 1.3
-    """Seconds within which the speed of a leg must be acknowledged. It is sent twice in this time.
+    """Seconds within which the speed of a leg must be acknowledged. The speed is sent twice in this time.
 
     Without an acknowledgement the drone is stopped and the leg is started once more.
 """
@@ -230,7 +236,10 @@ class MobilitySettings:
     # Monitor
 
     monitor_interval_s: float = 0.1
-    """Longest time between two checks in flight, in seconds of the vehicle's clock. Each position also starts one (20 Hz)."""
+    """Longest time between two checks in flight, in seconds of the vehicle's clock.
+
+    Each position also starts a check (20 Hz).
+    """
 
     monitor_idle_interval_s: float = 0.5
     """Longest time between two iterations on the ground."""
@@ -253,10 +262,13 @@ class MobilitySettings:
     # gRPC streams
 
     stream_check_interval_s: float = 0.5
-    """Longest time between two checks for a waiting caller, because a change of the autopilot's readiness wakes no task."""
+    """Longest time between two checks for a waiting caller.
+
+    The checks are needed because a change of the autopilot's readiness does not wake the task of the caller.
+    """
 
     stream_event_timeout_s: float = 5.0
-    """Seconds to wait for one event of a lease."""
+    """Longest uninterrupted wait for the next event of a control lease, in seconds. The wait is then repeated."""
 
     telemetry_min_interval_s: float = 0.05
     """Shortest interval of a telemetry stream."""

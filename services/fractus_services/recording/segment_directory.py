@@ -21,7 +21,7 @@ RESERVE_BYTES = 200_000_000
 MIN_SEGMENT_BYTES = 250_000
 MAX_SEGMENT_BYTES = 32_000_000
 SEGMENTS_PER_LIMIT = 16
-"""Number of segments of full size within the limit, so that removing the oldest loses little."""
+"""Number of full segments that fit within the limit. With many small segments, removing the oldest one loses little."""
 
 PART_SUFFIX = ".part"
 """Suffix of a file that is being written."""

@@ -12,7 +12,7 @@ from fractus_services.errors import Unavailable
 from fractus_services.options import CannotServe
 
 TIMEOUT_S = 5.0
-"""Time for one image, in seconds, for drivers that use the network."""
+"""Timeout of one image, in seconds, for drivers that use the network."""
 
 
 class CameraFailed(Unavailable):

@@ -29,7 +29,7 @@ class HttpSnapshot:
     """
 
     latency_s = 2.0
-    """IP cameras return the latest encoded image, which may be this old."""
+    """Maximum age of an image, in seconds, because IP cameras return the image that they encoded last."""
 
     def __init__(self, url: str) -> None:
         parts = urllib.parse.urlsplit(url)

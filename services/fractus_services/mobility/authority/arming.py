@@ -75,9 +75,9 @@ class Arming:
             await asyncio.sleep(SETTINGS.arming_retry_s)
 
     async def _arm_exclusively(self, grant: ActiveGrant, permit: Permit) -> None:
-        """Arm while no other caller arms.
+        """Arm the drone. Only one caller at a time can do this.
 
-        Otherwise one caller could still prepare the arming when the drone already flies.
+        Otherwise a caller could still be preparing to arm a drone that another caller has armed and that already flies.
         """
         async with self._control.autopilot.starting:
             permit()
@@ -174,7 +174,14 @@ class Arming:
         return self._require_verified(after)
 
     def _require_verified(self, chosen: FailsafeStatus | None = None) -> FailsafeStatus:
-        """Return the failsafes if they are verified and, unless `chosen` is None, are still the chosen ones."""
+        """Return the failsafe status if the drone may arm with it.
+
+        Arming requires verified failsafes, a fast link and a working audit log. If `chosen` is specified, it must still
+        be the current status.
+
+        Raises:
+            PreconditionFailed: One of these conditions is not met.
+        """
         status = self._control.failsafe_status
         if status is None or status.problem or (chosen is not None and status is not chosen):
             problem = (status.problem if status is not None else "") or BEING_SET

@@ -199,7 +199,7 @@ class ControlStore:
 
     @property
     def mission_grant(self) -> ActiveGrant | None:
-        """Grant of the lease, or of the active mission."""
+        """Grant of the current lease. Without a lease, Grant of the active mission if this Grant is in force."""
         lease = self.lease
         mission = self._state.mission
         if lease is not None:
@@ -332,7 +332,10 @@ class ControlStore:
         return check
 
     def transit_permit(self, lease: Lease, motion: Motion) -> Permit:
-        """Return a permit for transit flights. It is valid while the driver that requested the transit is waiting."""
+        """Return a permit for transit flights.
+
+        The permit is valid while the driver that requested the transit is waiting.
+        """
 
         def check() -> None:
             motion.check()
@@ -342,7 +345,7 @@ class ControlStore:
         return check
 
     def system_permit(self, constraints: FlightConstraints, motion: Motion) -> Permit:
-        """Return a permit for flights without a driver. It is valid while no other party has the drone."""
+        """Return a permit for flights without a driver. The permit is valid while no other party has the drone."""
 
         def check() -> None:
             motion.check()
@@ -356,7 +359,7 @@ class ControlStore:
         return check
 
     async def return_control(self, grant: ActiveGrant) -> bool:
-        """End the control point of a driver. Return True if it was the last one.
+        """End the control point of a driver. Return True if it was the last control point of the mission.
 
         Raises:
             Refused: The driver does not have control.
@@ -370,7 +373,7 @@ class ControlStore:
         return last
 
     async def report_waypoints(self, grant: ActiveGrant, waypoints: int) -> None:
-        """Record that a driver completed the first waypoints of its control point, and save that.
+        """Record the number of waypoints that a driver has completed at its control point, and save it in the journal.
 
         Raises:
             Refused: The driver does not have control.
@@ -433,7 +436,7 @@ class ControlStore:
         return origin is None or _is_elsewhere(vehicle.home, origin)
 
     async def restore_home(self) -> None:
-        """Set home back to where the mission armed for its first takeoff, if it was moved.
+        """If home was moved, set it back to the position where the mission armed for its first takeoff.
 
         Raises:
             AutopilotError: The autopilot refused, or reported no new home.
@@ -452,19 +455,19 @@ class ControlStore:
     # System flights
 
     def begin_transit(self, grant: ActiveGrant) -> FlightConstraints:
-        """Begin to fly for an application, under its flight constraints."""
+        """Begin a transit flight for an application, and return the flight constraints."""
         constraints = self._constrain(grant)
         self.dispatch(TransitBegan(constraints.flight_id, grant.key, grant.identity))
         return constraints
 
     def begin_system_flight(self, grant: ActiveGrant) -> FlightConstraints:
-        """Begin a flight under the constraints of a grant."""
+        """Begin a flight of the system, and return its flight constraints, which follow from the grant."""
         constraints = self._constrain(grant)
         self.dispatch(SystemFlightBegan(constraints.flight_id, grant.key))
         return constraints
 
     def end_system_flight(self, constraints: FlightConstraints) -> None:
-        """End the flight under these constraints."""
+        """End the flight of the system that has these flight constraints."""
         self.dispatch(SystemFlightEnded(constraints.flight_id))
 
     def begin_tour(self, grant: ActiveGrant, work: Coroutine[Any, Any, None]) -> None:
@@ -486,14 +489,18 @@ class ControlStore:
     # Motions
 
     def set_cruise_speed(self, speed_mps: float, leg_mps: float) -> None:
-        """Set the speed of future legs, and the speed that is legal along the rest of the current leg."""
+        """Set the speed of later legs to `speed_mps`, and the speed of the current leg to `leg_mps`."""
         self.dispatch(CruiseSpeedSet(speed_mps))
         motion = self.motion
         if motion is not None and motion.speed_mps is not None:
             motion.speed_mps = leg_mps
 
     def begin_motion(self, kind: str, permit: Callable[[Motion], Permit] = lambda _motion: always) -> Motion:
-        """Begin a motion in place of the current one, if its permit holds."""
+        """Begin a motion, which replaces the current motion.
+
+        Raises:
+            Exception: The permit of the new motion does not hold.
+        """
         motion = Motion(kind)
         permit(motion)()
         self.dispatch(MotionBegan(motion.motion_id, kind))

@@ -77,7 +77,7 @@ class Lease:
 
 @dataclass(eq=False, slots=True)
 class FlightConstraints:
-    """Flight constraints of a system flight. They follow changes of the grant."""
+    """Flight constraints of a system flight. If the grant changes, the constraints change too."""
 
     grant: ActiveGrant
     compiled: CompiledGrant
@@ -106,7 +106,7 @@ class Motion:
     _refusal: Refused | None = None
 
     def stop(self, refusal: Refused) -> None:
-        """End the motion. Its caller receives the first refusal."""
+        """End the motion with a refusal. If it is called again, the motion keeps its first refusal."""
         self._refusal = self._refusal or refusal
 
     def check(self) -> None:
@@ -240,7 +240,10 @@ class EffectRunner:
     # System tasks
 
     def run_task(self, task: SystemTask, work: Coroutine[Any, Any, None]) -> None:
-        """Run a system task. Its end is always dispatched, so that a failed task does not count as running."""
+        """Run a system task.
+
+        The end of the task is dispatched even if the task fails. Otherwise a failed task would count as running.
+        """
         running = self._running[task.task_id] = self.tasks.spawn(work)
 
         def ended(_done: asyncio.Task[None]) -> None:

@@ -48,7 +48,7 @@ def _outcome(stored: Any) -> Outcome:
 def _mission(stored: dict[str, Any]) -> Mission:
     """Return a stored mission without the fields that only a newer release knows."""
     known = {name: value for name, value in stored.items() if name in _FIELDS}
-    # Earlier releases did not record legs. A mission that was in the air may have flown some.
+    # Earlier releases did not record legs. A mission that was in the air counts as having flown a leg.
     known.setdefault("leg_flown", known.get("flown", False))
     if known.get("outcome"):
         known["outcome"] = _outcome(known["outcome"])
@@ -69,7 +69,7 @@ def _stored(mission: Mission) -> dict[str, Any]:
 def _read(path: Path) -> JournalContent:
     stored = read_json(path)
     missions = {m["key"]: _mission(m) for m in stored["missions"]}
-    # Earlier releases did not record who armed.
+    # Earlier releases did not record who armed. The system then counts as having armed.
     return JournalContent(missions, stored["active"], bool(stored.get("armed_by_others", False)))
 
 

@@ -154,7 +154,7 @@ class ModeController:
             await autopilot.update(SETTINGS.brake_resend_s / autopilot.pace)
 
     async def _hover(self) -> None:
-        """Hold now, and again when a takeoff in progress leaves the ground."""
+        """Hold the position now. If a takeoff is in progress, hold again when the drone has left the ground."""
         await self.hold()
         while self._autopilot.vehicle.armed and not self._autopilot.vehicle.in_air:
             await self._autopilot.update(SETTINGS.task_retry_s)

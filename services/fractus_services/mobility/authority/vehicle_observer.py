@@ -134,7 +134,10 @@ class VehicleObserver:
                     await self._changed.wait()
 
     async def _verify(self) -> None:
-        """Set and read back the failsafes, and in flight also the fence. If they cannot be kept, the drone is brought home."""
+        """Set the failsafes and read them back. In flight, also check the limits of the return and the fence.
+
+        If a protection is lost in flight, the drone is brought home.
+        """
         control = self._control
         before = control.failsafe_status
         flying = control.autopilot.vehicle.armed
@@ -172,7 +175,10 @@ class VehicleObserver:
         self._verified_at = control.autopilot.now
 
     def _bring_home(self, problem: str) -> None:
-        """Take over a drone whose failsafes may not bring it home, unless the system already returns it."""
+        """Take over the drone, because its failsafes may not bring it home.
+
+        Do nothing if the system already flies it home.
+        """
         if not self._control.state.returning:
             reason = f"the autopilot's own failsafes no longer protect the drone: {problem}"
             self._control.take_over(Verdict("takeover", None, "FailsafeLost", reason, (), "returnToLaunch"))

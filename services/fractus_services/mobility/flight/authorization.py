@@ -168,7 +168,7 @@ class CallAuthorizer:
     """Throttles and judges calls.
 
     Args:
-        control: Control state. Takeovers demanded by a verdict are dispatched to it.
+        control: Control state. If a verdict demands a takeover, the takeover is dispatched to the control state.
         gate: Policy engine.
     """
 
@@ -179,9 +179,9 @@ class CallAuthorizer:
         self._motion_calls = 0
 
     async def throttle(self, grant: ActiveGrant) -> None:
-        """Wait for the end of the pause after the last judgement.
+        """Wait for the end of the pause that follows each judgement of a call.
 
-        Judgements for the driver in control and judgements for all other callers have separate pauses.
+        Calls of the driver in control and calls of all other callers have separate pauses.
         """
         while True:
             wait_s = self._free_at[self._has_control(grant)] - self._control.autopilot.now

@@ -227,7 +227,7 @@ class MotionMonitor:
             and not just_began
             and autopilot.vehicle.keeps_place(autopilot.now)
         ):
-            # Every later movement is judged under the current constraints or under later ones.
+            # From now on, every movement is judged under the current constraints or under later constraints.
             self._changed_at = -math.inf
         return autopilot.now - self._changed_at < SETTINGS.grant_change_s
 
@@ -302,7 +302,7 @@ class MotionMonitor:
         await self._control.autopilot.set_speed(speed_mps, permit)
 
     async def _lead_back(self, verdict: Verdict, target: GotoArgs, permits: Permits, compiled: CompiledGrant) -> None:
-        """Fly back into the limits. This motion replaces the one that violated them."""
+        """Fly back into the limits. This motion replaces the motion that violated the limits."""
         control = self._control
         control.stop_motion(verdict)
         motion = control.begin_motion(CORRECTION)

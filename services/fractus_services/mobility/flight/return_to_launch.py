@@ -154,7 +154,10 @@ class ReturnFlight:
             raise AutopilotError(str(error), link=not control.autopilot.connected) from error
 
     def _path_is_home(self) -> bool:
-        """Return True if home was moved and the autopilot recorded its path. The path then leads to where the mission armed."""
+        """Return True if home was moved and the autopilot recorded its path.
+
+        The path then ends where the mission armed.
+        """
         return self._control.retraces and self._control.home_moved
 
     async def _fly_home(self, grant: ActiveGrant, is_current: Callable[[], bool]) -> str:

@@ -46,8 +46,8 @@ class SystemFlight:
     """A flight by the system.
 
     Attributes:
-        constraints: Flight constraints. They follow changes of the grant.
-        kind: Kind of its motions.
+        constraints: Flight constraints. If the grant changes, the constraints change too.
+        kind: Kind of the motions of the flight.
         permit: Returns the permit for the commands of a motion.
     """
 
@@ -230,7 +230,7 @@ class RouteFollower:
                 self._control.finish_motion(motion)
 
     async def legs(self, flight: SystemFlight, motion: Motion, search: Search) -> AsyncGenerator[Step, None]:
-        """Fly one attempt of `follow`, as one motion."""
+        """Fly the legs of one attempt of `follow` as one motion."""
         autopilot = self._control.autopilot
         permit = flight.permit(motion)
         for _ in range(SETTINGS.max_legs):
@@ -284,7 +284,11 @@ class RouteFollower:
         )
 
     def _allowed(self, flight: SystemFlight, leg: GotoArgs) -> GotoArgs:
-        """Return the leg as the policies allow it."""
+        """Return the leg with the corrections that the policies require.
+
+        Raises:
+            PreconditionFailed: The policies forbid the leg.
+        """
         verdict = self._gate.judge(Call("Goto", leg), flight.constraints.grant, flight.constraints.compiled)
         if not verdict.permits or not isinstance(verdict.args, GotoArgs):
             raise PreconditionFailed("NoLegalWay", f"the system cannot fly there: {verdict.reason}")

@@ -33,14 +33,14 @@ from fractus_services.mobility.settings import SETTINGS
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """Progress of a motion, with the verdict on it."""
+    """Progress of a motion, with the verdict on the motion."""
 
     verdict: Verdict
     step: Step
 
 
 class _Outdated(Aborted):
-    """The verdict on a leg changed before its command was acknowledged. `verdict` is the current one."""
+    """The verdict on a leg changed before its command was acknowledged. `verdict` is the new verdict."""
 
     def __init__(self, verdict: Verdict) -> None:
         super().__init__("NotFollowing", "the verdict on the leg changed before the autopilot acknowledged the command")
@@ -319,7 +319,7 @@ class MobilityService:
             yield Progress(verdict, step)
 
     def _require_armed(self, call: Call, grant: ActiveGrant) -> None:
-        """Refuse a takeoff that cannot be carried out, before its expensive judgement.
+        """Refuse a takeoff that cannot be carried out, before the policy engine judges it, which takes long.
 
         Calls of a method that is not granted are not refused here: the judgement refuses them and writes the audit log.
         """

@@ -33,7 +33,7 @@ _COPTERS = frozenset(
 _NUMBERS = {mode: number for number, mode in _MODES.items()}
 
 _ACCEPTS_COMPANION = "accepts heartbeats of the companion, and not those of a ground station"
-# Releases with the new name can accept a range of systems as the companion.
+# Releases that have MAV_GCS_SYSID_HI can accept a range of system ids as the companion.
 _ACCEPTS_ONE_SYSTEM = Setting(
     ("MAV_GCS_SYSID_HI",), 0, frozenset(float(n) for n in range(1, SYSTEM_ID + 1)), False, _ACCEPTS_COMPANION
 )
@@ -48,12 +48,13 @@ _REFUSALS: dict[int, tuple[str, ...]] = {
 _UNSTEERED = 1 << 4 | 1 << 5 | 1 << 6
 """Bits of GUID_OPTIONS that are not allowed.
 
-With the first two, the autopilot corrects neither position nor velocity and does not stop on command. With the third, it flies to
-positions as in a mission: at WPNAV_SPEED regardless of the commanded speed, and with its own detours around obstacles.
+With bits 4 and 5, the autopilot corrects neither position nor velocity and does not stop on command. With bit 6, it
+flies to positions as in a mission: at WPNAV_SPEED regardless of the commanded speed, and with its own detours around
+obstacles.
 """
 _STEERED = frozenset(float(options) for options in range(256) if not options & _UNSTEERED)
 
-# Values of FS_GCS_ENABLE and FENCE_ACTION: RTL, and SmartRTL. BATT_FS_LOW_ACT uses other numbers.
+# Values of FS_GCS_ENABLE and FENCE_ACTION for RTL and for SmartRTL. BATT_FS_LOW_ACT has other values for them.
 _RETURN = 1.0
 _RETRACE = 3.0
 
@@ -71,16 +72,16 @@ OPTIONS = "FENCE_OPTIONS"
 AUTOENABLE = "FENCE_AUTOENABLE"
 MARGIN = "FENCE_MARGIN"
 _UNION = 2
-"""Bit of FENCE_OPTIONS with which the vehicle has to be inside only one of several polygons."""
+"""Bit of FENCE_OPTIONS. If the bit is set, it is sufficient that the vehicle is inside one of several polygons."""
 _DEFAULT_FENCES = float(mavlink.FENCE_TYPE_ALT_MAX | mavlink.FENCE_TYPE_CIRCLE | mavlink.FENCE_TYPE_POLYGON)
 _DEFAULT_MARGIN_M = 2.0
 
 _ACCEL: Names = (("WPNAV_ACCEL", 0.01), ("WP_ACC", 1.0))
 _GAIN: Names = (("PSC_POSXY_P", 1.0), ("PSC_NE_POS_P", 1.0))
 _CLIMB: Names = (("WPNAV_ACCEL_Z", 0.01), ("WP_ACC_Z", 1.0))
-# 4.7.0 and 4.7.1 use different names.
+# The names differ between releases, even between 4.7.0 and 4.7.1.
 _JERK: Names = (("PSC_JERK_XY", 1.0), ("PSC_NE_JERK", 1.0), ("PSC_JERK_NE", 1.0))
-# Maximum lean angle of the position controller in degrees (0 if unset), and of the vehicle.
+# Maximum lean angles in degrees: _OWN_LEAN of the position controller (0 if unset), _LEAN of the vehicle.
 _OWN_LEAN: Names = (("PSC_ANGLE_MAX", 1.0),)
 _LEAN: Names = (("ANGLE_MAX", 0.01), ("ATC_ANGLE_MAX", 1.0))
 _MAX_LEAN_DEG = 80.0
@@ -95,7 +96,10 @@ _RETURN_CLIMB: Names = (("RTL_CLIMB_MIN", 0.01), ("RTL_CLIMB_MIN_M", 1.0))
 _MIN_SPEED_MPS = 0.2
 _MIN_ACCEL_MPS2 = 0.1
 _NO_RALLY_KM = 2.0**-10
-"""Distance of about one metre, beyond which rally points are ignored. 0 would allow all of them. The value is exact in float32."""
+"""Distance in kilometres beyond which the autopilot ignores rally points (about one metre).
+
+With 0, the autopilot would use every rally point. The value is exact in float32.
+"""
 
 
 class ArduCopter:
@@ -233,9 +237,10 @@ class ArduCopter:
         return limited
 
     def airframe(self, reader: ParameterReader, known: Airframe, speed_mps: float) -> tuple[Airframe, float]:
-        """Return accelerations, limited by the maximum lean angle, and gains.
+        """Return the dynamics of the vehicle, and the speed of its legs.
 
-        Releases before 4.7 use centimetres, later ones metres.
+        The horizontal acceleration is limited by the maximum lean angle. Releases before 4.7 use centimetres, and later
+        releases use metres.
         """
         read = reader.read
         airframe = Airframe(
@@ -265,8 +270,9 @@ class ArduCopter:
     ) -> dict[str, float]:
         """Return the parameters of the mission's fence.
 
-        The lower of both ceilings and both fence types apply. The owner's action stays if it brings the drone down. The drone must be
-        inside every polygon.
+        If a fence of the owner is active, the lower of the two ceilings applies, and the fence types of the owner stay
+        enabled in addition to those of the mission. The owner's action stays if it brings the drone down. The drone
+        must be inside every polygon.
         """
         action = _RETRACE if retraces else _RETURN
         kinds = (mavlink.FENCE_TYPE_ALT_MAX if ceiling_m is not None else 0) | (

@@ -35,7 +35,7 @@ BACKOFF_S = (0.2, 3.0)
 
 
 def ignore(_data: bytes) -> None:
-    """Discard a copy of received or sent bytes."""
+    """Default of the callbacks `received` and `sent`, which does nothing."""
 
 
 class MessageSubscriptions:

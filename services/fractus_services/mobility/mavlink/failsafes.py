@@ -134,7 +134,7 @@ class MavlinkFailsafes:
         self._concerned = frozenset((*(name for names in self._names for name in names), *additional))
 
     def concerns(self, name: str) -> bool:
-        """Return True if a parameter is set or read by the failsafes."""
+        """Return True if the failsafes set or read the parameter with this name."""
         return name in self._concerned
 
     async def configure(self, *, flying: bool = False, before: FailsafeStatus | None = None) -> FailsafeStatus:

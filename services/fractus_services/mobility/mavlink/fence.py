@@ -25,9 +25,9 @@ log = logging.getLogger(__name__)
 
 _RESTORE_TIMEOUT_S = 5.0
 ITEMS_AGAIN_S = 60.0
-"""Interval at which the items are read in flight.
+"""Interval at which the fence items are read in flight, in seconds.
 
-This detects that another station replaced them by the same number of items.
+Reading them detects that another station replaced them by the same number of items.
 """
 
 _SWITCHED = mavlink.FENCE_TYPE_ALT_MAX | mavlink.FENCE_TYPE_CIRCLE | mavlink.FENCE_TYPE_POLYGON
@@ -299,7 +299,7 @@ class MissionFence:
         raise refused
 
     async def _is_raised(self, owned: OwnerFence) -> bool:
-        """Return True if the fence is still raised as before. A repeated arming attempt then does not load it again."""
+        """Return True if the fence of an earlier arming attempt is still raised. It is then not loaded again."""
         try:
             self._compared_at = -math.inf
             await self._revert_changes(owned)

@@ -22,8 +22,8 @@ class Setting:
     Attributes:
         names: Name of the parameter, and its names in older or newer releases.
         value: Value that is set.
-        accepted: Values that may stay.
-        span: Values above the first number and up to the second may also stay.
+        accepted: Values that may stay, in addition to `value`.
+        span: Range of further values that may stay. The lower end of the range is excluded, the upper end is included.
         needed: True if arming is refused when the vehicle does not have the parameter.
         purpose: What the autopilot does because of the setting: a verb phrase for messages.
         additional: Further settings by name of the parameter. Each one must hold if the vehicle uses the parameter
@@ -60,7 +60,7 @@ class ParameterReader(Protocol):
     def read(self, names: Names, default: float, *, needed: bool = True) -> float:
         """Return a scaled value, or the default if the parameter is missing or invalid.
 
-        An invalid parameter is a problem. A missing one is a problem only if it is needed.
+        An invalid parameter is a problem. A missing parameter is a problem only if it is needed.
         """
 
 
@@ -116,7 +116,10 @@ class FlightStack(Protocol):
         """Return the flight mode of a heartbeat's `custom_mode`."""
 
     def mode_parameters(self, mode: FlightMode) -> tuple[float, ...]:
-        """Return the parameters of MAV_CMD_DO_SET_MODE from the second on. The first one requests a custom mode."""
+        """Return the parameters of MAV_CMD_DO_SET_MODE from param2 on.
+
+        The caller sets param1, which requests a custom mode.
+        """
 
     def explains_refusal(self, command: int, text: str) -> bool:
         """Return True if a status text states why a command (MAV_CMD) was refused."""

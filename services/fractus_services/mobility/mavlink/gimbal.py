@@ -20,7 +20,7 @@ _FRAMES = mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_VEHICLE_FRAME | mavlink.GIMBAL_DEVI
 
 
 class GimbalState(Protocol):
-    """Gimbal limits in the vehicle's state."""
+    """Part of the vehicle's state that contains the limits of the gimbal."""
 
     @property
     def gimbal_limits(self) -> tuple[tuple[float, float], ...] | None:

@@ -68,14 +68,14 @@ Velocity = tuple[float, float, float]
 MAX_SETPOINTS = 200
 """Maximum number of stored setpoints.
 
-The service sends fewer setpoints within the longest latency at which it flies.
+Within the longest latency with which the service flies, it sends fewer setpoints.
 """
 
 TURNED_MPS = 0.5
 """A vehicle has turned onto its course if its speed across the course is at most this value."""
 
 LEVEL_M = 0.3
-"""Height difference up to which a leg neither climbs nor descends."""
+"""Height difference up to which a leg counts as level, in metres."""
 
 
 class Acknowledgements:
@@ -100,7 +100,7 @@ class Acknowledgements:
 
     @property
     def timeout_s(self) -> float:
-        """Time after which a transmission counts as lost."""
+        """Time after which a transmission without an acknowledgement counts as lost, in seconds."""
         return max(ACK_TIMEOUT_S, min(self._timing.answer_s + ACK_SLACK_S, MAX_ACK_TIMEOUT_S))
 
     def _answerable_s(self, now: float) -> float:
@@ -124,7 +124,7 @@ class Acknowledgements:
         self._latest[command] = answer
 
     def is_overtaken(self, command: int, answer: Answer) -> bool:
-        """Return True if a later command with the same id was sent."""
+        """Return True if another command with the same id was sent after the command of this answer."""
         return self._latest.get(command, answer) is not answer
 
     def take(self, acknowledgement: Message, now: float) -> None:
@@ -165,13 +165,19 @@ class Acknowledgements:
 
 
 class RecentSetpoints:
-    """Recent setpoints, which the vehicle's reported state may not reflect yet. Each has the times of its first and last transmission."""
+    """Recent setpoints, which the vehicle's reported state may not reflect yet.
+
+    The times of the first and of the last transmission of each setpoint are stored.
+    """
 
     def __init__(self) -> None:
         self._sent: deque[tuple[float, float, Velocity]] = deque(maxlen=MAX_SETPOINTS)
 
     def add_velocity(self, velocity: Velocity, now: float) -> None:
-        """Add a velocity setpoint that is being sent."""
+        """Record that a velocity setpoint is being sent now.
+
+        A repetition of the latest setpoint only updates the time of its last transmission.
+        """
         first = self._sent.pop()[0] if self._sent and self._sent[-1][2] == velocity else now
         self._sent.append((first, now, velocity))
 
@@ -190,7 +196,7 @@ class RecentSetpoints:
         self.add_velocity((north * share, east * share, down), now)
 
     def pending_since(self, earliest: float, measured: Velocity) -> tuple[Velocity, ...]:
-        """Return the setpoints that the vehicle may still be reacting to, the latest last. Older ones are dropped.
+        """Return the setpoints that the vehicle may still be reacting to, the latest last. Drop older setpoints.
 
         Setpoints sent after `earliest` always count. The setpoint that was in force at `earliest` counts in two cases.
         If it is a velocity command, the vehicle brakes only until it has reached that velocity. If it is a leg onto
@@ -438,7 +444,7 @@ class MavlinkAutopilot(AutopilotLink):
         await self.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 0, permit=permit)
 
     async def set_home(self, lat: float, lon: float, amsl_m: float) -> None:
-        """Set home, so that arming elsewhere does not move it."""
+        """Set home to a position. If the vehicle later arms at another position, home does not move there."""
         await self.command(mavlink.MAV_CMD_DO_SET_HOME, place=(lat, lon, amsl_m), frame=mavlink.MAV_FRAME_GLOBAL)
 
     async def take_off(self, altitude_m: float, permit: Permit = always) -> None:
@@ -516,7 +522,7 @@ class MavlinkAutopilot(AutopilotLink):
             )
 
     async def set_rates(self, flying: bool) -> None:
-        """Request the message rates, higher in the air, again if messages are missing."""
+        """Request the message rates, which are higher in the air. Request them again if messages are missing."""
         await self._rates.request(self, flying)
 
     async def request_home(self) -> None:

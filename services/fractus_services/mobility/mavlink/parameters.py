@@ -21,7 +21,7 @@ The list has about 1,400 parameters, and its transfer takes half a minute at 57,
 """
 
 WINDOW = 12
-"""Concurrent requests. ArduPilot queues 20 and drops the rest."""
+"""Maximum number of concurrent requests. ArduPilot queues 20 requests and drops further requests."""
 
 LIST_QUIET_S = 2.0
 """Time without a further entry after which the autopilot has stopped sending its list."""
@@ -30,9 +30,9 @@ LIST_TIMEOUT_S = 180.0
 """Longest time for the transfer of the list, including repeated requests."""
 
 FEW_MISSING = 0.05
-"""Share of the list.
+"""Share of the parameter list that may be missing.
 
-If more entries are missing, the complete list is requested again, otherwise the missing entries.
+If more entries are missing, the complete list is requested again. Otherwise only the missing entries are requested.
 """
 
 Spellings = tuple[str, ...]

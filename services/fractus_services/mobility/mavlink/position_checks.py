@@ -14,7 +14,7 @@ from fractus_core.geo import LocalFrame
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 QUIET_S = 5.0
-"""Time without any sign after which the position is trusted again."""
+"""Seconds without a sign of a wrong position after which the position is trusted again."""
 
 DEFAULT_VARIANCE_LIMIT = 0.8
 """Default of FS_EKF_THRESH. At 1, the estimator rejects its measurements."""
@@ -30,19 +30,23 @@ ERROR_FACTOR = 3.0
 """Multiple of the position error (1 sigma) that two correct positions may be apart."""
 
 JUMP_M = 1.0
-"""Distance of a correction by the estimator that is no jump, in addition to the position error."""
+"""Distance by which the estimator may correct the position, in addition to the position error, without a jump."""
 
 RETURNED_M = 5.0
 """Distance from the expected position, in addition to the position error, within which a position that jumped has returned.
 
-The expected position follows from the last trusted one and the velocities since then, which are inaccurate.
+The expected position is the last trusted position plus the distance flown since then. This distance is computed from
+velocities, which are inaccurate.
 """
 
 ALTITUDE_JUMP_M = 3.0
-"""Change of the altitude by a correction that is no jump."""
+"""Distance by which the estimator may correct the altitude, in metres. A larger correction is a jump."""
 
 DISAGREEMENT_M = 2.0
-"""Distance between GPS and estimate, in addition to the position error: antenna offset, and distance between two positions."""
+"""Permitted distance between the GPS position and the estimate, in addition to the position error.
+
+It covers the offset of the antenna, and the flight between the times of the two positions.
+"""
 
 MAX_ACCEL_MPS2 = 10.0
 """Largest acceleration of a copter between two positions: a lean angle of 45 degrees, or free fall."""
@@ -54,7 +58,10 @@ PATH_S = 1.0
 """Seconds of the vehicle's clock for which positions are kept. The position of the GPS is older than the estimate."""
 
 DISAGREEMENTS = 2
-"""Number of consecutive GPS positions that must disagree, because a single one may be an outlier that the estimator rejects."""
+"""Number of consecutive GPS positions that must disagree with the estimate.
+
+A single GPS position may be an outlier, which the estimator rejects.
+"""
 
 
 @dataclass(frozen=True, slots=True)

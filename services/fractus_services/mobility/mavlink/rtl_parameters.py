@@ -39,7 +39,7 @@ class RtlParameters:
 
     @property
     def limited(self) -> bool:
-        """True while the vehicle has values that this service set."""
+        """True while the vehicle has parameter values that this service set in place of the owner's values."""
         return bool(self._owned)
 
     async def limit(self, bounds: ReturnBounds) -> tuple[str, ...]:

@@ -32,7 +32,10 @@ RETRY_S = 1.0
 
 VEHICLE_FILE = "vehicle.json"
 SERVED_FILE = "served"
-"""Exists if the previous run identified its vehicle and took responsibility for it. The next start removes the file."""
+"""Name of the file that shows that the previous run identified its vehicle and took responsibility for it.
+
+The next start removes the file.
+"""
 
 T = TypeVar("T")
 

@@ -44,7 +44,7 @@ MAX_CHECK_PERIOD_S = 40.0
 """Longest check period. Each unsuccessful request doubles the period, because requests do not help behind a slow radio."""
 
 MAX_NEVER_RECEIVED = 5
-"""Number of repeated requests because of an accepted message that never arrived.
+"""Limit of repeated requests for a message whose request the autopilot accepted, but which never arrived.
 
 The acceptance may have been a duplicate of the acknowledgement of another request. Few autopilots accept messages that they
 cannot send.

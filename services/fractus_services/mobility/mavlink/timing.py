@@ -1,10 +1,12 @@
 """Upper bounds of the delays of vehicle state and commands, in seconds of the vehicle's clock.
 
-The autopilot stamps its positions and the TIMESYNC requests that it receives with one clock. The offset of this clock is unknown.
-Let E be the latest reading of that clock that received positions prove: the clock shows at least E now. A request that is sent at E
-and stamped H on reception took at most H - E longer on the uplink than the fastest position took on the downlink. A position stamped S
-is E - S older than the fastest possible one. The sum E - S + max(H - E) therefore bounds the time from a position to the effect of a
-command that is sent now. The unknown offset cancels, whichever direction is slower.
+The autopilot stamps its positions, and the TIMESYNC requests that it receives, with one clock. The offset of this clock
+is unknown. A position that was stamped S and arrived t seconds (of this clock) ago shows that this clock reads at least
+S + t now. Let E be the largest of these lower bounds. A request that is sent when the bound is E, and that is stamped H
+on reception, took at most H - E longer on the uplink than the fastest position took on the downlink. A position stamped
+S is E - S older than it would be if it had arrived as fast as the fastest position. The sum E - S + max(H - E)
+therefore bounds the time from a position to the effect of a command that is sent now. The sum does not depend on the
+unknown offset, regardless of which direction of the link is slower.
 """
 
 from __future__ import annotations
@@ -20,13 +22,13 @@ PROBE_S = 0.2
 """Interval between measurements."""
 
 WINDOW_S = 10.0
-"""Period over which the longest delay is taken."""
+"""Seconds for which measured delays are kept. The longest of them is the delay of the link."""
 
 ENVELOPE_S = 2.0
-"""Period of positions that prove the current reading of the vehicle's clock."""
+"""Seconds for which received positions are used to compute a lower bound of the vehicle's clock."""
 
 STALE_S = 3.0
-"""Time without an answer after which the delay is unknown. In this time, 15 answers were due."""
+"""Seconds without an answer after which the delay is unknown. In this time, 15 answers are due."""
 
 UNANSWERED = 10
 """Number of consecutive unanswered requests after which acknowledgements of commands measure the link."""
@@ -47,16 +49,18 @@ MAX_PACE = 6.0
 """Fastest simulation that the service can follow, as a multiple of real time."""
 
 OVERTAKEN_S = 5.0
-"""Age difference below which a position that is older than the last one was overtaken by it.
+"""Limit that separates overtaken positions from restarts of the vehicle, in seconds of the vehicle's clock.
 
-A position that is even older is either very late, or the vehicle has restarted. After a restart, the next position continues from it.
+If a position is older than the previous position by less than this limit, the previous position has overtaken it. If it
+is older by more, the position was delivered very late, or the vehicle has restarted. After a restart, the time stamps
+of the following positions continue from this position.
 """
 
 _WRAP_MS = 1 << 32
 _SLACK_S = 0.5
 """Tolerance of a measured delay, because positions may wait in the autopilot before they are sent.
 
-A reply outside the tolerance is from another clock.
+A reply whose time stamp is outside the tolerance is from the clock of another system.
 """
 
 
@@ -101,8 +105,8 @@ class Timing:
             if -OVERTAKEN_S < later_s <= 0.0:
                 return None
             if later_s <= 0.0:
-                # A much older position may have been delivered very late and must be ignored. If the vehicle has restarted, the next
-                # position continues from it.
+                # A much older position may have been delivered very late and must be ignored. If the vehicle has
+                # restarted, the time stamp of the next position continues from this position.
                 restart_boot_ms = self._restart_boot_ms
                 self._restart_boot_ms = boot_ms
                 if restart_boot_ms is None or not 0 < boot_ms - restart_boot_ms < OVERTAKEN_S * 1e3:
@@ -147,13 +151,17 @@ class Timing:
         return ((boot_ms - self._boot_ms + _WRAP_MS / 2) % _WRAP_MS - _WRAP_MS / 2) / 1e3
 
     def _present(self, at: float) -> float:
-        """Return the latest reading of the vehicle's clock that received positions prove for a time."""
+        """Return the largest lower bound of the vehicle's clock at a time, computed from recently received positions.
+
+        A position that was stamped S and arrived t seconds before that time, by the pace of the vehicle's clock, gives
+        the lower bound S + t.
+        """
         return max(stamp + self.pace * (at - arrived) for arrived, stamp in self._samples)
 
     def _compare(self, now: float) -> None:
         """Update the pace of the vehicle's clock.
 
-        It is 1 unless the measured rate exceeds 1 by more than its possible error.
+        The pace is 1 unless the measured rate exceeds 1 by more than the possible error of the measurement.
         """
         if now < self._compared_from:
             return

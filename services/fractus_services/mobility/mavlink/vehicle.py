@@ -19,13 +19,17 @@ log = logging.getLogger(__name__)
 
 _UNKNOWN_U8 = 0xFF
 _UNKNOWN_U16 = 0xFFFF
-"""Values of 8 and 16 bits that mean "unknown"."""
+"""Values of fields of 8 and of 16 bits that mean "unknown"."""
 
 _POSITIONED = mavlink.EKF_POS_HORIZ_ABS | mavlink.EKF_PRED_POS_HORIZ_ABS
 
 MIN_ERROR_M = 0.5
 MAX_ERROR_M = 10.0
-"""Range of the position error: smaller reported errors are raised to the first, and larger ones give no position."""
+"""Range of the position error, in metres (1 sigma).
+
+A reported error below `MIN_ERROR_M` is replaced by `MIN_ERROR_M`. If the reported error is above `MAX_ERROR_M`,
+positions are ignored.
+"""
 
 STATUS_MAX_AGE_S = 10.0
 """Maximum age of the estimator and GPS status.

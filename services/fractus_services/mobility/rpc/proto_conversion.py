@@ -177,7 +177,7 @@ def motion_progress(step: Step, vehicle: VehicleState, verdict: Verdict | None) 
 
 
 def _write_target(message: mobility_pb2.MotionProgress, verdict: Verdict, vehicle: VehicleState) -> None:
-    """Set the target of the motion after correction."""
+    """Set the target of the motion, with the corrections of the verdict."""
     args = verdict.args
     if isinstance(args, GotoArgs):
         message.target.latitude_deg = args.lat

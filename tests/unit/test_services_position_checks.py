@@ -162,7 +162,7 @@ def test_altitude_jump_makes_position_unknown() -> None:
     flight.amsl_m += 10.0
     flight.send(0.05)
     assert not flight.known
-    assert "altitude jumped by 10 m" in flight.vehicle.position_problem
+    assert "altitude is 10 m from where the vehicle flew" in flight.vehicle.position_problem
 
 
 @pytest.mark.parametrize("lost_s", [0.05, 0.5, 1.0, 10.0])
@@ -201,6 +201,17 @@ def test_restarted_clock_of_vehicle_is_no_jump() -> None:
     flight.boot_s = -flight.now
     flight.north_m += 33.0
     flight.send(0.5)
+    assert flight.known
+
+
+def test_altitude_stays_unknown_until_it_has_jumped_back() -> None:
+    flight = Flight()
+    flight.amsl_m += 20.0
+    flight.send(2 * QUIET_S)
+    assert not flight.known
+    assert "altitude" in flight.vehicle.position_problem
+    flight.amsl_m -= 20.0
+    flight.send(QUIET_S + 1.0)
     assert flight.known
 
 

@@ -109,6 +109,7 @@ class PositionChecks:
         self._displacement = ""
         self._trusted: ReportedPosition | None = None
         self._flown_m = (0.0, 0.0)
+        self._climbed_m = 0.0
         self._disagreements = 0
         self._reason = ""
         self._seen_at = -math.inf
@@ -188,13 +189,19 @@ class PositionChecks:
         if self._trusted is None:
             self._trusted = last
             self._flown_m = (0.0, 0.0)
+            self._climbed_m = 0.0
         self._flown_m = (
             self._flown_m[0] + (last.east_mps + reported.east_mps) / 2 * elapsed_s,
             self._flown_m[1] + (last.north_mps + reported.north_mps) / 2 * elapsed_s,
         )
+        self._climbed_m -= (last.down_mps + reported.down_mps) / 2 * elapsed_s
         away_m = math.dist(self._trusted.offset_m(reported), self._flown_m)
-        returned = away_m <= RETURNED_M + ERROR_FACTOR * error_m
-        self._displacement = "" if returned else f"the reported position is {away_m:.0f} m from where the vehicle flew"
+        off_m = abs(reported.amsl_m - self._trusted.amsl_m - self._climbed_m)
+        self._displacement = ""
+        if away_m > RETURNED_M + ERROR_FACTOR * error_m:
+            self._displacement = f"the reported position is {away_m:.0f} m from where the vehicle flew"
+        elif off_m > RETURNED_M:
+            self._displacement = f"the reported altitude is {off_m:.0f} m from where the vehicle flew"
 
     def _look_for_jump(
         self, last: ReportedPosition, reported: ReportedPosition, elapsed_s: float, error_m: float, now: float

@@ -215,6 +215,26 @@ def test_altitude_stays_unknown_until_it_has_jumped_back() -> None:
     assert flight.known
 
 
+def test_signs_that_recur_soon_belong_to_one_problem() -> None:
+    flight = Flight()
+    flight.flags = GLITCHING
+    flight.send(1.0)
+    began_s = flight.vehicle.position_problem_at
+    for _ in range(3):
+        flight.flags = READY
+        flight.send(QUIET_S + 3.0)
+        assert flight.known
+        flight.flags = GLITCHING
+        flight.send(2.0)
+        assert flight.vehicle.position_problem
+        assert flight.vehicle.position_problem_at == began_s
+    flight.flags = READY
+    flight.send(QUIET_S + 40.0)
+    flight.flags = GLITCHING
+    flight.send(2.0)
+    assert flight.vehicle.position_problem_at > began_s
+
+
 def test_correction_of_position_on_ground_is_no_jump() -> None:
     flight = Flight(armed=False)
     flight.north_m += 33.0

@@ -85,7 +85,8 @@ class VehicleState:
         heartbeat_gap_s: Interval between the last two heartbeats.
         located: True if GPS has an accurate three-dimensional fix. Positions without such a fix are ignored.
         position_problem: Reason why the reported position is not trusted and ignored; empty if it is trusted.
-        position_problem_at: Time since which the position has not been trusted.
+        position_problem_at: Start of the problem with the position. Problems that recur soon count as one.
+        position_trusted_at: Time at which the latest problem with the position ended.
     """
 
     lat: float | None = None
@@ -135,6 +136,7 @@ class VehicleState:
     heartbeat_gap_s: float = 0.0
     position_problem: str = ""
     position_problem_at: float = -math.inf
+    position_trusted_at: float = -math.inf
 
     @property
     def reports_on_ground(self) -> bool:

@@ -47,6 +47,9 @@ It is also the gap between heartbeats after which a report of stopped motors is 
 have landed.
 """
 
+TRUSTED_AGAIN_S = 30.0
+"""Seconds for which the position must be trusted before the next sign of a wrong position counts as another problem."""
+
 PATH_KEPT_S = 12.0
 """Time without a position after which the recorded path counts as lost.
 
@@ -127,7 +130,9 @@ def _check_position(vehicle: Vehicle, now: float) -> bool:
     if not problem:
         return True
     if not vehicle.position_problem:
-        vehicle.position_problem_at = now
+        # Signs that recur soon belong to one problem. Otherwise the drone would wait for its end until the battery is empty.
+        if now - vehicle.position_trusted_at > TRUSTED_AGAIN_S:
+            vehicle.position_problem_at = now
         log.warning("position: no longer trusted (reason=%s)", problem)
     vehicle.position_problem = problem
     return False
@@ -152,6 +157,7 @@ def _position(vehicle: Vehicle, message: Message, now: float) -> None:
     if vehicle.position_problem:
         log.info("position: trusted again")
         vehicle.position_problem = ""
+        vehicle.position_trusted_at = now
     vehicle.lat, vehicle.lon = place
     vehicle.altitude_m = message.integer("relative_alt") / 1e3
     vehicle.amsl_m = amsl_m

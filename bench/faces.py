@@ -138,15 +138,15 @@ def measure_shares(report: Report, name: str, series: Callable[[float, bool], It
         outcomes = []
         for scene in series(width, quick):
             boxes = detector.detect(scene.picture, scene.width * 0.95, upright=False)
-            theirs = detect_like_tutorials(scene.picture)
-            outcomes.append((is_found(scene, boxes), is_hidden(scene, boxes), is_found(scene, theirs)))
+            reference = detect_like_tutorials(scene.picture)
+            outcomes.append((is_found(scene, boxes), is_hidden(scene, boxes), is_found(scene, reference)))
         rows.append((name, width, len(outcomes), *(float(share) for share in np.mean(outcomes, axis=0))))
         if width >= DEFAULT_MIN_PX:
             reliable += outcomes
     print_table(("faces", "width px", "scenes", "found", "hidden", "tutorial"), rows)
-    found, hidden, theirs = (float(share) for share in np.mean(reliable, axis=0))
-    report.add(f"{name}_found", found, theirs, width=DEFAULT_MIN_PX)
-    report.add(f"{name}_hidden", hidden, theirs, width=DEFAULT_MIN_PX)
+    found, hidden, reference = (float(share) for share in np.mean(reliable, axis=0))
+    report.add(f"{name}_found", found, reference, width=DEFAULT_MIN_PX)
+    report.add(f"{name}_hidden", hidden, reference, width=DEFAULT_MIN_PX)
 
 
 def measure_filters(report: Report, quick: bool) -> None:

@@ -25,8 +25,8 @@ import yaml
 ROOT = Path(__file__).parents[1]
 
 _CLAIMS = Path(__file__).with_name("claims.yaml")
-_COMPARED = re.compile(r"(?:(ours|ours/theirs|theirs/ours) )?(<=|>=|<|>|=) (theirs|[\d.]+)")
-_NEAR = re.compile(r"within ([\d.]+) % of theirs(?:, or ([\d.]+))?")
+_COMPARED = re.compile(r"(?:(measured|measured/reference|reference/measured) )?(<=|>=|<|>|=) (reference|[\d.]+)")
+_NEAR = re.compile(r"within ([\d.]+) % of reference(?:, or ([\d.]+))?")
 _OPERATORS: dict[str, Callable[[float, float], bool]] = {
     "<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge, "=": operator.eq,
 }  # fmt: skip
@@ -60,34 +60,37 @@ class Report:
         self._results: list[dict[str, Any]] = []
 
     def add(
-        self, claim: str, ours: float, theirs: float | None = None, *, valid: bool = True, **details: object
+        self, claim: str, measured: float, reference: float | None = None, *, valid: bool = True, **details: object
     ) -> None:
         """Check a measured value against the limit of its claim, and print the result.
 
         Args:
             claim: Key of the claim in the section.
-            ours: Measured value.
-            theirs: Value of the comparator, if there is one.
+            measured: Measured value.
+            reference: Value of the comparator, if there is one.
             valid: False if the measurement is invalid. The claim then fails for every value.
             **details: Values for the placeholders in the name of the claim. The JSON file contains all of them.
         """
         entry = self._claims[claim]
         limit = entry.get("limit")
-        quantity = "theirs/ours"
+        quantity = "reference/measured"
         holds = valid
         if limit is not None:
-            quantity, within = _check(limit, ours, theirs)
+            quantity, within = _check(limit, measured, reference)
             holds = valid and within
         result = {
-            "name": entry["name"].format(**details), "ours": ours, "theirs": theirs, "unit": entry["unit"],
-            "ratio": _ratio(quantity, ours, theirs), "target": limit, "holds": holds,
+            "name": entry["name"].format(**details), "measured": measured, "reference": reference, "unit": entry["unit"],
+            "ratio": _ratio(quantity, measured, reference), "target": limit, "holds": holds,
         }  # fmt: skip
         self._results.append(result | details)
         verdict = "FAILS"
         if holds:
             verdict = "holds" if limit is not None else ""
-        compared = "" if theirs is None else f"{entry['against']} {theirs:.4g}"
-        print(f"{verdict:6}{result['name']:62} {ours:10.4g} {entry['unit']:12} {limit or '':26} {compared}", flush=True)
+        compared = "" if reference is None else f"{entry['against']} {reference:.4g}"
+        print(
+            f"{verdict:6}{result['name']:62} {measured:10.4g} {entry['unit']:12} {limit or '':26} {compared}",
+            flush=True,
+        )
 
     def finish(self) -> int:
         """Write the JSON file, and return the exit status: 0 if every claim holds."""
@@ -101,26 +104,28 @@ class Report:
             self._file.write_text(json.dumps({"claims": self._results}, indent=1) + "\n")
 
 
-def _check(limit: str, ours: float, theirs: float | None) -> tuple[str, bool]:
+def _check(limit: str, measured: float, reference: float | None) -> tuple[str, bool]:
     """Return the quantity that a limit applies to, and True if the quantity is within the limit."""
     compared = _COMPARED.fullmatch(limit)
     if compared is not None:
-        quantity = compared[1] or "ours"
-        value = ours if quantity == "ours" else _ratio(quantity, ours, theirs)
-        bound = theirs if compared[3] == "theirs" else float(compared[3])
+        quantity = compared[1] or "measured"
+        value = measured if quantity == "measured" else _ratio(quantity, measured, reference)
+        bound = reference if compared[3] == "reference" else float(compared[3])
         return quantity, value is not None and bound is not None and _OPERATORS[compared[2]](value, bound)
     near = _NEAR.fullmatch(limit)
     if near is None:
         raise ValueError(f"{_CLAIMS}: limit {limit!r} has an unknown format")
-    if theirs is None:
-        return "ours/theirs", False
-    return "ours/theirs", abs(ours - theirs) <= max(abs(theirs) * float(near[1]) / 100, float(near[2] or 0))
+    if reference is None:
+        return "measured/reference", False
+    return "measured/reference", abs(measured - reference) <= max(
+        abs(reference) * float(near[1]) / 100, float(near[2] or 0)
+    )
 
 
-def _ratio(quantity: str, ours: float, theirs: float | None) -> float | None:
-    if theirs is None:
+def _ratio(quantity: str, measured: float, reference: float | None) -> float | None:
+    if reference is None:
         return None
-    above, below = (ours, theirs) if quantity == "ours/theirs" else (theirs, ours)
+    above, below = (measured, reference) if quantity == "measured/reference" else (reference, measured)
     return above / below if below else None
 
 

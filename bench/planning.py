@@ -294,16 +294,16 @@ class Measurement:
     Attributes:
         nodes: Number of edge nodes.
         candidates: Number of edge nodes among the streets.
-        ours_s: Median duration of the planner, in seconds.
-        theirs_s: Duration of the linear method, in seconds.
+        measured_s: Median duration of the planner, in seconds.
+        reference_s: Duration of the linear method, in seconds.
         phases_ms: Duration of each phase, of the planner and of the linear method, in milliseconds.
         same: True if both made the same plan.
     """
 
     nodes: int
     candidates: int
-    ours_s: float
-    theirs_s: float
+    measured_s: float
+    reference_s: float
     phases_ms: tuple[list[float], list[float]]
     same: bool
 
@@ -341,11 +341,11 @@ def measure(nodes: int, candidates: int, times: int, application: Application) -
     stock = inventory(nodes, candidates)
     settings = Settings()
     stock.located()
-    plan, ours_s, ours_phases = repeated(lambda: plan_in_steps(application, stock, settings), times)
-    decision, theirs_s, their_phases = repeated(lambda: Linear(application, stock, settings).steps(), 1)
+    plan, measured_s, measured_phases = repeated(lambda: plan_in_steps(application, stock, settings), times)
+    decision, reference_s, their_phases = repeated(lambda: Linear(application, stock, settings).steps(), 1)
     assert isinstance(plan, DeploymentPlanSpec)
     same = decision_of(plan) == decision
-    return Measurement(nodes, candidates, ours_s, theirs_s, (ours_phases, their_phases), same)
+    return Measurement(nodes, candidates, measured_s, reference_s, (measured_phases, their_phases), same)
 
 
 def index_update_ms(nodes: int, moves: int = 1000) -> tuple[float, float]:
@@ -368,7 +368,7 @@ def index_update_ms(nodes: int, moves: int = 1000) -> tuple[float, float]:
 def rows_of(measurements: Iterable[Measurement]) -> Iterator[tuple[object, ...]]:
     """Return the rows of the table: two for each size."""
     for m in measurements:
-        methods = (("planner", m.ours_s, m.phases_ms[0]), ("linear", m.theirs_s, m.phases_ms[1]))
+        methods = (("planner", m.measured_s, m.phases_ms[0]), ("linear", m.reference_s, m.phases_ms[1]))
         for method, total_s, phases_ms in methods:
             yield m.nodes, m.candidates, method, 1e3 * total_s, *phases_ms
 
@@ -388,10 +388,10 @@ def main() -> int:
     report = Report("planning", options)
     large = fixed[LARGEST]
     small = fixed[1_000]
-    report.add("fixed", 1e3 * large.ours_s, 1e3 * large.theirs_s)
-    report.add("growth", large.ours_s / small.ours_s, large.theirs_s / small.theirs_s)
-    report.add("speed", large.theirs_s / large.ours_s)
-    report.add("share", 1e3 * share[LARGEST].ours_s, 1e3 * share[LARGEST].theirs_s)
+    report.add("fixed", 1e3 * large.measured_s, 1e3 * large.reference_s)
+    report.add("growth", large.measured_s / small.measured_s, large.reference_s / small.reference_s)
+    report.add("speed", large.reference_s / large.measured_s)
+    report.add("share", 1e3 * share[LARGEST].measured_s, 1e3 * share[LARGEST].reference_s)
     report.add("index", *index_update_ms(LARGEST))
     report.add("same", sum(not m.same for m in (*fixed.values(), *share.values())))
     return report.finish()

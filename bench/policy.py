@@ -191,10 +191,10 @@ def measure(report: Report, runs: int, autopilot: Autopilot) -> None:
         assert thesis.check(case.call)
         p50, p99 = check_durations_us(functools.partial(judge, case.call, NOW, compiled), runs)
         few = max(runs // (100 if len(spec.policies) > 1000 else 20), 20)
-        theirs = statistics.median(durations_us(functools.partial(thesis.check, case.call), few, warm_up=5))
+        reference = statistics.median(durations_us(functools.partial(thesis.check, case.call), few, warm_up=5))
         alone = statistics.median(durations_us(functools.partial(areas.check, case.call), few, warm_up=5))
-        rows.append((case.claim, theirs, alone))
-        report.add(case.claim, p50, theirs, p99=p99)
+        rows.append((case.claim, reference, alone))
+        report.add(case.claim, p50, reference, p99=p99)
         if case.claim == "access":
             report.add("access_tail", p99)
     compiled = compile_grant(grant(fence_and_limit()))

@@ -129,13 +129,13 @@ def main() -> int:
                 for side in sides:
                     side.add_foreign_services()
             for count in SIZES:
-                ours_ms = fractus_ms(sides, count)
+                measured_ms = fractus_ms(sides, count)
                 few = 2 if options.quick else 5
-                theirs_ms = thesis_ms(sides, count, few if count <= 16 else 1)
-                middle_ms = statistics.median(ours_ms)
+                reference_ms = thesis_ms(sides, count, few if count <= 16 else 1)
+                middle_ms = statistics.median(measured_ms)
                 claim = CLAIMS.get(count, "median")
-                report.add(claim, middle_ms, statistics.median(theirs_ms), count=count, beside=beside)
-                report.add("tail", tail_ms(ours_ms), max(theirs_ms), count=count, beside=beside)
+                report.add(claim, middle_ms, statistics.median(reference_ms), count=count, beside=beside)
+                report.add("tail", tail_ms(measured_ms), max(reference_ms), count=count, beside=beside)
     finally:
         for side in sides:
             side.close()

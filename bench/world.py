@@ -55,13 +55,13 @@ def measure_known_ground(report: Report, world: World, repeats: int) -> None:
     store = TileStore(world.ground)
     for name, (camera, mount) in scenes.items():
         world.render(camera, LENS, mount=mount, time_s=100.0)
-        ours_ms = median_ms(functools.partial(render_next, world, camera, mount, itertools.count()), repeats)
-        theirs_ms = None
+        measured_ms = median_ms(functools.partial(render_next, world, camera, mount, itertools.count()), repeats)
+        reference_ms = None
         if mount.pitch_deg == -90.0:
             view = world.view(camera, LENS, mount)
             render_naively(view, store)
-            theirs_ms = median_ms(functools.partial(render_naively, view, store), max(repeats // 5, 2))
-        report.add("picture", ours_ms, theirs_ms, scene=name)
+            reference_ms = median_ms(functools.partial(render_naively, view, store), max(repeats // 5, 2))
+        report.add("picture", measured_ms, reference_ms, scene=name)
     camera = scenes["1080p, 60 m, looking down"][0]
     report.add("thermal", median_ms(lambda: world.render(camera, LENS, time_s=100.0, band="ir"), repeats))
     picture = world.render(camera, LENS, time_s=100.0)

@@ -71,7 +71,7 @@ class VehicleObserver:
             position = f"{home.lat:.7f}, {home.lon:.7f}, {home.amsl_m:.1f} m above mean sea level"
             log.warning("observer: home moved by another station (home=%s)", position)
             control.note(
-                "restored", f"set back in flight: home, which another station moved to {position}", "HomeMoved"
+                "restored", f"home is set back, because another station moved it in flight to {position}", "HomeMoved"
             )
         if self._restoring_home is None or self._restoring_home.done():
             self._restoring_home = control.tasks.spawn(self._restore_home())

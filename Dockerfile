@@ -43,8 +43,8 @@ FROM build AS code
 COPY . /build/
 RUN --mount=type=cache,target=/root/.cache/uv /opt/uv/bin/uv build --quiet --wheel --all-packages --out-dir /wheels \
  && for name in fractus_drones fractus_sim; do \
-      python3 -m venv --without-pip /opt/fractus && /opt/uv/bin/uv pip install --quiet --python /opt/fractus --no-deps --no-index --find-links /wheels $name \
-      && mv /opt/fractus /$name; done
+      python3 -m venv --without-pip /opt/fractus && /opt/uv/bin/pip --python /opt/fractus install --quiet --no-compile --no-deps --no-index --find-links /wheels $name \
+      && python3 -m compileall -q --invalidation-mode unchecked-hash /opt/fractus/lib && mv /opt/fractus /$name; done
 
 # ---- images
 FROM base AS unprivileged

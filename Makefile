@@ -66,7 +66,7 @@ E2E_IMAGES = $(if $(filter current,$(FRACTUS_E2E_CLUSTER)),,$(RUN) python -m fra
 E2E_WORKERS = $(if $(filter current,$(FRACTUS_E2E_CLUSTER)),0,2)
 
 .PHONY: test
-test: packages env lint ## Run the checks that every change must pass: lint, types, unit, component, integration, attack and kill tests, and a mission on an embedded cluster (20 min)
+test: packages env lint ## Run the checks that every change must pass: lint, types, unit, component, integration, attack and kill tests, and a mission on an embedded cluster (30 min)
 	$(RUN) fractus cluster binaries
 	$(PYTEST) $(UNIT) -m "not slow" tests/component tests/unit
 	$(PYTEST) -n 3 $(GROUPS) -m "not slow" tests/integration

@@ -17,7 +17,7 @@ from fractus_proto.v1 import mobility_pb2
 from fractus.channel import Retries, ServiceChannel
 from fractus.control_point import ControlPoint
 from fractus.errors import ControlLost, Corrected, FractusError, MissionComplete, NotConfigured, Unavailable
-from fractus.values import Position, Progress
+from fractus.values import Decision, Position, Progress
 
 _log = logging.getLogger("fractus")
 _Event = mobility_pb2.ControlEvent
@@ -229,7 +229,8 @@ class Control:
                     if self._progress is not None and event.reason:
                         self._progress(event.reason)
                 elif event.state == _Event.STATE_LOST:
-                    self._lose(ControlLost(event.reason or "the system took the drone"))
+                    decision = Decision.from_proto(event.decision) if event.HasField("decision") else None
+                    self._lose(ControlLost(event.reason or "the system took the drone", decision))
                     return
                 elif event.state == _Event.STATE_COMPLETE:
                     if not self._returning:

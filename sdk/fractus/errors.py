@@ -71,7 +71,7 @@ class NoLegalWay(StateError):
 
 
 class ControlHeld(StateError):
-    """Another application controls the drone."""
+    """Another application, or another process of this component, controls the drone."""
 
     remedy = "retry when the drone is back; `fractus.run` does this"
 
@@ -105,8 +105,7 @@ class PolicyDenied(FractusError):
         self.code = decision.code
         self.reason = decision.reason
         self.policies = decision.policies
-        named = f" (by {', '.join(decision.policies)})" if decision.policies else ""
-        super().__init__(f"{decision.reason or decision.code or 'not allowed'}{named}")
+        super().__init__(_text_of(decision, "not allowed"))
 
 
 class Corrected(FractusError):
@@ -123,9 +122,17 @@ class Corrected(FractusError):
 
 
 class ControlLost(FractusError):
-    """The system or a human pilot took the drone, or this component never had control."""
+    """The system or a human pilot took the drone, or this component never had control.
+
+    Attributes:
+        decision: Reason, and the policies that demanded the takeover, if any.
+    """
 
     remedy = "request control again: it is granted when the drone is free; `fractus.run` does this"
+
+    def __init__(self, message: str, decision: Decision | None = None) -> None:
+        self.decision = decision or Decision(Action.UNSPECIFIED, reason=message)
+        super().__init__(_text_of(decision, message) if decision is not None else message)
 
 
 class MissionEnded(ControlLost):
@@ -179,6 +186,12 @@ class Busy(FractusError):
 
 class NotConfigured(FractusError):
     """Environment variables of a component's pod are missing or invalid. The message names what to set."""
+
+
+def _text_of(decision: Decision, text: str) -> str:
+    """Return the reason of a decision with the names of the policies, or `text` if the decision has no reason."""
+    named = f" (by {', '.join(decision.policies)})" if decision.policies else ""
+    return f"{decision.reason or decision.code or text}{named}"
 
 
 def decision_of(error: Any) -> Decision | None:
@@ -240,6 +253,8 @@ def _refusal(code: grpc.StatusCode, text: str, method: str, decision: Decision |
         return MissionComplete(text)
     if decision is not None and decision.code == "MissionEnded":
         return MissionEnded(decision.reason or text)
+    if decision is not None and decision.action is Action.TAKEOVER:
+        return ControlLost(text, decision)
     if decision is not None and decision.code in _CONTROL_CODES:
         return ControlLost(decision.reason or text)
     if code is grpc.StatusCode.PERMISSION_DENIED:

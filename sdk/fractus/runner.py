@@ -38,6 +38,8 @@ def run(program: Program, *, endpoint: Endpoint | None = None, strict: bool = Fa
     |---|---|
     | A motion is stopped (`Interrupted`) | The program is restarted with the same control |
     | The system or a pilot takes the drone (`ControlLost`) | Control is requested again |
+    | The program causes the same takeover three times without another completed waypoint | The mission ends early |
+    | Another process of this component has control (`ControlHeld`) | Control is requested again |
     | The mission ends early (`MissionEnded`) | The process exits with 1 (in a pod it stays, because a restart would have no effect) |
     | The program raises another error, for example `PolicyDenied` | The drone hovers, and the process exits with 1 |
     | SIGTERM or SIGINT | The program is cancelled, the drone hovers, and the process exits with 0 |

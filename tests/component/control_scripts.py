@@ -210,12 +210,37 @@ async def landed_driver_is_lost(f: Flight) -> None:
 
 
 @script
-async def second_stream_takes_over(f: Flight) -> None:
+async def second_stream_is_refused(f: Flight) -> None:
     held = f.put(spec())
     await f.up(held)
     await f.drive(held, "second")
     await f.sleep(3)
     await f.give_back(held)
+    await f.landed()
+
+
+@script
+async def second_stream_continues_after_first_ended(f: Flight) -> None:
+    held = f.put(spec())
+    first = await f.up(held)
+    f.follow(held, "second")
+    await f.sleep(3)
+    first.cancel()
+    await f.sleep(3)
+    await f.give_back(held)
+    await f.landed()
+
+
+@script
+async def driver_repeats_a_call_that_causes_takeovers(f: Flight) -> None:
+    held = f.put(spec(zone("wall", "hover", *WALL)))
+    await f.drive(held)
+    await f.do("Arm", lambda: f.world.service.arm(held))
+    await f.do("Takeoff", lambda: f.world.service.take_off(held, TakeoffArgs(10.0)))
+    for attempt in range(4):
+        await f.goto(held, 0, 33)
+        await f.sleep(2)
+        await f.drive(held, f"retry {attempt}")
     await f.landed()
 
 

@@ -88,7 +88,10 @@ def normalized(state: ControlState, now: float) -> ControlState:
         last_task_id=0,
         mode_changes=min(state.mode_changes, 1),
         preparing=min(state.preparing, 1),
-        missions={key: replace(m, points_done=min(m.points_done, 1), waypoints=0) for key, m in state.missions.items()},
+        missions={
+            key: replace(m, points_done=min(m.points_done, 1), waypoints=0, takeover="", takeovers=0)
+            for key, m in state.missions.items()
+        },
     )
 
 

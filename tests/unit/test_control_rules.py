@@ -184,12 +184,63 @@ def test_return_is_left_to_autopilot_after_three_failures() -> None:
     assert (landed.unattended, landed.attended) == (0, True)
 
 
-def test_closed_second_stream_leaves_no_driver_authority() -> None:
-    second = (events.StreamOpened(2, "a", "A"), events.StreamClosed(2))
-    state, _ = apply_events(*REQUEST_CONTROL, *second)
-    assert state.authority is Authority.SYSTEM
-    armed, _ = apply_events(events.VehicleObserved(ARMED), events.Heartbeat(), state=state)
-    assert armed.authority is Authority.PILOT, "the vehicle was not armed by a driver"
+def test_second_stream_of_a_driver_is_refused_while_the_first_is_open() -> None:
+    state, _ = apply_events(*FLY)
+    refused, actions = apply_events(events.StreamOpened(2, "a", "A"), state=state)
+    assert [(action.code, "another process" in action.reason) for action in actions if isinstance(action, RefuseStream)] == [
+        ("ControlHeld", True)
+    ]  # fmt: skip
+    assert refused == state, "the refused stream changed the state of the first driver"
+    closed, _ = apply_events(events.StreamClosed(2), state=refused)
+    assert closed.drives
+    again, _ = apply_events(
+        events.StreamClosed(1), events.StreamOpened(3, "a", "A"), events.GrantControl(3), state=closed
+    )
+    assert again.drives, "the driver cannot continue after its first stream ended"
+
+
+def demand_hover(state: ControlState, lease_id: int, code: str = "Code") -> ControlState:
+    """Take control for a driver, then demand a takeover with the action `hover`."""
+    state, _ = apply_events(
+        events.StreamOpened(lease_id, "a", "A"),
+        events.GrantControl(lease_id),
+        events.TakeoverDemanded("hover", code, "the leg is too long", ("short",)),
+        state=state,
+    )
+    return state
+
+
+def test_repeated_takeover_for_one_reason_ends_the_mission_with_that_reason() -> None:
+    state, _ = apply_events(*FLY, events.StreamClosed(1))
+    for lease_id in (2, 3):
+        state = demand_hover(state, lease_id)
+        assert state.missions["a"].outcome is None
+        assert state.grace is not None
+    ended = demand_hover(state, 4)
+    outcome = ended.missions["a"].outcome
+    assert outcome is not None
+    assert outcome.kind is OutcomeKind.FAILED
+    assert outcome.reason.startswith("the leg is too long")
+    assert "3 times" in outcome.reason
+    assert ended.returning
+    assert ended.grace is None
+
+
+@pytest.mark.parametrize("between", ["waypoint", "other reason"])
+def test_takeovers_are_not_repeated_after_a_waypoint_or_for_another_reason(between: str) -> None:
+    state, _ = apply_events(*FLY, events.StreamClosed(1))
+    for attempt in range(5):
+        state = demand_hover(state, 2 + attempt, "Code" if between == "waypoint" or attempt % 2 else "Other")
+        if between == "waypoint":
+            state, _ = apply_events(events.WaypointsDone("a", 1 + attempt), state=state)
+    assert state.missions["a"].outcome is None
+
+
+def test_takeovers_on_the_ground_are_not_counted() -> None:
+    state, _ = apply_events(events.GrantChanged(None, DRIVER))
+    for attempt in range(5):
+        state = demand_hover(state, 1 + attempt)
+    assert state.missions["a"].outcome is None
 
 
 @pytest.mark.parametrize("mode", [GUIDED, LOITER])

@@ -53,6 +53,14 @@ async def test_policy_denied_contains_decision() -> None:
     assert "set a timeout" in str(found)
 
 
+async def test_call_that_causes_a_takeover_raises_control_lost() -> None:
+    verdict = Verdict("takeover", None, "InsideExclusionZone", "the target is inside", ("no-fly",), "hover")
+    found = translate(await failed(denied(verdict)), "Goto", "there")
+    assert type(found) is ControlLost
+    assert str(found) == "the target is inside (by no-fly)"
+    assert (found.decision.code, found.decision.policies) == ("InsideExclusionZone", ("no-fly",))
+
+
 @pytest.mark.parametrize(
     ("code", "text", "remedy"),
     [

@@ -101,11 +101,21 @@ Without a maximum, a task that always fails would be restarted forever. After th
 the heartbeats, and the autopilot's own failsafe brings the vehicle home.
 """
 
+MAX_REPEATED_TAKEOVERS = 3
+"""Number of takeovers in flight for one reason, without a further waypoint, at which the mission ends.
+
+After a takeover with the action `hover`, the driver gets control again when it requests control. A driver that then
+repeats the forbidden call would otherwise keep the vehicle in the air until its battery is empty.
+"""
+
 CANCELLED_DESCENT_S = 0.3
 """Seconds for which a cancelled descent continues.
 
 If the driver's stream breaks within this time, the descent is not stopped, because the vehicle must then come down.
 """
+
+SECOND_STREAM = "another process of this component has the control stream; end that process, or wait until it ends"
+"""Reason for refusing a second stream of a driver."""
 
 DESCENTS = frozenset({"Land", "ReturnToLaunch"})
 """Motions that end on the ground."""
@@ -170,7 +180,9 @@ def _on_driver(update: StateUpdate, event: DriverEvent) -> None:
             mission = update.state.missions.get(key)
             if mission is not None and (event.waypoints > mission.waypoints or (event.leg and not mission.leg_flown)):
                 waypoints = max(event.waypoints, mission.waypoints)
-                update.update_mission(mission, waypoints=waypoints, leg_flown=mission.leg_flown or event.leg)
+                takeovers = mission.takeovers if waypoints == mission.waypoints else 0
+                leg_flown = mission.leg_flown or event.leg
+                update.update_mission(mission, waypoints=waypoints, leg_flown=leg_flown, takeovers=takeovers)
                 update.act(SaveJournal())
         case CruiseSpeedSet(speed_mps):
             update.set(speed_mps=speed_mps)
@@ -179,7 +191,11 @@ def _on_driver(update: StateUpdate, event: DriverEvent) -> None:
 
 
 def _open_stream(update: StateUpdate, event: StreamOpened) -> None:
-    """Create a lease for the driver or refuse its stream. A second stream of an instance replaces its first stream."""
+    """Create a lease for the driver or refuse its stream.
+
+    A second stream of the same driver is refused while the first one is open. Otherwise two processes of one driver
+    would take the vehicle from each other without end.
+    """
     mission = update.mission(event.key, event.identity)
     if mission.outcome is not None:
         update.act(RefuseStream(event.lease_id, *ended_refusal(mission.outcome)))
@@ -193,8 +209,8 @@ def _open_stream(update: StateUpdate, event: StreamOpened) -> None:
         update.act(RefuseStream(event.lease_id, "ControlHeld", reason))
         return
     if lease is not None:
-        lost = ControlEvent(StreamState.LOST, reason="another stream of the same instance took over")
-        update.act(SendEvent(lease.lease_id, lost))
+        update.act(RefuseStream(event.lease_id, "ControlHeld", SECOND_STREAM))
+        return
     update.set(lease=ControlLease(event.lease_id, event.key, event.identity))
 
 
@@ -226,7 +242,7 @@ def _return_control(update: StateUpdate, event: ControlReturned) -> None:
     if lease is None or lease.key != event.key or not update.state.drives:
         return
     mission = update.mission(lease.key, lease.identity)
-    mission = update.update_mission(mission, points_done=mission.points_done + 1, waypoints=0)
+    mission = update.update_mission(mission, points_done=mission.points_done + 1, waypoints=0, takeovers=0)
     last = mission.points_done >= event.control_points
     update.set(lease=None, authority=Authority.SYSTEM)
     update.stop_motion(StopKind.ABORTED, "ControlReturned", "control was returned")
@@ -324,10 +340,9 @@ def _hover_after_cancellation(update: StateUpdate) -> None:
 
 def _on_policy(update: StateUpdate, event: PolicyEvent) -> None:
     match event:
-        case TakeoverDemanded(takeover, code, reason, policies):
-            kind, outcome = TAKEOVERS[takeover]
+        case TakeoverDemanded():
             if update.state.authority is not Authority.PILOT:  # policies apply to applications, never to a human pilot
-                update.seize(kind, code, reason, policies, outcome)
+                _take_over(update, event)
         case BrakeDemanded(code, reason, policies):
             update.audit("control", "brake", update.state.controller, reason, code, policies=policies)
             update.stop_motion(StopKind.ABORTED, code, reason, policies)
@@ -342,6 +357,23 @@ def _on_policy(update: StateUpdate, event: PolicyEvent) -> None:
             _change_grant(update, event)
         case _:
             assert_never(event)
+
+
+def _take_over(update: StateUpdate, event: TakeoverDemanded) -> None:
+    """Take the vehicle for a policy. A driver that repeatedly causes the same takeover ends its mission."""
+    kind, outcome = TAKEOVERS[event.takeover]
+    reason = event.reason
+    mission = update.state.mission
+    if outcome is None and mission is not None and update.state.drives and update.state.vehicle.armed:
+        cause = " ".join((event.code, *event.policies))
+        takeovers = mission.takeovers + 1 if mission.takeover == cause else 1
+        update.update_mission(mission, takeover=cause, takeovers=takeovers)
+        update.act(SaveJournal())
+        if takeovers >= MAX_REPEATED_TAKEOVERS:
+            kind = TaskKind.RETURN
+            outcome = OutcomeKind.FAILED
+            reason = f"{reason} (the driver caused this takeover {takeovers} times without a further waypoint)"
+    update.seize(kind, event.code, reason, event.policies, outcome)
 
 
 def _lose_position(update: StateUpdate, reason: str) -> None:

@@ -118,6 +118,9 @@ class Mission:
         flown: True if the vehicle has been airborne for this mission.
         home: Latitude, longitude and altitude above sea level at which the vehicle armed for its first takeoff.
         leg_flown: True if a leg of the driver was completed, or the driver flew by velocity setpoints.
+        takeover: Code and policies of the last takeover after which the driver may continue.
+        takeovers: Number of these takeovers in succession. A further waypoint, or a takeover for another reason, starts
+            the count again.
     """
 
     key: str
@@ -128,6 +131,8 @@ class Mission:
     flown: bool = False
     home: tuple[float, float, float] | None = None
     leg_flown: bool = False
+    takeover: str = ""
+    takeovers: int = 0
 
 
 class StreamState(Enum):
@@ -142,12 +147,23 @@ class StreamState(Enum):
 
 @dataclass(frozen=True, slots=True)
 class ControlEvent:
-    """Event on a GetControl stream."""
+    """Event on a GetControl stream.
+
+    Attributes:
+        state: Kind of the event.
+        control_point: Index of the control point, or of a passenger's next point of interest.
+        reason: Reason in plain text.
+        waypoints_reached: Number of completed waypoints of the control point, or of visited points of interest.
+        code: Code of the verdict with which a policy took the vehicle; empty if no policy did.
+        policies: Policies that demanded the takeover.
+    """
 
     state: StreamState
     control_point: int = 0
     reason: str = ""
     waypoints_reached: int = 0
+    code: str = ""
+    policies: tuple[str, ...] = ()
 
     @property
     def final(self) -> bool:

@@ -114,22 +114,24 @@ class StateUpdate:
             self.act(StopMotion(self.state.motion.motion_id, kind, code, reason, policies))
             self.set(motion=None)
 
-    def lose_lease(self, reason: str) -> None:
-        """Take the lease from a driver that has control or waits for control, and report the reason to the driver."""
+    def lose_lease(self, reason: str, code: str = "", policies: tuple[str, ...] = ()) -> None:
+        """Take the lease from a driver that has control or waits for control, and report the reason to the driver.
+
+        Args:
+            reason: Reason in plain text.
+            code: Code of the verdict, if a policy takes the vehicle.
+            policies: Policies that demand the takeover.
+        """
         lease = self.state.lease
-        self.stop_motion(StopKind.LOST, "ControlLost", reason)
+        self.stop_motion(StopKind.LOST, "ControlLost", reason, policies)
         self.drop_lease()
         if lease is not None:
-            self.act(SendEvent(lease.lease_id, ControlEvent(StreamState.LOST, reason=reason)))
+            lost = ControlEvent(StreamState.LOST, reason=reason, code=code, policies=policies)
+            self.act(SendEvent(lease.lease_id, lost))
         self.act(WakeWaiters())
 
     def drop_lease(self) -> None:
-        """Remove the lease, and end the control authority of the driver.
-
-        If a driver with authority opens a second stream, the lease of the second stream is not granted yet. If the
-        second lease is removed before it is granted, the authority must end too. Otherwise the service would mistake a
-        pilot who arms the vehicle for the driver.
-        """
+        """Remove the lease, and end the control authority of the driver."""
         self.set(lease=None)
         if self.state.authority is Authority.DRIVER:
             self.set(authority=Authority.SYSTEM)
@@ -198,7 +200,7 @@ class StateUpdate:
         """
         mission = self.state.mission
         self.audit("takeover", kind.value, "system", reason, code, policies=policies)
-        self.lose_lease(reason)
+        self.lose_lease(reason, code, policies)
         self.set(authority=Authority.SYSTEM)
         if outcome is not None:
             mission = self.end_mission(mission, outcome, reason)

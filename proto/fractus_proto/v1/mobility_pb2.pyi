@@ -16,7 +16,7 @@ class GetControlRequest(_message.Message):
     def __init__(self) -> None: ...
 
 class ControlEvent(_message.Message):
-    __slots__ = ("state", "control_point", "reason", "waypoints_reached", "task")
+    __slots__ = ("state", "control_point", "reason", "waypoints_reached", "task", "decision")
     class State(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
         __slots__ = ()
         STATE_UNSPECIFIED: _ClassVar[ControlEvent.State]
@@ -36,12 +36,14 @@ class ControlEvent(_message.Message):
     REASON_FIELD_NUMBER: _ClassVar[int]
     WAYPOINTS_REACHED_FIELD_NUMBER: _ClassVar[int]
     TASK_FIELD_NUMBER: _ClassVar[int]
+    DECISION_FIELD_NUMBER: _ClassVar[int]
     state: ControlEvent.State
     control_point: int
     reason: str
     waypoints_reached: int
     task: _types_pb2.ControlPoint
-    def __init__(self, state: _Optional[_Union[ControlEvent.State, str]] = ..., control_point: _Optional[int] = ..., reason: _Optional[str] = ..., waypoints_reached: _Optional[int] = ..., task: _Optional[_Union[_types_pb2.ControlPoint, _Mapping]] = ...) -> None: ...
+    decision: _types_pb2.Decision
+    def __init__(self, state: _Optional[_Union[ControlEvent.State, str]] = ..., control_point: _Optional[int] = ..., reason: _Optional[str] = ..., waypoints_reached: _Optional[int] = ..., task: _Optional[_Union[_types_pb2.ControlPoint, _Mapping]] = ..., decision: _Optional[_Union[_types_pb2.Decision, _Mapping]] = ...) -> None: ...
 
 class ReportProgressRequest(_message.Message):
     __slots__ = ("waypoints",)

@@ -270,6 +270,12 @@ class MobilitySettings:
     stream_event_timeout_s: float = 5.0
     """Longest uninterrupted wait for the next event of a control lease, in seconds. The wait is then repeated."""
 
+    second_stream_wait_s: float = 6.0
+    """Seconds for which a second control stream of a driver waits for the end of the first one before it is refused.
+
+    It is longer than the 4 s after which the gRPC server disconnects a client that does not reply to pings.
+    """
+
     telemetry_min_interval_s: float = 0.05
     """Shortest interval of a telemetry stream."""
 

@@ -7,6 +7,7 @@ from contextlib import aclosing
 
 from fractus_core.control import ControlEvent, OutcomeKind, StreamState
 from fractus_core.control.events import PassengerBoarded, TransitRequested
+from fractus_core.control.machine import SECOND_STREAM
 from fractus_core.control.state import ended_refusal
 
 from fractus_services.errors import PolicyDenied, PreconditionFailed
@@ -43,6 +44,9 @@ class ControlStreams:
         control = self._control
         if grant.spec.class_ != "driver":
             raise PolicyDenied("NotADriver", "a passenger cannot get control; only a driver can")
+        async with aclosing(self._until_alone(grant)) as waiting:
+            async for reason in waiting:
+                yield ControlEvent(StreamState.WAITING, control.mission(grant).points_done, reason)
         lease = control.open_lease(grant)
         try:
             while control.lease is lease and not control.state.granted:
@@ -63,6 +67,21 @@ class ControlStreams:
                     return
         finally:
             control.close_lease(lease)
+
+    async def _until_alone(self, grant: ActiveGrant) -> AsyncGenerator[str, None]:
+        """Wait until no other stream of this driver is open, at most `second_stream_wait_s`. Yield the reason once.
+
+        The other stream may belong to a connection whose client no longer exists. The pings of the gRPC server then close
+        the connection, and the driver continues. The stream of a client that exists stays open.
+        """
+        control = self._control
+        give_up = control.autopilot.now + SETTINGS.second_stream_wait_s
+        reported = False
+        while control.lease is not None and control.lease.key == grant.key and control.autopilot.now < give_up:
+            if not reported:
+                reported = True
+                yield SECOND_STREAM
+            await control.changes.wait(SETTINGS.stream_check_interval_s)
 
     async def _until_ready(self, lease: Lease) -> AsyncGenerator[str, None]:
         """Yield each new reason to wait until the driver can get control."""

@@ -134,6 +134,8 @@ def control_event(event: ControlEvent, points: Sequence[ControlPoint]) -> mobili
     )
     if event.state is StreamState.GRANTED and event.control_point < len(points):
         message.task.CopyFrom(_task(points[event.control_point]))
+    if event.code:
+        message.decision.CopyFrom(decision(Verdict("takeover", None, event.code, event.reason, event.policies)))
     return message
 
 

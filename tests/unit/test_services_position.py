@@ -18,8 +18,16 @@ from fractus_services.mobility.rpc.telemetry import telemetry_of
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from virtual_time import Loop
 
+HEALTHY = 831
+"""Flags of EKF_STATUS_REPORT of a real ArduCopter that has a position."""
+
 
 def place(vehicle: Vehicle, lat: float, now: float) -> None:
+    vehicle.take(message("EKF_STATUS_REPORT", flags=HEALTHY), now)
+    report_position(vehicle, lat, now)
+
+
+def report_position(vehicle: Vehicle, lat: float, now: float) -> None:
     vehicle.take(message("GLOBAL_POSITION_INT", lat=round(lat * 1e7), lon=229500000, relative_alt=20_000, vx=300), now)
 
 
@@ -48,22 +56,31 @@ def test_invalid_coordinates_are_ignored(lat_e7: int, lon_e7: int) -> None:
     assert (vehicle.lat, vehicle.home, vehicle.position_at) == (None, None, -math.inf)
 
 
+def test_position_is_unknown_until_estimator_has_reported() -> None:
+    vehicle = Vehicle(stack=ARDUCOPTER)
+    fix(vehicle, 3)
+    report_position(vehicle, 39.0, 1.0)
+    assert vehicle.lat is None
+    vehicle.take(message("EKF_STATUS_REPORT", flags=HEALTHY), 1.1)
+    report_position(vehicle, 39.0, 1.2)
+    assert vehicle.lat == 39.0
+
+
 def test_position_is_trusted_again_only_when_a_new_position_arrives() -> None:
     def estimator(flags: int, now: float) -> None:
         vehicle.take(message("EKF_STATUS_REPORT", flags=flags), now)
 
-    healthy = 831
     vehicle = Vehicle(stack=ARDUCOPTER)
     fix(vehicle, 3)
-    estimator(healthy, 0.0)
     place(vehicle, 39.0, 0.5)
-    estimator(healthy | mavlink.EKF_GPS_GLITCHING, 1.0)
+    estimator(HEALTHY | mavlink.EKF_GPS_GLITCHING, 1.0)
     assert "GPS glitch" in vehicle.position_problem
     for second in range(2, 9):
-        estimator(healthy, float(second))
+        estimator(HEALTHY, float(second))
     assert vehicle.position_problem, "the known position is still that from before the glitch"
     vehicle.take(message("GPS_RAW_INT", fix_type=3, h_acc=600), 9.0)
-    place(vehicle, 39.0, 9.1)
+    estimator(HEALTHY, 9.0)
+    report_position(vehicle, 39.0, 9.1)
     assert (vehicle.position_problem, vehicle.position_at) == ("", 9.1)
 
 

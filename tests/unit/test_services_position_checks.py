@@ -30,6 +30,8 @@ class Flight:
         self.north_mps = 0.0
         self.amsl_m = 100.0
         self.gps_error_m = 0.0
+        self.gps_accuracy_m = 0.5
+        self.fixes = 0
         self.boot_s = 100.0
         self.send(2.0)
 
@@ -50,10 +52,15 @@ class Flight:
     def status(self) -> None:
         self.vehicle.take(message("EKF_STATUS_REPORT", flags=self.flags, **self.variances), self.now)
 
-    def gps(self) -> None:
+    def gps(self, *, repeated: bool = False) -> None:
+        """Send a GPS position, of the same fix as the last one if `repeated` is True."""
         lat, lon = FRAME.latlon(0.0, self.north_m + self.gps_error_m)
         place = {"lat": round(lat * 1e7), "lon": round(lon * 1e7)}
-        self.vehicle.take(message("GPS_RAW_INT", fix_type=3, h_acc=500, **place), self.now)
+        if not repeated:
+            self.fixes += 1
+        accuracy_mm = round(self.gps_accuracy_m * 1e3)
+        fix = message("GPS_RAW_INT", fix_type=3, time_usec=self.fixes * 200_000, h_acc=accuracy_mm, **place)
+        self.vehicle.take(fix, self.now)
 
     def send(self, duration_s: float, *, lost: bool = False) -> None:
         """Fly on for a duration. If the messages are lost, none of them arrives."""
@@ -148,13 +155,115 @@ def test_position_stays_unknown_if_it_jumped_while_link_was_lost_during_glitch()
     assert not flight.known
 
 
-def test_position_is_known_after_landing_at_place_to_which_it_jumped() -> None:
+def test_position_stays_unknown_after_landing_at_place_to_which_it_jumped_until_vehicle_restarts() -> None:
     flight = Flight()
     flight.north_m += 33.0
     flight.send(10.0)
     flight.vehicle.armed = False
+    flight.send(600.0)
+    assert not flight.known
+    assert "33 m from where the vehicle flew" in flight.vehicle.position_problem
+    flight.boot_s = -flight.now
     flight.send(QUIET_S + 0.5)
     assert flight.known
+
+
+def test_position_is_known_after_landing_if_it_returns_on_ground() -> None:
+    flight = Flight()
+    flight.north_m += 33.0
+    flight.send(10.0)
+    flight.vehicle.armed = False
+    flight.send(10.0, lost=True)
+    flight.north_m -= 33.0
+    flight.send(QUIET_S + 0.5)
+    assert flight.known
+
+
+def test_position_stays_unknown_if_it_jumps_on_ground_during_glitch_that_began_in_flight() -> None:
+    flight = Flight()
+    flight.flags = GLITCHING
+    flight.send(5.0)
+    flight.vehicle.armed = False
+    flight.send(5.0)
+    flight.north_m += 33.0
+    flight.flags = READY
+    flight.send(10.0)
+    assert not flight.known
+
+
+@pytest.mark.parametrize("lost_s", [1.5, 3.0, 8.0])
+def test_position_is_unknown_after_interruption_until_estimator_reports(lost_s: float) -> None:
+    flight = Flight()
+    flight.send(lost_s, lost=True)
+    for _ in range(10):
+        flight.tick += 1
+        flight.gps()
+        flight.position()
+        assert not flight.known
+    flight.status()
+    flight.position()
+    flight.tick += 1
+    flight.position()
+    assert flight.known
+
+
+def test_report_without_position_does_not_hide_glitch() -> None:
+    flight = Flight()
+    flight.flags = GLITCHING & ~READY
+    flight.status()
+    flight.flags = READY
+    flight.status()
+    flight.send(QUIET_S - 0.1)
+    assert not flight.known
+
+
+def test_report_without_position_does_not_end_glitch() -> None:
+    flight = Flight()
+    flight.flags = GLITCHING
+    flight.status()
+    flight.flags = 167
+    flight.send(10.0)
+    flight.flags = READY
+    flight.status()
+    flight.send(QUIET_S - 0.1)
+    assert not flight.known
+    flight.send(1.0)
+    assert flight.known
+
+
+def test_flight_during_interruption_is_no_lasting_displacement() -> None:
+    flight = Flight()
+    flight.flags = GLITCHING
+    flight.send(1.0)
+    flight.north_m += 40.0  # It accelerated, flew and stopped again.
+    flight.send(12.0, lost=True)
+    flight.flags = READY
+    flight.send(QUIET_S + 1.5)
+    assert flight.known
+
+
+def test_glitch_reported_first_after_long_interruption_is_no_displacement() -> None:
+    flight = Flight()
+    flight.north_m += 300.0
+    flight.send(60.0, lost=True)
+    flight.flags = GLITCHING
+    flight.status()
+    flight.send(5.0)
+    flight.flags = READY
+    flight.send(QUIET_S + 1.5)
+    assert flight.known
+
+
+@pytest.mark.parametrize(("pace", "known"), [(1.0, False), (4.0, True)])
+def test_quiet_time_is_measured_on_clock_of_vehicle(pace: float, known: bool) -> None:
+    flight = Flight()
+    flight.vehicle.position_checks.pace = pace
+    flight.flags = GLITCHING
+    flight.status()
+    flight.flags = READY
+    flight.status()
+    flight.send(QUIET_S / 4 + 0.2)
+    assert flight.known is known
 
 
 def test_altitude_jump_makes_position_unknown() -> None:
@@ -263,6 +372,35 @@ def test_position_is_unknown_if_two_consecutive_gps_positions_disagree_with_esti
     flight.gps()
     assert not flight.known
     assert "12 m apart" in flight.vehicle.position_problem
+
+
+def test_fix_that_is_reported_again_is_no_second_disagreement() -> None:
+    flight = Flight()
+    flight.gps_error_m = 12.0
+    flight.gps()
+    flight.gps(repeated=True)
+    assert flight.known
+    flight.gps()
+    assert not flight.known
+
+
+def test_receiver_that_reports_large_error_does_not_hide_disagreement() -> None:
+    flight = Flight()
+    flight.gps_error_m = 20.0
+    flight.gps_accuracy_m = 9.0
+    flight.gps()
+    flight.gps()
+    assert not flight.known
+
+
+def test_receiver_that_reports_large_error_does_not_hide_jump() -> None:
+    flight = Flight()
+    flight.gps_accuracy_m = 9.0
+    flight.gps()
+    flight.north_m += 20.0
+    flight.position()
+    flight.send(0.05)
+    assert not flight.known
 
 
 @pytest.mark.parametrize("lag_s", [0.0, 0.25, 0.9])

@@ -32,7 +32,7 @@ def test_armed_vehicle_without_position_counts_as_airborne() -> None:
 
 @pytest.mark.parametrize(("vx", "forward_mps2"), [((100, 12), 2.4), ((600, -10), -2.0), ((300, 0), 0.0)])
 def test_forward_acceleration_is_derived_from_velocities(vx: tuple[int, int], forward_mps2: float) -> None:
-    vehicle = Vehicle(stack=ARDUCOPTER, located=True, gps_at=0.0)
+    vehicle = Vehicle(stack=ARDUCOPTER, located=True, gps_at=0.0, estimated=True, estimated_at=0.0)
     assert vehicle.forward_mps2 is None
     for i in range(12):
         position = message("GLOBAL_POSITION_INT", time_boot_ms=i * 50, lat=1, lon=1, vx=vx[0] + i * vx[1])

@@ -266,6 +266,7 @@ class AutopilotLink:
             self.timing.take_reply(incoming.integer("tc1"), incoming.integer("ts1"), at)
             if self._restarted():
                 return
+        self.vehicle.position_checks.pace = self.timing.pace
         self.vehicle.take(incoming, at)
         self._subscriptions.take(incoming)
         if incoming.name == "HEARTBEAT":

@@ -319,6 +319,8 @@ class MavlinkAutopilot(AutopilotLink):
     def _lost(self) -> None:
         self.vehicle.gimbal_measured = self.vehicle.gimbal_limits = None
         self.vehicle.identity_problem = ""
+        # The vehicle on the next connection may have restarted, or its estimator may have accepted another position meanwhile.
+        self.vehicle.estimated_at = -math.inf
         # Let the first heartbeat of a new connection report stopped motors: the drone may have landed meanwhile.
         self.vehicle.stopping_at = -math.inf
         for part in (self._rates, self._home_monitor, self._acknowledgements, self.vehicle_parameters):

@@ -14,7 +14,7 @@ from fractus_core.geo import LocalFrame
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 QUIET_S = 5.0
-"""Seconds without a sign of a wrong position after which the position is trusted again."""
+"""Seconds of the vehicle's clock without a sign of a wrong position after which the position is trusted again."""
 
 DEFAULT_VARIANCE_LIMIT = 0.8
 """Default of FS_EKF_THRESH. At 1, the estimator rejects its measurements."""
@@ -28,6 +28,12 @@ VARIANCES = {
 
 ERROR_FACTOR = 3.0
 """Multiple of the position error (1 sigma) that two correct positions may be apart."""
+
+MAX_TOLERATED_ERROR_M = 2.0
+"""Largest position error (1 sigma) that increases the permitted distances.
+
+The receiver that may be wrong reports the error. Without this limit, a receiver that reports a large error could not be found wrong.
+"""
 
 JUMP_M = 1.0
 """Distance by which the estimator may correct the position, in addition to the position error, without a jump."""
@@ -53,6 +59,16 @@ MAX_ACCEL_MPS2 = 10.0
 
 MAX_SPEED_MPS = 30.0
 """Largest mean speed between two positions."""
+
+GAP_S = 1.0
+"""Seconds between two positions up to which the velocities give the distance that was flown."""
+
+GAP_ACCEL_MPS2 = 1.5
+"""Mean acceleration of a copter that starts and stops between two positions.
+
+It bounds the distance that the velocities before and after a longer interruption do not show. The service stops a drone whose
+position is not trusted, so a larger mean acceleration is not expected.
+"""
 
 PATH_S = 1.0
 """Seconds of the vehicle's clock for which positions are kept. The position of the GPS is older than the estimate."""
@@ -93,15 +109,35 @@ class ReportedPosition:
         return LocalFrame(self.lat, self.lon).xy(other.lat, other.lon)
 
 
+@dataclass(frozen=True, slots=True)
+class GpsFix:
+    """Position that a GPS receiver reported.
+
+    Attributes:
+        message: Name of the MAVLink message.
+        lat, lon: Degrees.
+        error_m: Position error, 1 sigma.
+        fix_us: Time of the fix on the receiver's clock; 0 if it is unknown.
+    """
+
+    message: str
+    lat: float
+    lon: float
+    error_m: float
+    fix_us: int
+
+
 class PositionChecks:
     """Collects signs of a wrong position. Times are monotonic seconds unless they are stated to be on the vehicle's clock.
 
     Attributes:
         variance_limit: FS_EKF_THRESH of the vehicle: a variance of this size or larger is a sign.
+        pace: Seconds of the vehicle's clock per second of real time.
     """
 
     def __init__(self) -> None:
         self.variance_limit = DEFAULT_VARIANCE_LIMIT
+        self.pace = 1.0
         self._path: deque[ReportedPosition] = deque()
         self._path_at = -math.inf
         self._estimator_problem = ""
@@ -110,7 +146,9 @@ class PositionChecks:
         self._trusted: ReportedPosition | None = None
         self._flown_m = (0.0, 0.0)
         self._climbed_m = 0.0
+        self._unseen_m = 0.0
         self._disagreements = 0
+        self._fix_us = 0
         self._reason = ""
         self._seen_at = -math.inf
 
@@ -123,7 +161,7 @@ class PositionChecks:
         lasting = self._estimator_problem or self._gps_problem or self._displacement
         if lasting:
             self._see(lasting, now)
-        return self._reason if now - self._seen_at < QUIET_S else ""
+        return self._reason if now - self._seen_at < QUIET_S / self.pace else ""
 
     def _see(self, reason: str, now: float) -> None:
         self._reason = reason
@@ -133,18 +171,28 @@ class PositionChecks:
         """Use the vehicle's FS_EKF_THRESH. Values that switch the failsafe off, or on late, do not apply."""
         self.variance_limit = limit if 0.0 < limit <= 1.0 else DEFAULT_VARIANCE_LIMIT
 
-    def take_estimator(self, flags: int, variances: dict[str, float], now: float) -> None:
-        """Process EKF_STATUS_REPORT of an estimator that has an absolute position."""
+    def take_estimator(self, flags: int, variances: dict[str, float], now: float, *, positioned: bool) -> None:
+        """Process EKF_STATUS_REPORT.
+
+        Args:
+            flags: Flags of the estimator.
+            variances: Variances by their names in the message.
+            now: Time of the report.
+            positioned: True if the estimator has an absolute position. A report without one clears no earlier sign. Its variances do
+                not count, because they are large during each start.
+        """
         self.problem(now)  # The previous report holds until now.
         excessive = [VARIANCES[name] for name, value in variances.items() if not value < self.variance_limit]
-        self._estimator_problem = ""
+        problem = ""
         if flags & mavlink.EKF_GPS_GLITCHING:
-            self._estimator_problem = "the autopilot reports a GPS glitch (EKF_STATUS_REPORT)"
-        elif excessive:
-            self._estimator_problem = (
+            problem = "the autopilot reports a GPS glitch (EKF_STATUS_REPORT)"
+        elif excessive and positioned:
+            problem = (
                 f"the estimator's variance of {', '.join(excessive)} is {self.variance_limit:g} or larger"
                 " (EKF_STATUS_REPORT, FS_EKF_THRESH)"
             )
+        if problem or positioned:
+            self._estimator_problem = problem
 
     def take_position(self, reported: ReportedPosition, error_m: float, now: float, *, moves: bool) -> None:
         """Compare a position with the previous one.
@@ -155,13 +203,17 @@ class PositionChecks:
             now: Time of the position.
             moves: True if the motors run. On the ground, the estimator corrects its position and altitude by resets.
         """
+        error_m = min(error_m, MAX_TOLERATED_ERROR_M)
         if self._path:
             last = self._path[-1]
             elapsed_s = reported.boot_s - last.boot_s
             if elapsed_s == 0.0:
                 return  # The same position again.
             if elapsed_s < 0.0:
-                self._path.clear()  # The vehicle has restarted. Overtaken positions are dropped before.
+                # The vehicle has restarted. Overtaken positions are dropped before.
+                self._path.clear()
+                self._trusted = None
+                self._displacement = ""
             else:
                 if moves:
                     self._look_for_jump(last, reported, elapsed_s, error_m, now)
@@ -181,26 +233,33 @@ class PositionChecks:
         *,
         moves: bool,
     ) -> None:
-        """While a flying vehicle's position is not trusted, compare it with the position that follows from the velocities."""
-        if not moves or not self.problem(now):
+        """While the position is not trusted, compare it with the position that follows from the velocities.
+
+        The comparison begins in flight. It continues on the ground, because the vehicle could otherwise arm at a wrong position.
+        """
+        if not self.problem(now):
             self._trusted = None
-            self._displacement = ""
             return
         if self._trusted is None:
+            if not moves:
+                return
             self._trusted = last
             self._flown_m = (0.0, 0.0)
             self._climbed_m = 0.0
+            self._unseen_m = 0.0
         self._flown_m = (
             self._flown_m[0] + (last.east_mps + reported.east_mps) / 2 * elapsed_s,
             self._flown_m[1] + (last.north_mps + reported.north_mps) / 2 * elapsed_s,
         )
         self._climbed_m -= (last.down_mps + reported.down_mps) / 2 * elapsed_s
+        if moves:
+            self._unseen_m += GAP_ACCEL_MPS2 * max(elapsed_s - GAP_S, 0.0) ** 2 / 4
         away_m = math.dist(self._trusted.offset_m(reported), self._flown_m)
         off_m = abs(reported.amsl_m - self._trusted.amsl_m - self._climbed_m)
         self._displacement = ""
-        if away_m > RETURNED_M + ERROR_FACTOR * error_m:
+        if away_m > RETURNED_M + ERROR_FACTOR * error_m + self._unseen_m:
             self._displacement = f"the reported position is {away_m:.0f} m from where the vehicle flew"
-        elif off_m > RETURNED_M:
+        elif off_m > RETURNED_M + self._unseen_m:
             self._displacement = f"the reported altitude is {off_m:.0f} m from where the vehicle flew"
 
     def _look_for_jump(
@@ -213,18 +272,20 @@ class PositionChecks:
         if climbed_m > _reach_m(abs(last.down_mps), abs(reported.down_mps), elapsed_s) + ALTITUDE_JUMP_M:
             self._see(f"the reported altitude jumped by {climbed_m:.0f} m within {elapsed_s:.2f} s", now)
 
-    def take_gps(self, lat: float, lon: float, error_m: float, now: float) -> None:
-        """Compare the position of the GPS with the estimator's positions of the last second."""
+    def take_gps(self, fix: GpsFix, now: float) -> None:
+        """Compare a position of the GPS with the estimator's positions of the last second. A repeated fix is no new sign."""
         self.problem(now)
-        if not self._path or now - self._path_at > PATH_S:
+        repeated = fix.fix_us != 0 and fix.fix_us == self._fix_us
+        self._fix_us = fix.fix_us
+        if repeated or not self._path or now - self._path_at > PATH_S / self.pace:
             return  # There is nothing to compare, so an earlier disagreement remains.
-        frame = LocalFrame(lat, lon)
+        frame = LocalFrame(fix.lat, fix.lon)
         apart_m = min(math.hypot(*frame.xy(known.lat, known.lon)) for known in self._path)
-        agrees = apart_m <= DISAGREEMENT_M + ERROR_FACTOR * error_m
+        agrees = apart_m <= DISAGREEMENT_M + ERROR_FACTOR * min(fix.error_m, MAX_TOLERATED_ERROR_M)
         self._disagreements = 0 if agrees else self._disagreements + 1
         self._gps_problem = ""
         if self._disagreements >= DISAGREEMENTS:
-            self._gps_problem = f"GPS_RAW_INT and GLOBAL_POSITION_INT are {apart_m:.0f} m apart"
+            self._gps_problem = f"{fix.message} and GLOBAL_POSITION_INT are {apart_m:.0f} m apart"
 
 
 def _reach_m(first_mps: float, second_mps: float, elapsed_s: float) -> float:

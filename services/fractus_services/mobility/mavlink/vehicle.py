@@ -10,10 +10,10 @@ from fractus_core.policy.decision_types import Home
 from fractus_runtime.mavlink_codec import Message
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from fractus_services.mobility.autopilot import DEFAULT_ERROR_M, VELOCITY_HISTORY_S, VehicleState
+from fractus_services.mobility.autopilot import DEFAULT_ERROR_M, MAX_POSITION_AGE_S, VELOCITY_HISTORY_S, VehicleState
 from fractus_services.mobility.mavlink.flight_stack import FlightStack
 from fractus_services.mobility.mavlink.gimbal import attitude_of
-from fractus_services.mobility.mavlink.position_checks import VARIANCES, PositionChecks, ReportedPosition
+from fractus_services.mobility.mavlink.position_checks import VARIANCES, GpsFix, PositionChecks, ReportedPosition
 
 log = logging.getLogger(__name__)
 
@@ -32,7 +32,7 @@ positions are ignored.
 """
 
 STATUS_MAX_AGE_S = 10.0
-"""Maximum age of the estimator and GPS status.
+"""Maximum age of the estimator and GPS status, in seconds of the vehicle's clock.
 
 The autopilot sends them at least once per second. After a longer silence the estimator may be using dead reckoning.
 """
@@ -48,10 +48,13 @@ have landed.
 """
 
 TRUSTED_AGAIN_S = 30.0
-"""Seconds for which the position must be trusted before the next sign of a wrong position counts as another problem."""
+"""Time for which the position must be trusted before the next sign of a wrong position counts as another problem.
+
+It is in seconds of the vehicle's clock.
+"""
 
 PATH_KEPT_S = 12.0
-"""Time without a position after which the recorded path counts as lost.
+"""Time without a position after which the recorded path counts as lost, in seconds of the vehicle's clock.
 
 ArduCopter discards the path after 15 s and reports that once. The limit is lower, because the report may be lost.
 """
@@ -72,6 +75,8 @@ class Vehicle(VehicleState):
         stopping_at: Time since which all heartbeats have reported stopped motors in flight; infinite if the last one did not.
         gimbal_limits: Smallest and largest pitch and yaw of the gimbal, degrees; None until they are reported.
         position_checks: Signs of a wrong position.
+        reported_at: Time of the last position message, trusted or not.
+        resumed_at: Time of the first position message after an interruption.
     """
 
     stack: FlightStack = field(kw_only=True)
@@ -84,6 +89,21 @@ class Vehicle(VehicleState):
     started_at: float = -math.inf
     stopping_at: float = math.inf
     position_checks: PositionChecks = field(default_factory=PositionChecks)
+    reported_at: float = -math.inf
+    resumed_at: float = -math.inf
+
+    @property
+    def pace(self) -> float:
+        """Seconds of the vehicle's clock per second of real time."""
+        return self.position_checks.pace
+
+    def estimator_positioned(self, now: float) -> bool:
+        """Return True if the estimator has reported an absolute position recently, and not only before an interruption.
+
+        Without such a report, the estimator may be using dead reckoning even with a GPS fix, or may have accepted a wrong position.
+        """
+        recent = now - self.estimated_at <= STATUS_MAX_AGE_S / self.pace
+        return self.estimated and recent and self.estimated_at >= self.resumed_at - MAX_POSITION_AGE_S
 
     def take(self, message: Message, now: float) -> None:
         """Update the state from a message."""
@@ -131,7 +151,7 @@ def _check_position(vehicle: Vehicle, now: float) -> bool:
         return True
     if not vehicle.position_problem:
         # Signs that recur soon belong to one problem. Otherwise the drone would wait for its end until the battery is empty.
-        if now - vehicle.position_trusted_at > TRUSTED_AGAIN_S:
+        if now - vehicle.position_trusted_at > TRUSTED_AGAIN_S / vehicle.pace:
             vehicle.position_problem_at = now
         log.warning("position: no longer trusted (reason=%s)", problem)
     vehicle.position_problem = problem
@@ -146,13 +166,13 @@ def _position(vehicle: Vehicle, message: Message, now: float) -> None:
     amsl_m = message.integer("alt") / 1e3
     north_mps, east_mps, down_mps = (message.integer(name) / 100 for name in ("vx", "vy", "vz"))
     reported = ReportedPosition(boot_s, *place, amsl_m, north_mps, east_mps, down_mps)
+    if now - vehicle.reported_at > MAX_POSITION_AGE_S:
+        vehicle.resumed_at = now
+    vehicle.reported_at = now
     vehicle.position_checks.take_position(reported, vehicle.position_error_m, now, moves=vehicle.armed)
     plausible = _check_position(vehicle, now)
-    # Even with a GPS fix the estimator may be using dead reckoning, and its position drifts.
-    reports_estimator = math.isfinite(vehicle.estimated_at)
-    recent_estimate = vehicle.estimated and now - vehicle.estimated_at <= STATUS_MAX_AGE_S
-    dead_reckoning = reports_estimator and not recent_estimate
-    if dead_reckoning or not vehicle.located or now - vehicle.gps_at > STATUS_MAX_AGE_S or not plausible:
+    located = vehicle.located and now - vehicle.gps_at <= STATUS_MAX_AGE_S / vehicle.pace
+    if not plausible or not located or not vehicle.estimator_positioned(now):
         return
     if vehicle.position_problem:
         log.info("position: trusted again")
@@ -253,12 +273,12 @@ def _estimator(vehicle: Vehicle, message: Message, now: float) -> None:
     vehicle.estimated = message.integer("flags") & _POSITIONED == _POSITIONED
     # A service that starts in flight received no earlier positions. It assumes that a vehicle with a position has kept its path.
     first_estimate = vehicle.positioned_at == -math.inf and vehicle.estimated
-    lost = vehicle.armed and not first_estimate and now - vehicle.positioned_at > PATH_KEPT_S
+    lost = vehicle.armed and not first_estimate and now - vehicle.positioned_at > PATH_KEPT_S / vehicle.pace
     vehicle.path_lost = vehicle.path_lost or lost
     if vehicle.estimated:
         vehicle.positioned_at = now
-        variances = {name: message.real(name) for name in VARIANCES}
-        vehicle.position_checks.take_estimator(message.integer("flags"), variances, now)
+    variances = {name: message.real(name) for name in VARIANCES}
+    vehicle.position_checks.take_estimator(message.integer("flags"), variances, now, positioned=vehicle.estimated)
     vehicle.estimated_at = now
     _check_position(vehicle, now)
 
@@ -276,7 +296,8 @@ def _gps(vehicle: Vehicle, message: Message, now: float) -> None:
     vehicle.position_error_m = max(error, MIN_ERROR_M)
     place = _place(message.integer("lat"), message.integer("lon"))
     if place is not None:
-        vehicle.position_checks.take_gps(*place, vehicle.position_error_m, now)
+        fix = GpsFix(message.name, *place, vehicle.position_error_m, message.integer("time_usec"))
+        vehicle.position_checks.take_gps(fix, now)
         _check_position(vehicle, now)
 
 

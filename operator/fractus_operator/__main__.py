@@ -88,7 +88,7 @@ async def run(settings: Settings, stop: asyncio.Event | None = None) -> None:
         services = ServiceRollout(store, cache, conditions, time.monotonic)
         orphaned_pods = OrphanedPods(store, cache)
         links = LinkEventRecorder(store, _now)
-        background: list[Coroutine[Any, Any, None]] = [
+        parts: list[Coroutine[Any, Any, None]] = [
             *(informer.run() for informer in (*cache.informers, links.informer)),
             *(queue.run() for queue in (*work_queues(store, cache, csr, conditions), links.work_queue)),
             run_periodically("node liveness", liveness.step, node_liveness.LIVENESS_PERIOD_S),
@@ -97,7 +97,11 @@ async def run(settings: Settings, stop: asyncio.Event | None = None) -> None:
             # Shielded, because the last writes of cancelled parts need the Lease.
             _await(asyncio.shield(election)),
         ]
-        await _run_together(handlers.operator(applications, cache.oldest_contact_s, settings.health, stop), background)
+        background = [asyncio.create_task(part) for part in parts]
+        kopf_operator = handlers.operator(
+            applications, cache.oldest_contact_s, settings.health, stop, lambda: _end(background)
+        )
+        await _run_together(kopf_operator, background)
     finally:
         # The Lease is released last. Until here, writes may be in progress, and no other operator may lead.
         election.cancel()
@@ -179,17 +183,24 @@ def work_queues(
     return [*queues, *NodeGrantsController(store, cache).work_queues()]
 
 
-async def _run_together(main: Coroutine[Any, Any, None], background: list[Coroutine[Any, Any, None]]) -> None:
+async def _run_together(main: Coroutine[Any, Any, None], background: list[asyncio.Task[None]]) -> None:
     """Run the main part until it ends. A failed background part ends all."""
-    tasks = [asyncio.create_task(part) for part in (main, *background)]
+    running = asyncio.create_task(main)
     try:
-        done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
-        for task in done:
+        done, _ = await asyncio.wait([running, *background], return_when=asyncio.FIRST_COMPLETED)
+        ended = [task for task in done if not task.cancelled()]
+        for task in ended:
             task.result()
+        if not ended:
+            await running  # it is stopping, and has cancelled the background
     finally:
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
+        await _end([running, *background])
+
+
+async def _end(tasks: list[asyncio.Task[None]]) -> None:
+    for task in tasks:
+        task.cancel()
+    await asyncio.gather(*tasks, return_exceptions=True)
 
 
 def main() -> int:

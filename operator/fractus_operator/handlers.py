@@ -7,7 +7,7 @@ import contextlib
 import dataclasses
 import os
 import ssl
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from typing import Any, Protocol, cast
 
 import kopf
@@ -30,7 +30,11 @@ class Controller(Protocol):
 
 
 async def operator(
-    applications: Controller, oldest_contact_s: Callable[[], float], health: str, stop: asyncio.Event | None
+    applications: Controller,
+    oldest_contact_s: Callable[[], float],
+    health: str,
+    stop: asyncio.Event | None,
+    end_background: Callable[[], Awaitable[None]],
 ) -> None:
     """Run kopf with the handlers of Applications until it is stopped.
 
@@ -39,11 +43,19 @@ async def operator(
         oldest_contact_s: Returns the seconds since the last message of the watch that has been silent for longest.
         health: URL of the liveness endpoint.
         stop: Event that stops kopf. Signals stop it as well.
+        end_background: Ends all other tasks. Called after the last handler has ended. If other tasks still run then,
+            kopf waits five seconds for them, and no other operator can become the leader in this time.
     """
     registry = kopf.OperatorRegistry()
     settings = kopf.OperatorSettings()
     _configure(settings)
     _register(registry, applications, oldest_contact_s)
+
+    @kopf.on.cleanup(registry=registry, id="end_background")
+    async def cleanup(**_: object) -> None:
+        """End all other tasks."""
+        await end_background()
+
     await kopf.operator(
         registry=registry, settings=settings, clusterwide=True, liveness_endpoint=health, stop_flag=stop
     )

@@ -9,9 +9,11 @@ from typing import Any
 
 import kopf
 import pytest
-from fractus_operator.handlers import InMemoryProgress, KopfConnection
+from fractus_operator.handlers import InMemoryProgress, KopfConnection, operator
 from kopf._core.actions.execution import Outcome
 from kopf._core.actions.progression import State
+from kopf._core.engines.activities import run_activity
+from kopf._core.intents.causes import Activity
 
 TEARDOWN = kopf.HandlerId("teardown")
 NOTE = "kopf.fractus.dev/teardown"
@@ -77,3 +79,27 @@ def test_kopf_accepts_api_servers_without_authority_key_identifier(monkeypatch: 
     context = KopfConnection(server="https://127.0.0.1:6443").as_ssl_context()
     assert not context.verify_flags & ssl.VERIFY_X509_STRICT
     assert context.verify_mode is ssl.CERT_REQUIRED
+
+
+async def test_other_tasks_end_after_last_handler_of_kopf(monkeypatch: pytest.MonkeyPatch) -> None:
+    """kopf waits five seconds for tasks that it did not start. Meanwhile no operator handles Applications."""
+    ended: list[str] = []
+
+    async def end_background() -> None:
+        ended.append("background")
+
+    async def stop_kopf(*, registry: kopf.OperatorRegistry, settings: kopf.OperatorSettings, **_: object) -> None:
+        """End kopf: its last action before it waits for other tasks is the cleanup."""
+        await run_activity(
+            lifecycle=kopf.lifecycles.all_at_once,
+            registry=registry,
+            settings=settings,
+            activity=Activity.CLEANUP,
+            indices={},  # type: ignore[arg-type]
+            memo=None,
+        )
+
+    monkeypatch.setattr(kopf, "operator", stop_kopf)
+    controller: Any = SimpleNamespace()
+    await operator(controller, lambda: 0.0, "", None, end_background)
+    assert ended == ["background"]

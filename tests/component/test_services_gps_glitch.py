@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import math
 from collections.abc import AsyncGenerator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -14,8 +15,10 @@ from closed_loop import Account, Drone, Oracle, Sky
 from fractus_core.policy.decision_types import TakeoffArgs
 from fractus_services.errors import AutopilotError, Refused, Unavailable
 from fractus_services.grant_files import ActiveGrant
+from fractus_services.mobility.flight import return_to_launch
 from fractus_services.mobility.rpc.telemetry import located
-from mobility_world import goto, spec, zone
+from fractus_services.mobility.settings import SETTINGS
+from mobility_world import end, goto, spec, zone
 from sky_drone import fly, ready, until
 
 SOUTH = shapely.box(-60.0, -80.0, 190.0, -23.0)
@@ -51,6 +54,16 @@ async def flying_past_zone(
             await until(lambda: sky.truth.body.ve < -4.0)
         yield drone, distances_m
         driving.cancel()
+
+
+async def _fly_above_zone(drone: Drone, grant: ActiveGrant) -> None:
+    """Fly to a place above a zone that ends 13 m below the drone."""
+    below = zone("below", "ignore", 10.0, -40.0, 60.0, 40.0)
+    below["zones"][0]["altitude"] = {"lower": -5.0, "upper": 12.0, "reference": "home"}
+    drone.grants.put(spec(below))
+    await drone.service.arm(grant, 120.0)
+    await end(drone.service.take_off(grant, TakeoffArgs(25.0)))
+    await end(drone.service.goto(grant, goto(35.0, 0.0, 25.0), 0.0))
 
 
 async def _drive(drone: Drone, grant: ActiveGrant) -> None:
@@ -107,6 +120,36 @@ def test_drone_lands_where_it_is_if_jump_of_position_is_not_undone(tmp_path: Pat
             await until(lambda: not sky.truth.armed, 300.0)
             assert sky.truth.body.east == pytest.approx(east_m, abs=2.0)
             assert abs(sky.truth.body.north) < 2.0
+
+    fly(work, tmp_path)
+
+
+def test_drone_above_zone_waits_longer_for_position_before_it_lands(tmp_path: Path) -> None:
+    async def work(sky: Sky, directory: Path) -> None:
+        async with ready(sky, directory) as (drone, grant):
+            await _fly_above_zone(drone, grant)
+            sky.truth.params.assign("SIM_GPS_GLITCH_X", GLITCH_DEG)
+            await asyncio.sleep(110.0)
+            assert -sky.truth.body.down > 20.0
+            assert sky.truth.body.east == pytest.approx(35.0, abs=3.0)
+            sky.truth.params.assign("SIM_GPS_GLITCH_X", 0.0)
+            await until(lambda: not sky.truth.armed, 200.0)
+            assert math.hypot(sky.truth.body.north, sky.truth.body.east) < 3.0
+
+    fly(work, tmp_path)
+
+
+def test_drone_above_zone_lands_if_position_stays_wrong(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(return_to_launch, "SETTINGS", replace(SETTINGS, position_problem_above_zone_timeout_s=70.0))
+
+    async def work(sky: Sky, directory: Path) -> None:
+        async with ready(sky, directory) as (drone, grant):
+            await _fly_above_zone(drone, grant)
+            sky.truth.params.assign("SIM_GPS_GLITCH_X", GLITCH_DEG)
+            await asyncio.sleep(68.0)
+            assert -sky.truth.body.down > 20.0
+            await until(lambda: not sky.truth.armed, 100.0)
+            assert sky.truth.body.east == pytest.approx(35.0, abs=3.0)
 
     fly(work, tmp_path)
 

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import asyncio
 import math
+from pathlib import Path
 
 import pytest
 from fractus_core.geo import LocalFrame
 from fractus_runtime.mavlink_codec import message
 from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
+from fractus_services.mobility.mavlink.expected_position import EXPECTED_POSITION_FILE, ExpectedPositionFile
 from fractus_services.mobility.mavlink.position_checks import QUIET_S
 from fractus_services.mobility.mavlink.vehicle import Vehicle
 
@@ -61,6 +64,22 @@ class Flight:
         accuracy_mm = round(self.gps_accuracy_m * 1e3)
         fix = message("GPS_RAW_INT", fix_type=3, time_usec=self.fixes * 200_000, h_acc=accuracy_mm, **place)
         self.vehicle.take(fix, self.now)
+
+    def restart_service(self, directory: Path) -> None:
+        """Replace the service by one that knows only what the former one stored."""
+
+        async def store() -> None:
+            file = ExpectedPositionFile(directory / EXPECTED_POSITION_FILE)
+            file.keep(self.vehicle.position_checks.expected)
+            if file._storing is not None:
+                await file._storing
+
+        asyncio.run(store())
+        armed = self.vehicle.armed
+        self.vehicle = Vehicle(stack=ARDUCOPTER, armed=armed, landed_state=2, landed_at=self.now)
+        stored = ExpectedPositionFile(directory / EXPECTED_POSITION_FILE).stored
+        if stored is not None:
+            self.vehicle.position_checks.restore(stored)
 
     def send(self, duration_s: float, *, lost: bool = False) -> None:
         """Fly on for a duration. If the messages are lost, none of them arrives."""
@@ -189,6 +208,82 @@ def test_position_stays_unknown_if_it_jumps_on_ground_during_glitch_that_began_i
     flight.flags = READY
     flight.send(10.0)
     assert not flight.known
+
+
+@pytest.mark.parametrize("armed", [True, False])
+def test_position_stays_unknown_after_restart_of_service_until_it_has_jumped_back(tmp_path: Path, armed: bool) -> None:
+    flight = Flight()
+    flight.north_m += 33.0
+    flight.send(1.0)
+    flight.vehicle.armed = armed
+    flight.send(1.0)
+    flight.restart_service(tmp_path)
+    flight.send(4.0, lost=True)
+    flight.send(60.0)
+    assert not flight.known
+    assert "33 m from where the vehicle flew" in flight.vehicle.position_problem
+    flight.restart_service(tmp_path)
+    flight.north_m -= 33.0
+    flight.send(QUIET_S + 1.5)
+    assert flight.known
+    flight.restart_service(tmp_path)
+    assert not (tmp_path / EXPECTED_POSITION_FILE).exists()
+
+
+def test_position_that_jumps_during_restart_of_service_in_glitch_is_unknown(tmp_path: Path) -> None:
+    flight = Flight()
+    flight.flags = GLITCHING
+    flight.send(2.0)
+    flight.restart_service(tmp_path)
+    flight.north_m += 33.0
+    flight.flags = READY
+    flight.send(4.0, lost=True)
+    flight.send(QUIET_S + 5.0)
+    assert not flight.known
+
+
+def test_restart_of_vehicle_after_restart_of_service_makes_position_known(tmp_path: Path) -> None:
+    flight = Flight()
+    flight.north_m += 33.0
+    flight.send(1.0)
+    flight.vehicle.armed = False
+    flight.restart_service(tmp_path)
+    flight.boot_s = -flight.now
+    flight.send(QUIET_S + 1.5)
+    assert flight.known
+
+
+@pytest.mark.parametrize("content", ["", "[]", "{}", '{"position": {"boot_s": NaN}}', '{"position": {"lat": "here"}}'])
+def test_unreadable_expected_position_is_reported(
+    tmp_path: Path, content: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / EXPECTED_POSITION_FILE
+    path.write_text(content)
+    assert ExpectedPositionFile(path).stored is None
+    assert "cannot read the expected position" in caplog.text
+
+
+def test_expected_position_is_stored_once_while_vehicle_hovers(tmp_path: Path) -> None:
+    async def work() -> None:
+        file = ExpectedPositionFile(tmp_path / EXPECTED_POSITION_FILE)
+        flight = Flight()
+        flight.north_m += 33.0
+        flight.send(0.5)
+        file.keep(flight.vehicle.position_checks.expected)
+        first = file._storing
+        assert first is not None
+        await first
+        flight.send(1.0)
+        file.keep(flight.vehicle.position_checks.expected)
+        assert file._storing is first
+        flight.north_mps = 3.0
+        flight.send(1.0)
+        file.keep(flight.vehicle.position_checks.expected)
+        assert file._storing is not first
+        assert file._storing is not None
+        await file._storing
+
+    asyncio.run(work())
 
 
 @pytest.mark.parametrize("lost_s", [1.5, 3.0, 8.0])

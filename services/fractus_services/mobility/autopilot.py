@@ -87,6 +87,7 @@ class VehicleState:
         position_problem: Reason why the reported position is not trusted and ignored; empty if it is trusted.
         position_problem_at: Start of the problem with the position. Problems that recur soon count as one.
         position_trusted_at: Time at which the latest problem with the position ended.
+        expected_place: Latitude and longitude at which the vehicle is expected while its position is not trusted; None if unknown.
     """
 
     lat: float | None = None
@@ -137,6 +138,7 @@ class VehicleState:
     position_problem: str = ""
     position_problem_at: float = -math.inf
     position_trusted_at: float = -math.inf
+    expected_place: tuple[float, float] | None = None
 
     @property
     def reports_on_ground(self) -> bool:

@@ -74,6 +74,12 @@ class MobilitySettings:
     If the position is then still not trusted, the drone lands at its current position.
     """
 
+    position_problem_above_zone_timeout_s: float = 240.0
+    """The same time for a drone that would descend into a zone.
+
+    It is limited, because a drone that stays in the air until its battery is empty comes down without control.
+    """
+
     # Supervision and verification of the failsafes
 
     tick_timeout_s: float = 1.0

@@ -59,7 +59,8 @@ class ReturnFlight:
         """Fly home for the system until only the descent is left.
 
         A drone with the task to land lands at its position, unless it would descend into a zone. A drone whose position is not
-        trusted waits in the air, because the autopilot's own return would follow the wrong position. If it waits too long, it lands.
+        trusted waits in the air, because the autopilot's own return would follow the wrong position. If it waits too long, it lands. Above
+        a zone into which it would descend, it waits longer.
 
         Args:
             kind: Task of the system: land or return.
@@ -82,10 +83,10 @@ class ReturnFlight:
         if kind is TaskKind.RETURN and attempts < SETTINGS.max_route_attempts:
             await self._restore_home()
         # A landing in progress was chosen by a failsafe or a pilot. The battery may be too low for any other flight.
-        landing = vehicle.mode.kind is ModeKind.LANDING or self._blind()
+        landing = vehicle.mode.kind is ModeKind.LANDING
         if kind is TaskKind.LAND and (grant is None or landing or not self._lands_in_zone(grant)):
             return stack.land
-        if not vehicle.mode.comes_down and not await self._trusts_position(is_current):
+        if not vehicle.mode.comes_down and not await self._trusts_position(is_current, grant):
             if is_current() and vehicle.in_air:
                 control.note("land", f"the position is not trusted: {vehicle.position_problem}", "PositionUnknown")
             return stack.land
@@ -122,18 +123,29 @@ class ReturnFlight:
         self.given_up = grant
         return stack.return_retracing if retraces else stack.return_straight
 
-    async def _trusts_position(self, is_current: Callable[[], bool]) -> bool:
+    async def _trusts_position(self, is_current: Callable[[], bool], grant: ActiveGrant | None) -> bool:
         """Wait until the position is trusted; the drone hovers. Return False after a timeout, or if the task or flight has ended."""
         autopilot = self._control.autopilot
         vehicle = autopilot.vehicle
-        wait_s = SETTINGS.position_problem_timeout_s / autopilot.pace
-        while vehicle.position_problem and autopilot.now - vehicle.position_problem_at < wait_s:
+        above_zone = False
+        while vehicle.position_problem:
+            waited_s = (autopilot.now - vehicle.position_problem_at) * autopilot.pace
+            if waited_s >= SETTINGS.position_problem_timeout_s:
+                if waited_s >= SETTINGS.position_problem_above_zone_timeout_s or not self._descends_into_zone(grant):
+                    break
+                if not above_zone:
+                    reason = f"a zone lies below, and the position is not trusted: {vehicle.position_problem}"
+                    self._control.note("hover", reason, "PositionUnknown")
+                above_zone = True
             if not is_current() or not vehicle.in_air:
                 break
             if vehicle.mode.commanded:
                 autopilot.stop()
             await autopilot.update(SETTINGS.brake_resend_s / autopilot.pace)
         return not vehicle.position_problem
+
+    def _descends_into_zone(self, grant: ActiveGrant | None) -> bool:
+        return grant is not None and self._lands_in_zone(grant)
 
     def _require_trusted_position(self) -> None:
         problem = self._control.autopilot.vehicle.position_problem
@@ -230,8 +242,16 @@ class ReturnFlight:
         return refusal.verdict.code == "NotStopping" and self._straight_return_legal(flight.constraints.compiled)
 
     def _lands_in_zone(self, grant: ActiveGrant) -> bool:
-        """Return True if the drone is above a zone into which it would descend."""
-        return descent_enters_fence(self._gate.situation(), self._control.for_transit(grant))
+        """Return True if the drone is above a zone into which it would descend.
+
+        While the position is not trusted, the drone counts as being where it is expected.
+        """
+        now = self._gate.situation()
+        vehicle = self._control.autopilot.vehicle
+        if now.lat is None and vehicle.expected_place is not None:
+            lat, lon = vehicle.expected_place
+            now = replace(now, lat=lat, lon=lon, position_error_m=vehicle.position_error_m, latency_s=0.0)
+        return descent_enters_fence(now, self._control.for_transit(grant))
 
     def _blind(self) -> bool:
         """Return True if position or home is unknown to the service. Only the autopilot can then navigate."""

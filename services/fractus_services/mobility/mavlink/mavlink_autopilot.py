@@ -20,6 +20,7 @@ from fractus_services.errors import AutopilotError
 from fractus_services.mobility.autopilot import LEG_MPS, VELOCITY_HISTORY_S, Permit, VehicleState, always
 from fractus_services.mobility.mavlink.autopilot_link import AutopilotLink, ignore
 from fractus_services.mobility.mavlink.companion import SYSTEM_ID
+from fractus_services.mobility.mavlink.expected_position import ExpectedPositionFile
 from fractus_services.mobility.mavlink.flight_stack import FlightStack
 from fractus_services.mobility.mavlink.gimbal import point
 from fractus_services.mobility.mavlink.parameters import Parameters
@@ -246,6 +247,7 @@ class MavlinkAutopilot(AutopilotLink):
         stack: Firmware of the autopilot.
         alive, on_found, on_heartbeat, sysid, known_vehicle, received, sent: See `AutopilotLink`.
         on_parameter: Callback invoked with the name of a parameter that another station changed.
+        expected_position: File with the expected position while the reported one is not trusted.
 
     Attributes:
         starting: Lock held while the start of the motors is being prepared.
@@ -263,6 +265,7 @@ class MavlinkAutopilot(AutopilotLink):
         on_parameter: Callable[[str], None] = lambda _name: None,
         sysid: int = SYSTEM_ID,
         known_vehicle: KnownVehicleFile | None = None,
+        expected_position: ExpectedPositionFile | None = None,
         received: Callable[[bytes], None] = ignore,
         sent: Callable[[bytes], None] = ignore,
     ) -> None:
@@ -278,6 +281,9 @@ class MavlinkAutopilot(AutopilotLink):
             sent=sent,
         )
         self.starting = asyncio.Lock()
+        self._expected_position = expected_position
+        if expected_position is not None and expected_position.stored is not None:
+            self.vehicle.position_checks.restore(expected_position.stored)
         self.vehicle_parameters = Parameters(self, on_parameter)
         self._locks: dict[int, asyncio.Lock] = {}
         self._acknowledgements = Acknowledgements(sysid, self.timing)
@@ -337,6 +343,8 @@ class MavlinkAutopilot(AutopilotLink):
             self.vehicle_parameters.request(self.stack.gimbal_type)
         super().take(incoming)
         self._home_monitor.take(incoming.name)
+        if self._expected_position is not None and incoming.name == "GLOBAL_POSITION_INT":
+            self._expected_position.keep(self.vehicle.position_checks.expected)
 
     async def command(
         self,

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from fractus_core.geo import LocalFrame
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -110,6 +110,23 @@ class ReportedPosition:
 
 
 @dataclass(frozen=True, slots=True)
+class ExpectedPosition:
+    """Position at which a vehicle is expected whose reported position is not trusted.
+
+    Attributes:
+        position: Last trusted position, moved by the distance flown since then.
+        unseen_m: Distance that may have been flown during interruptions, in addition.
+        moves: True if the motors run.
+        reason: Why the reported position is not trusted.
+    """
+
+    position: ReportedPosition
+    unseen_m: float
+    moves: bool
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
 class GpsFix:
     """Position that a GPS receiver reported.
 
@@ -147,6 +164,7 @@ class PositionChecks:
         self._flown_m = (0.0, 0.0)
         self._climbed_m = 0.0
         self._unseen_m = 0.0
+        self._moved = False
         self._disagreements = 0
         self._fix_us = 0
         self._reason = ""
@@ -166,6 +184,23 @@ class PositionChecks:
     def _see(self, reason: str, now: float) -> None:
         self._reason = reason
         self._seen_at = max(self._seen_at, now)
+
+    @property
+    def expected(self) -> ExpectedPosition | None:
+        """Position at which the vehicle is expected while its reported position is not trusted; None if it is trusted or unknown."""
+        if self._trusted is None or not self._path:
+            return None
+        lat, lon = LocalFrame(self._trusted.lat, self._trusted.lon).latlon(*self._flown_m)
+        position = replace(self._path[-1], lat=lat, lon=lon, amsl_m=self._trusted.amsl_m + self._climbed_m)
+        return ExpectedPosition(position, self._unseen_m, moves=self._moved, reason=self._reason)
+
+    def restore(self, expected: ExpectedPosition) -> None:
+        """Continue from the expected position of an earlier process. Reported positions are compared with it."""
+        self._trusted = expected.position
+        self._path.append(expected.position)
+        self._unseen_m = expected.unseen_m
+        self._moved = expected.moves
+        self._displacement = expected.reason
 
     def set_variance_limit(self, limit: float) -> None:
         """Use the vehicle's FS_EKF_THRESH. Values that switch the failsafe off, or on late, do not apply."""
@@ -218,6 +253,7 @@ class PositionChecks:
                 if moves:
                     self._look_for_jump(last, reported, elapsed_s, error_m, now)
                 self._follow(last, reported, elapsed_s, error_m, now, moves=moves)
+        self._moved = moves
         self._path.append(reported)
         while self._path[0].boot_s < reported.boot_s - PATH_S:
             self._path.popleft()
@@ -252,7 +288,7 @@ class PositionChecks:
             self._flown_m[1] + (last.north_mps + reported.north_mps) / 2 * elapsed_s,
         )
         self._climbed_m -= (last.down_mps + reported.down_mps) / 2 * elapsed_s
-        if moves:
+        if moves or self._moved:
             self._unseen_m += GAP_ACCEL_MPS2 * max(elapsed_s - GAP_S, 0.0) ** 2 / 4
         away_m = math.dist(self._trusted.offset_m(reported), self._flown_m)
         off_m = abs(reported.amsl_m - self._trusted.amsl_m - self._climbed_m)

@@ -171,6 +171,8 @@ def _position(vehicle: Vehicle, message: Message, now: float) -> None:
     vehicle.reported_at = now
     vehicle.position_checks.take_position(reported, vehicle.position_error_m, now, moves=vehicle.armed)
     plausible = _check_position(vehicle, now)
+    expected = vehicle.position_checks.expected
+    vehicle.expected_place = (expected.position.lat, expected.position.lon) if expected is not None else None
     located = vehicle.located and now - vehicle.gps_at <= STATUS_MAX_AGE_S / vehicle.pace
     if not plausible or not located or not vehicle.estimator_positioned(now):
         return

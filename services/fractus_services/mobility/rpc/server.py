@@ -21,6 +21,7 @@ from fractus_services.grant_verifier import GrantVerifier
 from fractus_services.grpc_server import run_until, serve_grpc
 from fractus_services.mobility.authority.journal import Journal
 from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
+from fractus_services.mobility.mavlink.expected_position import EXPECTED_POSITION_FILE, ExpectedPositionFile
 from fractus_services.mobility.mavlink.failsafes import MavlinkFailsafes
 from fractus_services.mobility.mavlink.fence import MissionFence
 from fractus_services.mobility.mavlink.mavlink_autopilot import MavlinkAutopilot
@@ -109,6 +110,7 @@ def _connect(
         on_heartbeat=lambda: components.observer.heartbeat(),  # noqa: PLW0108
         on_parameter=lambda name: components.observer.parameter(name),  # noqa: PLW0108
         known_vehicle=KnownVehicleFile(options.state / VEHICLE_FILE, url),
+        expected_position=ExpectedPositionFile(options.state / EXPECTED_POSITION_FILE),
         received=recorder.take_received,
         sent=recorder.take_sent,
     )

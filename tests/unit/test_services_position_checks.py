@@ -55,14 +55,14 @@ class Flight:
     def status(self) -> None:
         self.vehicle.take(message("EKF_STATUS_REPORT", flags=self.flags, **self.variances), self.now)
 
-    def gps(self, *, repeated: bool = False) -> None:
+    def gps(self, name: str = "GPS_RAW_INT", *, repeated: bool = False, fix_type: int = 3) -> None:
         """Send a GPS position, of the same fix as the last one if `repeated` is True."""
         lat, lon = FRAME.latlon(0.0, self.north_m + self.gps_error_m)
         place = {"lat": round(lat * 1e7), "lon": round(lon * 1e7)}
         if not repeated:
             self.fixes += 1
         accuracy_mm = round(self.gps_accuracy_m * 1e3)
-        fix = message("GPS_RAW_INT", fix_type=3, time_usec=self.fixes * 200_000, h_acc=accuracy_mm, **place)
+        fix = message(name, fix_type=fix_type, time_usec=self.fixes * 200_000, h_acc=accuracy_mm, **place)
         self.vehicle.take(fix, self.now)
 
     def restart_service(self, directory: Path) -> None:
@@ -518,3 +518,77 @@ def test_arming_is_refused_while_position_is_not_trusted() -> None:
     flight.flags = GLITCHING
     flight.status()
     assert "GPS glitch" in vehicle.arming_refusal(flight.now)
+
+
+def test_position_is_unknown_while_second_gps_disagrees_with_estimate() -> None:
+    flight = Flight()
+    flight.gps("GPS2_RAW")
+    assert flight.known
+    flight.gps_error_m = 12.0
+    for _ in range(2):
+        flight.gps("GPS2_RAW")
+    flight.gps_error_m = 0.0
+    flight.gps()
+    assert not flight.known
+    assert "GPS2_RAW and GLOBAL_POSITION_INT are 12 m apart" in flight.vehicle.position_problem
+    flight.send(30.0)
+    assert not flight.known, "the disagreement remains although the second receiver is silent"
+    flight.gps("GPS2_RAW")
+    flight.send(QUIET_S + 0.2)
+    assert flight.known
+
+
+def test_position_is_unknown_if_estimate_is_mean_of_two_receivers_that_disagree() -> None:
+    flight = Flight()
+    for _ in range(2):
+        for name, error_m in (("GPS_RAW_INT", 6.0), ("GPS2_RAW", -6.0)):
+            flight.gps_error_m = error_m
+            flight.gps(name)
+    assert not flight.known
+
+
+def test_second_gps_without_fix_is_ignored() -> None:
+    flight = Flight()
+    flight.gps_error_m = 12.0
+    for _ in range(3):
+        flight.gps("GPS2_RAW", fix_type=1)
+    assert flight.known
+    for _ in range(2):
+        flight.gps("GPS2_RAW")
+    assert not flight.known
+    flight.gps("GPS2_RAW", fix_type=1)
+    flight.gps_error_m = 0.0
+    flight.send(QUIET_S + 0.2)
+    assert flight.known
+
+
+def test_position_error_is_larger_one_of_two_receivers() -> None:
+    flight = Flight()
+    flight.gps_accuracy_m = 4.0
+    flight.gps("GPS2_RAW")
+    flight.gps_accuracy_m = 0.8
+    flight.gps()
+    assert flight.vehicle.position_error_m == 4.0
+    flight.gps("GPS2_RAW", fix_type=0)
+    flight.gps()
+    assert flight.vehicle.position_error_m == 0.8
+
+
+@pytest.mark.parametrize("text", ["EKF3 lane switch 1", "EKF primary changed:1"])
+def test_position_is_unknown_for_quiet_time_after_switch_of_estimator(text: str) -> None:
+    flight = Flight()
+    flight.vehicle.take(message("STATUSTEXT", severity=2, text=text.encode()), flight.now)
+    assert not flight.known
+    assert "another estimator" in flight.vehicle.position_problem
+    flight.send(QUIET_S - 0.1)
+    assert not flight.known
+    flight.send(0.2)
+    assert flight.known
+
+
+def test_position_that_jumped_by_switch_of_estimator_stays_unknown() -> None:
+    flight = Flight()
+    flight.vehicle.take(message("STATUSTEXT", severity=2, text=b"EKF3 lane switch 1"), flight.now)
+    flight.north_m += 12.0
+    flight.send(30.0)
+    assert not flight.known

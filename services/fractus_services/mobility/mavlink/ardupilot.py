@@ -218,6 +218,10 @@ class ArduCopter:
         """Recognise that SmartRTL exceeded its memory or its time limit."""
         return text.startswith("SmartRTL deactivated")
 
+    def reports_estimator_switch(self, text: str) -> bool:
+        """Recognise that the EKF uses another lane."""
+        return text.startswith(("EKF3 lane switch", "EKF2 lane switch", "EKF primary changed"))
+
     def return_values(self, owned: Mapping[str, float], bounds: ReturnBounds) -> dict[str, float]:
         """Return limited values of the return parameters.
 

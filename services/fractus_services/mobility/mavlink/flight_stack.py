@@ -133,6 +133,9 @@ class FlightStack(Protocol):
     def reports_path_lost(self, text: str) -> bool:
         """Return True if a status text reports that the recorded path was discarded."""
 
+    def reports_estimator_switch(self, text: str) -> bool:
+        """Return True if a status text reports that the autopilot uses another of its estimators."""
+
     def return_values(self, owned: Mapping[str, float], bounds: ReturnBounds) -> dict[str, float]:
         """Return parameters that limit altitude and speed of the autopilot's return flight.
 

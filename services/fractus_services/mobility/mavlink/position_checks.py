@@ -144,6 +144,21 @@ class GpsFix:
     fix_us: int
 
 
+@dataclass(slots=True)
+class _Receiver:
+    """Comparison of one GPS receiver with the estimate.
+
+    Attributes:
+        fix_us: Time of its last fix.
+        disagreements: Number of consecutive fixes that disagree with the estimate.
+        problem: The disagreement as text; empty if there is none.
+    """
+
+    fix_us: int = 0
+    disagreements: int = 0
+    problem: str = ""
+
+
 class PositionChecks:
     """Collects signs of a wrong position. Times are monotonic seconds unless they are stated to be on the vehicle's clock.
 
@@ -158,15 +173,13 @@ class PositionChecks:
         self._path: deque[ReportedPosition] = deque()
         self._path_at = -math.inf
         self._estimator_problem = ""
-        self._gps_problem = ""
+        self._receivers: dict[str, _Receiver] = {}
         self._displacement = ""
         self._trusted: ReportedPosition | None = None
         self._flown_m = (0.0, 0.0)
         self._climbed_m = 0.0
         self._unseen_m = 0.0
         self._moved = False
-        self._disagreements = 0
-        self._fix_us = 0
         self._reason = ""
         self._seen_at = -math.inf
 
@@ -176,7 +189,8 @@ class PositionChecks:
         A sign of EKF_STATUS_REPORT or GPS_RAW_INT holds until a later message without it. A position that jumped is not trusted
         before it has returned, because either of the two positions may be the wrong one.
         """
-        lasting = self._estimator_problem or self._gps_problem or self._displacement
+        gps_problem = next((each.problem for each in self._receivers.values() if each.problem), "")
+        lasting = self._estimator_problem or gps_problem or self._displacement
         if lasting:
             self._see(lasting, now)
         return self._reason if now - self._seen_at < QUIET_S / self.pace else ""
@@ -228,6 +242,10 @@ class PositionChecks:
             )
         if problem or positioned:
             self._estimator_problem = problem
+
+    def take_estimator_switch(self, now: float) -> None:
+        """Process a status text that reports another estimator in use. Its position may differ from that of the former one."""
+        self._see("the autopilot has switched to another estimator (EKF lane)", now)
 
     def take_position(self, reported: ReportedPosition, error_m: float, now: float, *, moves: bool) -> None:
         """Compare a position with the previous one.
@@ -309,19 +327,28 @@ class PositionChecks:
             self._see(f"the reported altitude jumped by {climbed_m:.0f} m within {elapsed_s:.2f} s", now)
 
     def take_gps(self, fix: GpsFix, now: float) -> None:
-        """Compare a position of the GPS with the estimator's positions of the last second. A repeated fix is no new sign."""
+        """Compare a position of a GPS receiver with the estimator's positions of the last second. A repeated fix is no new sign.
+
+        The estimator uses one receiver, or a mean of two. If two receivers disagree, at least one disagrees with the estimate.
+        """
         self.problem(now)
-        repeated = fix.fix_us != 0 and fix.fix_us == self._fix_us
-        self._fix_us = fix.fix_us
+        receiver = self._receivers.setdefault(fix.message, _Receiver())
+        repeated = fix.fix_us != 0 and fix.fix_us == receiver.fix_us
+        receiver.fix_us = fix.fix_us
         if repeated or not self._path or now - self._path_at > PATH_S / self.pace:
             return  # There is nothing to compare, so an earlier disagreement remains.
         frame = LocalFrame(fix.lat, fix.lon)
         apart_m = min(math.hypot(*frame.xy(known.lat, known.lon)) for known in self._path)
         agrees = apart_m <= DISAGREEMENT_M + ERROR_FACTOR * min(fix.error_m, MAX_TOLERATED_ERROR_M)
-        self._disagreements = 0 if agrees else self._disagreements + 1
-        self._gps_problem = ""
-        if self._disagreements >= DISAGREEMENTS:
-            self._gps_problem = f"{fix.message} and GLOBAL_POSITION_INT are {apart_m:.0f} m apart"
+        receiver.disagreements = 0 if agrees else receiver.disagreements + 1
+        receiver.problem = ""
+        if receiver.disagreements >= DISAGREEMENTS:
+            receiver.problem = f"{fix.message} and GLOBAL_POSITION_INT are {apart_m:.0f} m apart"
+
+    def forget_gps(self, message: str, now: float) -> None:
+        """Forget a receiver that has no fix. The estimator does not use it."""
+        self.problem(now)
+        self._receivers.pop(message, None)
 
 
 def _reach_m(first_mps: float, second_mps: float, elapsed_s: float) -> float:

@@ -26,7 +26,8 @@ RATES_HZ = {
     "GPS_RAW_INT": (1.0, 2.0),
     "HOME_POSITION": (0.2, 1.0),
     "WIND": (0.2, 1.0),
-    # This message is requested last, because many vehicles have no gimbal, and the other messages must not wait for a refusal.
+    # These messages are requested last, because many vehicles have no second GPS and no gimbal. The others must not wait for a refusal.
+    "GPS2_RAW": (1.0, 2.0),
     "GIMBAL_DEVICE_ATTITUDE_STATUS": (2.0, 10.0),
 }
 """Requested messages with their rates on the ground and in the air."""
@@ -37,8 +38,8 @@ CHECK_PERIOD_S = 5.0
 MIN_SHARE = 0.25
 """Share of the requested rate below which the stream was stopped or slowed down. A bad link loses fewer messages."""
 
-_OPTIONAL = frozenset({"WIND", "GIMBAL_DEVICE_ATTITUDE_STATUS"})
-"""Messages that an autopilot sends only while it estimates the wind or measures the gimbal's attitude."""
+_OPTIONAL = frozenset({"WIND", "GPS2_RAW", "GIMBAL_DEVICE_ATTITUDE_STATUS"})
+"""Messages that an autopilot sends only while it estimates the wind, has a second GPS, or measures the gimbal's attitude."""
 
 MAX_CHECK_PERIOD_S = 40.0
 """Longest check period. Each unsuccessful request doubles the period, because requests do not help behind a slow radio."""

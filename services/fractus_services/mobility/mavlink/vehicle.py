@@ -75,6 +75,7 @@ class Vehicle(VehicleState):
         stopping_at: Time since which all heartbeats have reported stopped motors in flight; infinite if the last one did not.
         gimbal_limits: Smallest and largest pitch and yaw of the gimbal, degrees; None until they are reported.
         position_checks: Signs of a wrong position.
+        second_error_m: Position error of the second GPS receiver; 0 without one or if it has no fix.
         reported_at: Time of the last position message, trusted or not.
         resumed_at: Time of the first position message after an interruption.
     """
@@ -89,6 +90,7 @@ class Vehicle(VehicleState):
     started_at: float = -math.inf
     stopping_at: float = math.inf
     position_checks: PositionChecks = field(default_factory=PositionChecks)
+    second_error_m: float = 0.0
     reported_at: float = -math.inf
     resumed_at: float = -math.inf
 
@@ -288,18 +290,38 @@ def _estimator(vehicle: Vehicle, message: Message, now: float) -> None:
 def _gps(vehicle: Vehicle, message: Message, now: float) -> None:
     vehicle.gps_at = now
     vehicle.fix_type = message.integer("fix_type")
-    accuracy_mm = message.integer("h_acc")
     satellites = message.integer("satellites_visible")
     vehicle.satellites = satellites if satellites != _UNKNOWN_U8 else 0
-    error = accuracy_mm / 1e3 if accuracy_mm else DEFAULT_ERROR_M
+    # The estimator may use either receiver.
+    error = max(_gps_error_m(message), vehicle.second_error_m)
     vehicle.located = vehicle.fix_type >= mavlink.GPS_FIX_TYPE_3D_FIX and error <= MAX_ERROR_M
     if not vehicle.located:
         return
     vehicle.position_error_m = max(error, MIN_ERROR_M)
+    _compare_gps(vehicle, message, now)
+
+
+def _second_gps(vehicle: Vehicle, message: Message, now: float) -> None:
+    """Process GPS2_RAW, which a vehicle with two receivers sends. Its position must agree with the estimate as well."""
+    if message.integer("fix_type") < mavlink.GPS_FIX_TYPE_3D_FIX:
+        vehicle.second_error_m = 0.0
+        vehicle.position_checks.forget_gps(message.name, now)
+        return
+    vehicle.second_error_m = _gps_error_m(message)
+    _compare_gps(vehicle, message, now)
+
+
+def _gps_error_m(message: Message) -> float:
+    """Return the horizontal position error that a GPS receiver reports, 1 sigma in metres."""
+    accuracy_mm = message.integer("h_acc")
+    return accuracy_mm / 1e3 if accuracy_mm else DEFAULT_ERROR_M
+
+
+def _compare_gps(vehicle: Vehicle, message: Message, now: float) -> None:
     place = _place(message.integer("lat"), message.integer("lon"))
     if place is not None:
-        fix = GpsFix(message.name, *place, vehicle.position_error_m, message.integer("time_usec"))
-        vehicle.position_checks.take_gps(fix, now)
+        error_m = max(_gps_error_m(message), MIN_ERROR_M)
+        vehicle.position_checks.take_gps(GpsFix(message.name, *place, error_m, message.integer("time_usec")), now)
         _check_position(vehicle, now)
 
 
@@ -311,6 +333,9 @@ def _text(vehicle: Vehicle, message: Message, now: float) -> None:
     vehicle.status_texts.append((number, message.integer("severity"), text))
     if vehicle.stack.reports_path_lost(text):
         vehicle.path_lost = True
+    if vehicle.stack.reports_estimator_switch(text):
+        vehicle.position_checks.take_estimator_switch(now)
+        _check_position(vehicle, now)
     if vehicle.stack.reports_failsafe(text):
         vehicle.failsafe_text = text
         vehicle.failsafe_text_at = now
@@ -337,6 +362,7 @@ _HANDLERS = {
     "SYS_STATUS": _status,
     "EKF_STATUS_REPORT": _estimator,
     "GPS_RAW_INT": _gps,
+    "GPS2_RAW": _second_gps,
     "STATUSTEXT": _text,
     "WIND": _wind,
 }

@@ -24,7 +24,7 @@ WORKDIR /build
 COPY pyproject.toml uv.lock /build/
 COPY sim/pyproject.toml /build/sim/
 FROM build AS component-environment
-RUN --mount=type=cache,target=/root/.cache/uv $SYNC
+RUN --mount=type=cache,target=/root/.cache/uv $SYNC --extra geometry
 FROM build AS operator-environment
 RUN --mount=type=cache,target=/root/.cache/uv $SYNC --extra operator
 FROM build AS agent-environment

@@ -1,5 +1,7 @@
 """SDK for components of Fractus applications: drone, camera, and requests between components."""
 
+from typing import TYPE_CHECKING, Any
+
 from fractus import sync as sync
 from fractus.control import Control as Control
 from fractus.control import Motion as Motion
@@ -70,3 +72,19 @@ from fractus.values import SpeedResult as SpeedResult
 from fractus.values import TourProgress as TourProgress
 from fractus.values import Velocity as Velocity
 from fractus.values import VelocityResult as VelocityResult
+
+if TYPE_CHECKING:
+    from fractus.survey_lines import survey as survey
+
+
+def __getattr__(name: str) -> Any:
+    # Most components need no geometry. The import of shapely and numpy would double their memory.
+    if name != "survey":
+        raise AttributeError(f"module fractus has no attribute {name!r}")
+    try:
+        from fractus.survey_lines import survey  # noqa: PLC0415
+    except ImportError as error:
+        raise ImportError(
+            f"fractus.survey requires {error.name}; install it with: pip install 'fractus-drones[geometry]'"
+        ) from error
+    return survey

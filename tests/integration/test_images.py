@@ -32,7 +32,7 @@ PACKAGES = {
 }
 """Packages whose modules the image must be able to import, by image. All other images contain a component."""
 LACKING = {
-    "component": {"numpy", "kubernetes", "fractus_vehicle"},
+    "component": {"cv2", "kubernetes", "fractus_vehicle"},
     "operator": {"cv2", "fractus_vehicle"},
     "agent": {"numpy", "shapely", "cv2", "fractus_vehicle"},
     "mobility": {"cv2", "kubernetes", "fractus_vehicle"},

@@ -128,8 +128,9 @@ format: env ## Format the code
 	$(RUN) ruff format
 
 .PHONY: generate
-generate: env ## Generate the CRDs, the stubs of the .proto files, the types of the page's events, the chart's defaults and the charts' README.md
+generate: env ## Generate the CRDs, the JSON schema of manifests, the stubs of the .proto files, the types of the page's events, the chart's defaults and the charts' README.md
 	$(RUN) python -m fractus_core.api.crd crds
+	$(RUN) fractus schema > examples/fractus.schema.json
 	$(RUN) python -m grpc_tools.protoc -Iproto --python_out=proto --pyi_out=proto --grpc_python_out=proto \
 		proto/fractus_proto/v1/*.proto
 	$(RUN) python -m fractus_view.typescript view/web/src/events.ts

@@ -103,7 +103,7 @@ def test_experiment_command_exits_with_1_and_one_message_for_invalid_input(tmp_p
     file.write_text(json.dumps(content(faults=[{"fault": "gpsLoss"}])))
     result = run_command(str(file), "--out", str(tmp_path / "out"))
     assert result.exit_code == 1
-    assert "faults[0].gpsLoss.at: is missing; give it" in result.output
+    assert "faults[0].gpsLoss.at: is missing; specify it" in result.output
     unknown = {"name": "d", "home": HOME, "parameters": {"NO_SUCH": 1}}
     file.write_text(json.dumps(content(vehicles=[unknown])))
     result = run_command(str(file), "--out", str(tmp_path / "out"))

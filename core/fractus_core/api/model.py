@@ -313,7 +313,7 @@ _SENTENCES = {
     "finite_number": "must be a finite number",
     "bool_type": "must be true or false",
     "string_type": "must be a string; put it in quotes",
-    "missing": "is missing; give it",
+    "missing": "is missing; specify it",
     "extra_forbidden": "there is no such field; remove it, or correct its name",
 }
 """Messages for pydantic errors, by error type. The messages of pydantic use Python terms that users do not know."""

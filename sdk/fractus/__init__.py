@@ -47,6 +47,7 @@ from fractus.mission import orbit as orbit
 from fractus.pictures import Camera as Camera
 from fractus.pictures import camera as camera
 from fractus.plan_file import read_plan as read_plan
+from fractus.runner import fly as fly
 from fractus.runner import run as run
 from fractus.telemetry import Battery as Battery
 from fractus.telemetry import Fix as Fix

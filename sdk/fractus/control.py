@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import inspect
 import logging
 from collections.abc import AsyncGenerator, Awaitable, Callable, Generator, Sequence
@@ -17,6 +18,7 @@ from fractus_proto.v1 import mobility_pb2
 from fractus.channel import Retries, ServiceChannel
 from fractus.control_point import ControlPoint
 from fractus.errors import ControlLost, Corrected, FractusError, MissionComplete, NotConfigured, Unavailable
+from fractus.forgotten import Pending
 from fractus.values import Decision, Position, Progress
 
 _log = logging.getLogger("fractus")
@@ -32,20 +34,36 @@ OnWait = Callable[[str], None]
 """Callback for the reason why control is not granted yet, for example "the autopilot is not ready to arm: ..."."""
 
 
+RESPONSE_TIMEOUT_S = 5.0
+"""Default time in seconds within which the program's event loop answers a liveness request of the service."""
+
+CONFIRM_TIMEOUT_S = 2.0
+"""Deadline of the answer to a liveness request."""
+
+
 class Control:
     """Control lease for one control point: the right to move the drone.
 
-    The lease lasts while its stream is open. If the process ends, the drone hovers, and after the grace period the
-    system flies it home. If the service restarts, the stream is reopened and motions continue.
+    The lease lasts while its stream is open and the program's event loop answers the liveness requests of the service. If
+    the process ends, or if the program blocks the event loop for longer than `response_timeout_s`, the drone hovers, and
+    after the grace period the system flies it home. If the service restarts, the stream is reopened and motions continue.
 
     Use it as `async with drone.control() as control:`. Leaving the block normally returns control. Leaving it by an
     exception does not return control, so that this component can continue after a restart.
     """
 
     def __init__(
-        self, channel: ServiceChannel, *, timeout_s: float | None = None, progress: OnWait | None = None
+        self,
+        channel: ServiceChannel,
+        *,
+        timeout_s: float | None = None,
+        progress: OnWait | None = None,
+        response_timeout_s: float = RESPONSE_TIMEOUT_S,
+        before_return: Callable[[], None] = lambda: None,
     ) -> None:
         self._channel = channel
+        self._before_return = before_return
+        self._request = mobility_pb2.GetControlRequest(response_timeout_s=response_timeout_s)
         self._timeout_s = timeout_s
         self._progress = progress
         self._granted = asyncio.Event()
@@ -120,7 +138,15 @@ class Control:
 
         Returns:
             True if this was the last control point. The system then flies the drone home.
+
+        Raises:
+            InvalidRequest: The client is strict, and a motion was not awaited. Control is abandoned.
         """
+        try:
+            self._before_return()
+        except FractusError:
+            await self.abandon()
+            raise
         self._returning = True
         try:
             reply = await self._channel.unary("ReturnControl", mobility_pb2.ReturnControlRequest())
@@ -218,13 +244,18 @@ class Control:
 
     async def _follow(self) -> None:
         async with self._channel.stub() as stub:
-            async for event in stub.GetControl(mobility_pb2.GetControlRequest()):
+            async for event in stub.GetControl(self._request):
                 if event.state == _Event.STATE_GRANTED:
                     self.control_point = event.control_point
                     self.waypoints_reached = event.waypoints_reached
                     self.task = ControlPoint.from_proto(event.task)
                     self._held = True
                     self._granted.set()
+                elif event.state == _Event.STATE_PING:
+                    # A failed answer is not repeated: the service closes the stream, or sends no further request.
+                    with contextlib.suppress(grpc.aio.AioRpcError):
+                        answer = mobility_pb2.ConfirmAliveRequest(ping=event.ping)
+                        await stub.ConfirmAlive(answer, timeout=CONFIRM_TIMEOUT_S)
                 elif event.state == _Event.STATE_WAITING:
                     if self._progress is not None and event.reason:
                         self._progress(event.reason)
@@ -258,6 +289,9 @@ class Motion:
     report. Cancelling the task, or leaving the iteration early, stops the motion: the drone hovers. If the service
     restarts while this component holds control, the motion is requested again.
 
+    A motion that is neither awaited nor iterated warns as soon as it is discarded (`RuntimeWarning`). A strict client then
+    raises `InvalidRequest` from its next call.
+
     Raises:
         PolicyDenied: Policies forbid the motion. The drone continues to hover.
         Corrected: The client is strict, and a policy changed the target. The motion is stopped.
@@ -272,6 +306,7 @@ class Motion:
         method: str,
         request: Any,
         *,
+        pending: Pending,
         strict: bool = False,
         progress: OnProgress | None = None,
         timeout_s: float | None = None,
@@ -283,11 +318,14 @@ class Motion:
         self._strict = strict
         self._progress = progress
         self._timeout_s = timeout_s
+        self._pending = pending
 
     def __await__(self) -> Generator[Any, None, Progress]:
+        self._pending.begin()
         return self._complete().__await__()
 
     async def __aiter__(self) -> AsyncGenerator[Progress, None]:
+        self._pending.begin()
         retries = Retries(self._channel, self._method, retried=self._control is not None)
         while True:
             if self._control is not None:

@@ -9,9 +9,10 @@ from typing import Any, TypeVar
 from fractus_proto.v1 import mobility_pb2, mobility_pb2_grpc, types_pb2
 
 from fractus.channel import CALL_TIMEOUT_S, RECONNECT_TIMEOUT_S, ServiceChannel, ServiceClient
-from fractus.control import Control, Motion, OnProgress, OnWait
+from fractus.control import RESPONSE_TIMEOUT_S, Control, Motion, OnProgress, OnWait
 from fractus.environment import Endpoint, endpoint
 from fractus.errors import ControlLost, Corrected, InvalidRequest
+from fractus.forgotten import Pending, check_forgotten
 from fractus.mission import Mission, Waypoint
 from fractus.telemetry import Telemetry, Watch
 from fractus.values import (
@@ -30,6 +31,9 @@ from fractus.values import (
 
 ARM_TIMEOUT_S = 60.0
 """Default timeout of `arm`, in seconds. An autopilot is ready about 40 s after power-on."""
+
+_RPC_NAMES = {"takeoff": "Takeoff", "land": "Land", "return_to_launch": "ReturnToLaunch", "goto": "Goto"}
+"""Names of the motions in the service's interface."""
 
 R = TypeVar("R", bound=Result)
 
@@ -59,6 +63,7 @@ class Mobility(ServiceClient):
         self._channel = ServiceChannel(endpoint, stub, timeout_s=timeout_s, reconnect_timeout_s=reconnect_timeout_s)
         self._strict = strict
         self._control: Control | None = None
+        self._forgotten: list[str] = []
         self.can_i = CanI(self._check_call)
         """Dry runs: `await drone.can_i.goto(lat, lon, 20)`."""
         self.watch = Watch(self.telemetry)
@@ -70,14 +75,28 @@ class Mobility(ServiceClient):
             await self._control.abandon()
         await super().close()
 
-    def control(self, *, timeout_s: float | None = None, progress: OnWait | None = None) -> Control:
+    def control(
+        self,
+        *,
+        timeout_s: float | None = None,
+        progress: OnWait | None = None,
+        response_timeout_s: float = RESPONSE_TIMEOUT_S,
+    ) -> Control:
         """Return the control lease for the next control point, as a context manager.
 
         Args:
             timeout_s: Longest wait for control, in seconds; by default unlimited.
             progress: Callback for the reason of the wait, called on every change.
+            response_timeout_s: Seconds for which the program may block its event loop before it loses control, from 1 to 60;
+                0 if a hanging program shall not be noticed, for example in a debugger.
         """
-        self._control = Control(self._channel, timeout_s=timeout_s, progress=progress)
+        self._control = Control(
+            self._channel,
+            timeout_s=timeout_s,
+            progress=progress,
+            response_timeout_s=response_timeout_s,
+            before_return=self._check_forgotten,
+        )
         return self._control
 
     async def arm(self, *, timeout_s: float = ARM_TIMEOUT_S) -> Result:
@@ -170,15 +189,15 @@ class Mobility(ServiceClient):
 
         In the air, the drone climbs further, or the motion completes at once if the drone is high enough.
         """
-        return self._motion("Takeoff", takeoff_request(altitude_m), progress, timeout_s)
+        return self._motion("takeoff", takeoff_request(altitude_m), progress, timeout_s)
 
     def land(self, *, progress: OnProgress | None = None, timeout_s: float | None = None) -> Motion:
         """Land at the current position, and disarm."""
-        return self._motion("Land", mobility_pb2.LandRequest(), progress, timeout_s)
+        return self._motion("land", mobility_pb2.LandRequest(), progress, timeout_s)
 
     def return_to_launch(self, *, progress: OnProgress | None = None, timeout_s: float | None = None) -> Motion:
         """Fly home, land and disarm."""
-        return self._motion("ReturnToLaunch", mobility_pb2.ReturnToLaunchRequest(), progress, timeout_s)
+        return self._motion("return_to_launch", mobility_pb2.ReturnToLaunchRequest(), progress, timeout_s)
 
     def goto(
         self,
@@ -207,7 +226,7 @@ class Mobility(ServiceClient):
             timeout_s: Seconds after which the motion is cancelled and the drone hovers; by default unlimited.
         """
         request = goto_request(Position(lat, lon, alt, reference), yaw_deg, speed_mps, acceptance_radius_m)
-        return self._motion("Goto", request, progress, timeout_s)
+        return self._motion("goto", request, progress, timeout_s)
 
     async def turn(self, yaw_deg: float) -> Progress:
         """Turn the nose at the current position. The component also needs the method GetPosition.
@@ -230,11 +249,12 @@ class Mobility(ServiceClient):
         """
         if self._control is None:
             raise ControlLost("a mission is for a control point; use `async with drone.control():`")
-        return Mission(self._fly, self._control, waypoints, skip_refused=skip_refused)
+        pending = Pending("mission", self._forgotten)
+        return Mission(self._fly, self._control, waypoints, skip_refused=skip_refused, pending=pending)
 
     def _fly(self, to: Waypoint, progress: OnProgress) -> Motion:
         request = goto_request(to.position, to.yaw_deg, to.speed_mps, to.acceptance_radius_m)
-        return self._motion("Goto", request, progress, None)
+        return self._motion("goto", request, progress, None)
 
     async def telemetry(self, interval_s: float = 0.2) -> AsyncGenerator[Telemetry, None]:
         """Yield the drone's state every `interval_s` seconds. The iteration continues after a restart of the service.
@@ -272,17 +292,31 @@ class Mobility(ServiceClient):
     async def _check_call(self, request: mobility_pb2.CheckCallRequest) -> Check:
         return Check.from_proto(await self._channel.unary("CheckCall", request))
 
-    def _motion(self, method: str, request: Any, progress: OnProgress | None, timeout_s: float | None) -> Motion:
-        strict = self._strict
+    def _motion(self, name: str, request: Any, progress: OnProgress | None, timeout_s: float | None) -> Motion:
+        """Return the motion of a method of this class."""
+        self._check_forgotten()
         return Motion(
-            self._channel, self._control, method, request, strict=strict, progress=progress, timeout_s=timeout_s
+            self._channel,
+            self._control,
+            _RPC_NAMES[name],
+            request,
+            strict=self._strict,
+            progress=progress,
+            timeout_s=timeout_s,
+            pending=Pending(name, self._forgotten),
         )
+
+    def _check_forgotten(self) -> None:
+        """Raise `InvalidRequest` in a strict client if a motion was not awaited."""
+        if self._strict:
+            check_forgotten(self._forgotten)
 
     async def _unary(self, method: str, request: Any, *, timeout_s: float | None = None) -> Result:
         reply = await self._call(method, request, timeout_s=timeout_s)
         return self._judged(Result(decision=Decision.from_proto(reply.decision)))
 
     async def _call(self, method: str, request: Any, *, timeout_s: float | None = None) -> Any:
+        self._check_forgotten()
         if self._control is not None and self._control.lost is not None:
             raise self._control.lost
         return await self._channel.unary(method, request, timeout_s=timeout_s)

@@ -11,6 +11,7 @@ from typing import Any
 
 from fractus.control import Control, Motion, OnProgress
 from fractus.errors import InvalidRequest, PolicyDenied
+from fractus.forgotten import Pending
 from fractus.values import Position, Progress
 
 EARTH_M = 6_371_008.8
@@ -67,6 +68,7 @@ class Mission:
         control: Control lease of the control point.
         waypoints: Waypoints; by default the path of the control point.
         skip_refused: Continue with the next waypoint if policies forbid a leg.
+        pending: Warning if the mission is not flown.
     """
 
     def __init__(
@@ -76,6 +78,7 @@ class Mission:
         waypoints: Sequence[Waypoint | Position] | None = None,
         *,
         skip_refused: bool = False,
+        pending: Pending | None = None,
     ) -> None:
         path = control.task.path if waypoints is None else waypoints
         self.waypoints = tuple(Waypoint(item) if isinstance(item, Position) else item for item in path)
@@ -84,6 +87,7 @@ class Mission:
         self._fly = fly
         self._control = control
         self._skip_refused = skip_refused
+        self._pending = pending
         self._paused = asyncio.Event()
         self._resumed = asyncio.Event()
         self._resumed.set()
@@ -118,6 +122,8 @@ class Mission:
             ControlLost: The system or a pilot took the drone.
             InvalidRequest: The control point has another mission, or this mission is already complete.
         """
+        if self._pending is not None:
+            self._pending.begin()
         self._begin()
         for number in range(self._control.waypoints_reached + 1, len(self.waypoints) + 1):
             try:
@@ -131,6 +137,8 @@ class Mission:
         return self.refused
 
     def __await__(self) -> Generator[Any, None, dict[int, PolicyDenied]]:
+        if self._pending is not None:
+            self._pending.begin()
         return self.fly().__await__()
 
     def _begin(self) -> None:

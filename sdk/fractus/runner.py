@@ -8,12 +8,20 @@ import logging
 import os
 import signal
 import sys
-from collections.abc import Awaitable, Callable
 
-from fractus.control import Control
+from fractus.control import RESPONSE_TIMEOUT_S, Control
 from fractus.drone import Mobility, mobility
 from fractus.environment import Endpoint
-from fractus.errors import ControlHeld, ControlLost, FractusError, Interrupted, MissionComplete, MissionEnded
+from fractus.errors import (
+    ControlHeld,
+    ControlLost,
+    FractusError,
+    Interrupted,
+    InvalidRequest,
+    MissionComplete,
+    MissionEnded,
+)
+from fractus.program import Program, call_program, check_program
 
 MAX_INTERRUPTIONS = 5
 """Maximum number of consecutive restarts after interrupted motions while no further waypoint is reached."""
@@ -21,13 +29,17 @@ MAX_INTERRUPTIONS = 5
 RETRY_S = 2.0
 """Delay in seconds before control is requested again, or a program is restarted."""
 
-Program = Callable[[Mobility, Control], Awaitable[None]]
-"""Program that performs the task of one control point. It is called again after an interruption or a restart."""
-
 _log = logging.getLogger("fractus")
 
 
-def run(program: Program, *, endpoint: Endpoint | None = None, strict: bool = False, stay: bool | None = None) -> None:
+def run(
+    program: Program,
+    *,
+    endpoint: Endpoint | None = None,
+    strict: bool = False,
+    stay: bool | None = None,
+    response_timeout_s: float = RESPONSE_TIMEOUT_S,
+) -> None:
     """Fly a mission: acquire control at each control point, run the program there, return control.
 
     The program may be restarted at any point of its flight, in this process or in the next one: `arm` and `takeoff` complete
@@ -42,6 +54,8 @@ def run(program: Program, *, endpoint: Endpoint | None = None, strict: bool = Fa
     | Another process of this component has control (`ControlHeld`) | Control is requested again |
     | The mission ends early (`MissionEnded`) | The process exits with 1 (in a pod it stays, because a restart would have no effect) |
     | The program raises another error, for example `PolicyDenied` | The drone hovers, and the process exits with 1 |
+    | Tasks of an `asyncio.TaskGroup` fail | The reaction to the most severe of their errors |
+    | The program blocks the event loop for longer than `response_timeout_s` | The system takes the drone (`ControlLost`) |
     | SIGTERM or SIGINT | The program is cancelled, the drone hovers, and the process exits with 0 |
 
     A hovering drone waits for the next start of the program for the grace period (15 s). Then the system flies it home, and
@@ -52,29 +66,44 @@ def run(program: Program, *, endpoint: Endpoint | None = None, strict: bool = Fa
         endpoint: Endpoint of the service; by default from the environment.
         strict: Raise `Corrected` if a policy changes a request.
         stay: Wait for SIGTERM after the mission; by default in a Kubernetes pod, which would be restarted otherwise.
+        response_timeout_s: Seconds for which the program may block the event loop; see `Mobility.control`.
 
     Raises:
-        SystemExit: The mission could not be completed. The message contains the reason and the remedy.
+        SystemExit: The program is no coroutine function of drone and control, or the mission could not be completed. The
+            message contains the reason and the remedy.
+        InvalidRequest: An event loop is running already, as in a notebook.
     """
+    if _loop_runs():
+        raise InvalidRequest("an event loop is running already, as in a notebook: use `await fractus.fly(program)`")
     if not logging.getLogger().handlers:
         logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S", stream=sys.stderr)
     stays = "KUBERNETES_SERVICE_HOST" in os.environ if stay is None else stay
     try:
-        asyncio.run(_run(program, endpoint, strict, stays))
+        check_program(program)
+        asyncio.run(_run(program, endpoint, strict, stays, response_timeout_s))
     except (asyncio.CancelledError, KeyboardInterrupt):
         _log.info("run: stopping; the drone hovers, and the system flies it home unless the program restarts soon")
     except FractusError as error:
         raise SystemExit(_describe(error)) from None
 
 
-async def _run(program: Program, endpoint: Endpoint | None, strict: bool, stays: bool) -> None:
+def _loop_runs() -> bool:
+    try:
+        asyncio.get_running_loop()
+    except RuntimeError:
+        return False
+    return True
+
+
+async def _run(
+    program: Program, endpoint: Endpoint | None, strict: bool, stays: bool, response_timeout_s: float
+) -> None:
     flight = asyncio.current_task()
     assert flight is not None
     for signum in (signal.SIGTERM, signal.SIGINT):
         asyncio.get_running_loop().add_signal_handler(signum, flight.cancel)
     try:
-        async with mobility(endpoint, strict=strict) as drone:
-            await fly(program, drone)
+        await fly(program, endpoint=endpoint, strict=strict, response_timeout_s=response_timeout_s)
         _log.info("run: mission complete")
     except MissionEnded as error:
         if not stays:
@@ -85,18 +114,43 @@ async def _run(program: Program, endpoint: Endpoint | None, strict: bool, stays:
             await asyncio.Event().wait()
 
 
-async def fly(program: Program, drone: Mobility) -> None:
-    """Fly a mission like `run`, inside a running event loop.
+async def fly(
+    program: Program,
+    drone: Mobility | None = None,
+    *,
+    endpoint: Endpoint | None = None,
+    strict: bool = False,
+    response_timeout_s: float = RESPONSE_TIMEOUT_S,
+) -> None:
+    """Fly a mission like `run`, inside a running event loop, for example in a notebook: `await fractus.fly(program)`.
+
+    Args:
+        program: Function that is called with the drone and its control.
+        drone: Client of the mobility service; by default a client that is closed after the mission.
+        endpoint: Endpoint of the service if `drone` is not given; by default from the environment.
+        strict: Raise `Corrected` if a policy changes a request, if `drone` is not given.
+        response_timeout_s: Seconds for which the program may block the event loop; see `Mobility.control`.
 
     Raises:
+        InvalidRequest: The program is no coroutine function of drone and control.
         MissionEnded: The mission ended early.
         FractusError: An error of the program that a retry cannot resolve.
     """
+    check_program(program)
+    if drone is None:
+        async with mobility(endpoint, strict=strict) as own:
+            await _fly(program, own, response_timeout_s)
+    else:
+        await _fly(program, drone, response_timeout_s)
+
+
+async def _fly(program: Program, drone: Mobility, response_timeout_s: float) -> None:
     complete = False
     while not complete:
         try:
             async with drone.control(
-                progress=lambda reason: _log.info("run: waiting for the drone (reason=%s)", reason)
+                progress=lambda reason: _log.info("run: waiting for the drone (reason=%s)", reason),
+                response_timeout_s=response_timeout_s,
             ) as control:
                 reached = control.waypoints_reached
                 _log.info(
@@ -120,7 +174,7 @@ async def _carry_out(program: Program, drone: Mobility, control: Control) -> Non
     interruptions = 0
     while True:
         try:
-            await program(drone, control)
+            await call_program(program, drone, control)
         except Interrupted as stopped:
             interruptions = interruptions + 1 if control.waypoints_reached == reached else 1
             reached = control.waypoints_reached

@@ -242,9 +242,19 @@ class Mobility(_Client[_drone.Mobility]):
         self.watch = Watch(self._loop, self._async.watch)
         """Changes of one part of the drone's state: `for gps in drone.watch.gps()`."""
 
-    def control(self, *, timeout_s: float | None = None, progress: _control.OnWait | None = None) -> Control:
-        """Return the control lease for the next control point: `with drone.control() as control`."""
-        return Control(self._loop, self._async.control(timeout_s=timeout_s, progress=progress))
+    def control(
+        self,
+        *,
+        timeout_s: float | None = None,
+        progress: _control.OnWait | None = None,
+        response_timeout_s: float = _control.RESPONSE_TIMEOUT_S,
+    ) -> Control:
+        """Return the control lease for the next control point: `with drone.control() as control`.
+
+        The event loop on the separate thread answers the liveness requests of the service, so the program may block.
+        """
+        lease = self._async.control(timeout_s=timeout_s, progress=progress, response_timeout_s=response_timeout_s)
+        return Control(self._loop, lease)
 
     arm = _waiting(_drone.Mobility.arm)
     disarm = _waiting(_drone.Mobility.disarm)

@@ -45,7 +45,7 @@ TOUR = events.GrantRef("t", commands_vehicle=True)
 EVENTS: tuple[events.Event, ...] = (
     events.StreamOpened(1, "a", "A"), events.StreamOpened(2, "b", "B"), events.StreamOpened(3, "a", "A"),
     events.StreamClosed(1), events.StreamClosed(2), events.StreamClosed(3),
-    events.TransitRequested(1), events.TransitFailed(1, "fault"),
+    events.DriverUnresponsive(1, 5.0), events.TransitRequested(1), events.TransitFailed(1, "fault"),
     events.GrantControl(1), events.GrantControl(2), events.GrantControl(3),
     events.ControlReturned("a", 1), events.ControlReturned("a", 9), events.ControlReturned("b", 1),
     events.WaypointsDone("a", 1), events.CruiseSpeedSet(3.0),

@@ -199,6 +199,19 @@ def test_second_stream_of_a_driver_is_refused_while_the_first_is_open() -> None:
     assert again.drives, "the driver cannot continue after its first stream ended"
 
 
+def test_unresponsive_driver_loses_control_and_may_come_back() -> None:
+    silent, actions = apply_events(*FLY, events.DriverUnresponsive(1, 5.0))
+    assert [(action.action, action.code) for action in actions if isinstance(action, RecordAudit)] == [
+        ("hover", "DriverUnresponsive")
+    ]
+    assert silent.task == SystemTask(1, TaskKind.HOVER)
+    assert [action.event.state for action in actions if isinstance(action, SendEvent)] == [StreamState.LOST]
+    resumed, _ = apply_events(events.StreamOpened(2, "a", "A"), events.GrantControl(2), state=silent)
+    assert (resumed.drives, resumed.grace) == (True, None)
+    home, _ = transition(silent, events.Tick(), 5.0)
+    assert home.missions["a"].outcome == Outcome(OutcomeKind.FAILED, "the driver's program did not respond for 5 s")
+
+
 def demand_hover(state: ControlState, lease_id: int, code: str = "Code") -> ControlState:
     """Take control for a driver, then demand a takeover with the action `hover`."""
     state, _ = apply_events(

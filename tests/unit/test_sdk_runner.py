@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import logging
 import signal
-from typing import Any
 
 import fractus
 import pytest
@@ -17,19 +15,15 @@ from fractus import runner
 def test_run_waits_for_sigterm_after_mission_in_a_pod(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, *, over: bool
 ) -> None:
-    async def fly(_program: runner.Program, _drone: fractus.Mobility) -> None:
+    async def fly(_program: object, **_options: object) -> None:
         asyncio.get_running_loop().call_soon(signal.raise_signal, signal.SIGTERM)
         if not over:
             await asyncio.Event().wait()
-
-    def nothing(*_: Any, **_more: Any) -> contextlib.nullcontext[None]:
-        return contextlib.nullcontext()
 
     async def program(_drone: fractus.Mobility, _control: fractus.Control) -> None:
         raise AssertionError("the program must not start")
 
     monkeypatch.setattr(runner, "fly", fly)
-    monkeypatch.setattr(runner, "mobility", nothing)
     with caplog.at_level(logging.INFO):
         runner.run(program, stay=True)
     assert ("run: stopping" in caplog.text) != over

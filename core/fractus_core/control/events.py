@@ -27,6 +27,14 @@ class StreamClosed:
 
 
 @dataclass(frozen=True, slots=True)
+class DriverUnresponsive:
+    """The program of a driver with control did not answer a liveness request for `waited_s` seconds."""
+
+    lease_id: int
+    waited_s: float
+
+
+@dataclass(frozen=True, slots=True)
 class TransitRequested:
     """The system is about to bring the vehicle to the control point of a waiting driver."""
 
@@ -357,8 +365,8 @@ class Tick:
 
 
 DriverEvent = (
-    StreamOpened | StreamClosed | TransitRequested | TransitFailed | GrantControl | ControlReturned | WaypointsDone
-    | CruiseSpeedSet
+    StreamOpened | StreamClosed | DriverUnresponsive | TransitRequested | TransitFailed | GrantControl | ControlReturned
+    | WaypointsDone | CruiseSpeedSet
 )  # fmt: skip
 MotionEvent = MotionBegan | MotionFinished | MotionFailed | MotionCancelled | MotionStopped
 PolicyEvent = TakeoverDemanded | BrakeDemanded | PositionLost | PositionFound | GrantChanged

@@ -26,6 +26,7 @@ from fractus_core.control.events import (
     ControlReturned,
     CruiseSpeedSet,
     DriverEvent,
+    DriverUnresponsive,
     Event,
     GrantChanged,
     GrantControl,
@@ -66,6 +67,7 @@ from fractus_core.control.state import (
     ControlEvent,
     ControlLease,
     ControlState,
+    Mission,
     OutcomeKind,
     StreamState,
     SystemTask,
@@ -166,6 +168,8 @@ def _on_driver(update: StateUpdate, event: DriverEvent) -> None:
             _open_stream(update, event)
         case StreamClosed():
             _close_stream(update, event)
+        case DriverUnresponsive():
+            _drop_unresponsive_driver(update, event)
         case TransitRequested(lease_id):
             lease = update.state.lease
             if lease is not None and lease.lease_id == lease_id and update.state.authority is not Authority.PILOT:
@@ -268,21 +272,47 @@ def _close_stream(update: StateUpdate, event: StreamClosed) -> None:
     not help.
     """
     lease = update.state.lease
-    motion = update.state.motion
     if lease is None or lease.lease_id != event.lease_id:
         return
     update.drop_lease()
     mission = update.state.missions.get(lease.key)
     if mission is None or not (lease.granted or lease.transit):
         return
-    update.set(authority=Authority.SYSTEM)
     update.audit("control", DRIVER_LOST, lease.identity, "its stream broke")
+    _leave_driver(update, mission, "the driver's stream broke", DRIVER_LOST)
+
+
+def _drop_unresponsive_driver(update: StateUpdate, event: DriverUnresponsive) -> None:
+    """Take the vehicle from a driver whose program hangs, although its connection is intact."""
+    lease = update.state.lease
+    if lease is None or lease.lease_id != event.lease_id or not update.state.drives:
+        return
+    mission = update.mission(lease.key, lease.identity)
+    reason = f"the driver's program did not respond for {event.waited_s:g} s"
+    update.audit("takeover", TaskKind.HOVER.value, "system", reason, "DriverUnresponsive")
+    update.drop_lease()
+    remedy = "do not block its event loop: use asyncio.sleep and asyncio.to_thread"
+    update.act(SendEvent(lease.lease_id, ControlEvent(StreamState.LOST, reason=f"{reason}; {remedy}")))
+    _leave_driver(update, mission, reason, reason)
+
+
+def _leave_driver(update: StateUpdate, mission: Mission, stopped: str, reason: str) -> None:
+    """Hover without the driver, and start its grace period.
+
+    Args:
+        update: State whose lease was dropped.
+        mission: Mission of the driver.
+        stopped: Reason for the caller of the current motion.
+        reason: Reason with which the mission fails at the end of the grace period.
+    """
+    motion = update.state.motion
+    update.set(authority=Authority.SYSTEM)
     returns = motion is not None and motion.kind == "ReturnToLaunch"
     lands = motion is not None and motion.kind == "Land" and update.state.vehicle.mode.comes_down
-    update.stop_motion(StopKind.LOST, "ControlLost", "the driver's stream broke")
+    update.stop_motion(StopKind.LOST, "ControlLost", stopped)
     if update.state.vehicle.armed and not lands:
         update.start(TaskKind.RETURN if returns else TaskKind.HOVER)
-    update.begin_grace(mission, DRIVER_LOST)
+    update.begin_grace(mission, reason)
 
 
 def _fail_transit(update: StateUpdate, event: TransitFailed) -> None:
@@ -372,7 +402,7 @@ def _take_over(update: StateUpdate, event: TakeoverDemanded) -> None:
         if takeovers >= MAX_REPEATED_TAKEOVERS:
             kind = TaskKind.RETURN
             outcome = OutcomeKind.FAILED
-            reason = f"{reason} (the driver caused this takeover {takeovers} times without a further waypoint)"
+            reason = f"{reason}; the driver caused this takeover {takeovers} times without a further waypoint"
     update.seize(kind, event.code, reason, event.policies, outcome)
 
 

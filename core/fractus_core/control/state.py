@@ -141,6 +141,7 @@ class StreamState(Enum):
     WAITING = "waiting"
     GRANTED = "granted"
     PASSENGER = "passenger"
+    PING = "ping"
     LOST = "lost"
     COMPLETE = "complete"
 
@@ -156,6 +157,7 @@ class ControlEvent:
         waypoints_reached: Number of completed waypoints of the control point, or of visited points of interest.
         code: Code of the verdict with which a policy took the vehicle; empty if no policy did.
         policies: Policies that demanded the takeover.
+        ping: Number of a liveness request.
     """
 
     state: StreamState
@@ -164,6 +166,7 @@ class ControlEvent:
     waypoints_reached: int = 0
     code: str = ""
     policies: tuple[str, ...] = ()
+    ping: int = 0
 
     @property
     def final(self) -> bool:

@@ -12,11 +12,13 @@ from typing import ClassVar as _ClassVar, Optional as _Optional, Union as _Union
 DESCRIPTOR: _descriptor.FileDescriptor
 
 class GetControlRequest(_message.Message):
-    __slots__ = ()
-    def __init__(self) -> None: ...
+    __slots__ = ("response_timeout_s",)
+    RESPONSE_TIMEOUT_S_FIELD_NUMBER: _ClassVar[int]
+    response_timeout_s: float
+    def __init__(self, response_timeout_s: _Optional[float] = ...) -> None: ...
 
 class ControlEvent(_message.Message):
-    __slots__ = ("state", "control_point", "reason", "waypoints_reached", "task", "decision")
+    __slots__ = ("state", "control_point", "reason", "waypoints_reached", "task", "decision", "ping")
     class State(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
         __slots__ = ()
         STATE_UNSPECIFIED: _ClassVar[ControlEvent.State]
@@ -24,12 +26,14 @@ class ControlEvent(_message.Message):
         STATE_GRANTED: _ClassVar[ControlEvent.State]
         STATE_LOST: _ClassVar[ControlEvent.State]
         STATE_COMPLETE: _ClassVar[ControlEvent.State]
+        STATE_PING: _ClassVar[ControlEvent.State]
         STATE_PASSENGER: _ClassVar[ControlEvent.State]
     STATE_UNSPECIFIED: ControlEvent.State
     STATE_WAITING: ControlEvent.State
     STATE_GRANTED: ControlEvent.State
     STATE_LOST: ControlEvent.State
     STATE_COMPLETE: ControlEvent.State
+    STATE_PING: ControlEvent.State
     STATE_PASSENGER: ControlEvent.State
     STATE_FIELD_NUMBER: _ClassVar[int]
     CONTROL_POINT_FIELD_NUMBER: _ClassVar[int]
@@ -37,13 +41,25 @@ class ControlEvent(_message.Message):
     WAYPOINTS_REACHED_FIELD_NUMBER: _ClassVar[int]
     TASK_FIELD_NUMBER: _ClassVar[int]
     DECISION_FIELD_NUMBER: _ClassVar[int]
+    PING_FIELD_NUMBER: _ClassVar[int]
     state: ControlEvent.State
     control_point: int
     reason: str
     waypoints_reached: int
     task: _types_pb2.ControlPoint
     decision: _types_pb2.Decision
-    def __init__(self, state: _Optional[_Union[ControlEvent.State, str]] = ..., control_point: _Optional[int] = ..., reason: _Optional[str] = ..., waypoints_reached: _Optional[int] = ..., task: _Optional[_Union[_types_pb2.ControlPoint, _Mapping]] = ..., decision: _Optional[_Union[_types_pb2.Decision, _Mapping]] = ...) -> None: ...
+    ping: int
+    def __init__(self, state: _Optional[_Union[ControlEvent.State, str]] = ..., control_point: _Optional[int] = ..., reason: _Optional[str] = ..., waypoints_reached: _Optional[int] = ..., task: _Optional[_Union[_types_pb2.ControlPoint, _Mapping]] = ..., decision: _Optional[_Union[_types_pb2.Decision, _Mapping]] = ..., ping: _Optional[int] = ...) -> None: ...
+
+class ConfirmAliveRequest(_message.Message):
+    __slots__ = ("ping",)
+    PING_FIELD_NUMBER: _ClassVar[int]
+    ping: int
+    def __init__(self, ping: _Optional[int] = ...) -> None: ...
+
+class ConfirmAliveResponse(_message.Message):
+    __slots__ = ()
+    def __init__(self) -> None: ...
 
 class ReportProgressRequest(_message.Message):
     __slots__ = ("waypoints",)

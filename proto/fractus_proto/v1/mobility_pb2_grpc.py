@@ -39,6 +39,11 @@ class MobilityServiceStub(object):
                 request_serializer=fractus__proto_dot_v1_dot_mobility__pb2.GetControlRequest.SerializeToString,
                 response_deserializer=fractus__proto_dot_v1_dot_mobility__pb2.ControlEvent.FromString,
                 _registered_method=True)
+        self.ConfirmAlive = channel.unary_unary(
+                '/fractus.v1.MobilityService/ConfirmAlive',
+                request_serializer=fractus__proto_dot_v1_dot_mobility__pb2.ConfirmAliveRequest.SerializeToString,
+                response_deserializer=fractus__proto_dot_v1_dot_mobility__pb2.ConfirmAliveResponse.FromString,
+                _registered_method=True)
         self.ReturnControl = channel.unary_unary(
                 '/fractus.v1.MobilityService/ReturnControl',
                 request_serializer=fractus__proto_dot_v1_dot_mobility__pb2.ReturnControlRequest.SerializeToString,
@@ -128,6 +133,13 @@ class MobilityServiceServicer(object):
         """Blocks until the drone is at the caller's next control point, then sends GRANTED. The stream is the control lease: it stays
         open while the caller has control. If it breaks, the system hovers and then flies the drone home. A second stream of the same
         caller waits while the first one is open, and is refused (ControlHeld) after 6 s.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def ConfirmAlive(self, request, context):
+        """Answers a liveness request of the control stream.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -245,6 +257,11 @@ def add_MobilityServiceServicer_to_server(servicer, server):
                     request_deserializer=fractus__proto_dot_v1_dot_mobility__pb2.GetControlRequest.FromString,
                     response_serializer=fractus__proto_dot_v1_dot_mobility__pb2.ControlEvent.SerializeToString,
             ),
+            'ConfirmAlive': grpc.unary_unary_rpc_method_handler(
+                    servicer.ConfirmAlive,
+                    request_deserializer=fractus__proto_dot_v1_dot_mobility__pb2.ConfirmAliveRequest.FromString,
+                    response_serializer=fractus__proto_dot_v1_dot_mobility__pb2.ConfirmAliveResponse.SerializeToString,
+            ),
             'ReturnControl': grpc.unary_unary_rpc_method_handler(
                     servicer.ReturnControl,
                     request_deserializer=fractus__proto_dot_v1_dot_mobility__pb2.ReturnControlRequest.FromString,
@@ -353,6 +370,33 @@ class MobilityService(object):
             '/fractus.v1.MobilityService/GetControl',
             fractus__proto_dot_v1_dot_mobility__pb2.GetControlRequest.SerializeToString,
             fractus__proto_dot_v1_dot_mobility__pb2.ControlEvent.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def ConfirmAlive(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/fractus.v1.MobilityService/ConfirmAlive',
+            fractus__proto_dot_v1_dot_mobility__pb2.ConfirmAliveRequest.SerializeToString,
+            fractus__proto_dot_v1_dot_mobility__pb2.ConfirmAliveResponse.FromString,
             options,
             channel_credentials,
             insecure,

@@ -273,8 +273,8 @@ class MobilitySettings:
     The checks are needed because a change of the autopilot's readiness does not wake the task of the caller.
     """
 
-    stream_event_timeout_s: float = 5.0
-    """Longest uninterrupted wait for the next event of a control lease, in seconds. The wait is then repeated."""
+    ping_interval_s: float = 1.0
+    """Seconds between liveness requests to a driver with control. It is also the longest wait for the next event of a lease."""
 
     second_stream_wait_s: float = 6.0
     """Seconds for which a second control stream of a driver waits for the end of the first one before it is refused.

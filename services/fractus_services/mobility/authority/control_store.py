@@ -18,6 +18,7 @@ from fractus_core.control.events import (
     BrakeDemanded,
     ControlReturned,
     CruiseSpeedSet,
+    DriverUnresponsive,
     Event,
     GrantChanged,
     GrantControl,
@@ -297,6 +298,16 @@ class ControlStore:
         """End the lease of a driver whose stream ended."""
         self.dispatch(StreamClosed(lease.lease_id))
         self.effects.leases.pop(lease.lease_id, None)
+
+    def drop_unresponsive_driver(self, lease: Lease, waited_s: float) -> None:
+        """Take the drone from a driver that did not answer a liveness request for `waited_s` seconds."""
+        self.dispatch(DriverUnresponsive(lease.lease_id, waited_s))
+
+    def confirm_alive(self, grant: ActiveGrant, ping: int) -> None:
+        """Store the answer of a driver to a liveness request. A driver without control needs no answer."""
+        lease = self.lease
+        if lease is not None and lease.key == grant.key:
+            lease.confirm(ping)
 
     def require_control(self, grant: ActiveGrant) -> Lease:
         """Return the lease of a caller that moves the drone.

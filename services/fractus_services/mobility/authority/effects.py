@@ -9,7 +9,7 @@ from collections.abc import Coroutine, Sequence
 from dataclasses import dataclass, field
 from typing import Any, assert_never
 
-from fractus_core.control import Authority, ControlEvent
+from fractus_core.control import Authority, ControlEvent, StreamState
 from fractus_core.control.actions import (
     Action,
     Brake,
@@ -53,6 +53,7 @@ class Lease:
         lease_id: Id in the control state.
         key: Key of the mission.
         grant: Current Grant of the driver. Its key does not change.
+        responded: True if the driver has answered the last liveness request.
     """
 
     def __init__(self, grant: ActiveGrant) -> None:
@@ -60,10 +61,22 @@ class Lease:
         self.key = grant.key
         self.grant = grant
         self._events: asyncio.Queue[ControlEvent | None] = asyncio.Queue()
+        self._ping = 0
+        self.responded = True
 
     def send(self, event: ControlEvent | None) -> None:
         """Queue an event for the driver. None ends the stream without an event."""
         self._events.put_nowait(event)
+
+    def next_ping(self) -> ControlEvent:
+        """Return a liveness request, which the driver has to answer."""
+        self._ping += 1
+        self.responded = False
+        return ControlEvent(StreamState.PING, ping=self._ping)
+
+    def confirm(self, ping: int) -> None:
+        """Store the answer of the driver to a liveness request. An answer to an earlier request has no effect."""
+        self.responded = self.responded or ping == self._ping
 
     async def receive(self, timeout_s: float) -> ControlEvent | None:
         """Return the next event, or None at the end of the stream.

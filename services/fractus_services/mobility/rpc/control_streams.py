@@ -10,11 +10,15 @@ from fractus_core.control.events import PassengerBoarded, TransitRequested
 from fractus_core.control.machine import SECOND_STREAM
 from fractus_core.control.state import ended_refusal
 
-from fractus_services.errors import PolicyDenied, PreconditionFailed
+from fractus_services.errors import InvalidRequest, PolicyDenied, PreconditionFailed
 from fractus_services.grant_files import ActiveGrant
 from fractus_services.mobility.authority.control_store import ControlStore
 from fractus_services.mobility.authority.effects import Lease
 from fractus_services.mobility.settings import SETTINGS
+
+MIN_RESPONSE_TIMEOUT_S = 1.0
+MAX_RESPONSE_TIMEOUT_S = 60.0
+"""Limits of the time within which a driver answers liveness requests."""
 
 
 class ControlStreams:
@@ -29,17 +33,26 @@ class ControlStreams:
         self._control = control
         self._bring = bring
 
-    def follow(self, grant: ActiveGrant) -> AsyncGenerator[ControlEvent, None]:
+    def follow(self, grant: ActiveGrant, response_timeout_s: float = 0.0) -> AsyncGenerator[ControlEvent, None]:
         """Yield the events of a caller's stream.
+
+        Args:
+            grant: Grant of the caller.
+            response_timeout_s: Seconds within which a driver with control has to answer liveness requests; 0 for no requests.
 
         Raises:
             Refused: The caller may neither control the drone nor follow a mission.
         """
-        return self._follow_mission(grant) if grant.spec.tour else self._drive(grant)
+        if response_timeout_s and not MIN_RESPONSE_TIMEOUT_S <= response_timeout_s <= MAX_RESPONSE_TIMEOUT_S:
+            limits = f"{MIN_RESPONSE_TIMEOUT_S:g} to {MAX_RESPONSE_TIMEOUT_S:g} s, or 0 for no liveness requests"
+            raise InvalidRequest(
+                "InvalidArgument", f"response_timeout_s is {response_timeout_s:g}; it must be {limits}"
+            )
+        return self._follow_mission(grant) if grant.spec.tour else self._drive(grant, response_timeout_s)
 
     # Drivers
 
-    async def _drive(self, grant: ActiveGrant) -> AsyncGenerator[ControlEvent, None]:
+    async def _drive(self, grant: ActiveGrant, response_timeout_s: float) -> AsyncGenerator[ControlEvent, None]:
         """Yield the events of a driver. The driver has control from GRANTED until this generator is closed."""
         control = self._control
         if grant.spec.class_ != "driver":
@@ -55,18 +68,37 @@ class ControlStreams:
                         yield ControlEvent(StreamState.WAITING, control.mission(grant).points_done, reason)
                 if control.not_ready_reason(lease.key) is None:
                     control.grant_control(lease)
-            while True:
-                try:
-                    event = await lease.receive(SETTINGS.stream_event_timeout_s)
-                except TimeoutError:
-                    continue
-                if event is None:
-                    return
-                yield event
-                if event.final:
-                    return
+            async with aclosing(self._events(lease, response_timeout_s)) as events:
+                async for event in events:
+                    yield event
         finally:
             control.close_lease(lease)
+
+    async def _events(self, lease: Lease, response_timeout_s: float) -> AsyncGenerator[ControlEvent, None]:
+        """Yield the events of a lease until its end, and a liveness request whenever the previous one was answered.
+
+        The waiting time is counted in completed intervals and not read from a clock. An answer that arrived while the service
+        itself was suspended is therefore noticed in time.
+        """
+        waited_s = 0.0
+        while True:
+            try:
+                event = await lease.receive(SETTINGS.ping_interval_s)
+            except TimeoutError:
+                waited_s += SETTINGS.ping_interval_s
+                if not response_timeout_s:
+                    continue
+                if lease.responded:
+                    waited_s = 0.0
+                    yield lease.next_ping()
+                elif waited_s >= response_timeout_s:
+                    self._control.drop_unresponsive_driver(lease, waited_s)
+                continue
+            if event is None:
+                return
+            yield event
+            if event.final:
+                return
 
     async def _until_alone(self, grant: ActiveGrant) -> AsyncGenerator[str, None]:
         """Wait until no other stream of this driver is open, at most `second_stream_wait_s`. Yield the reason once.

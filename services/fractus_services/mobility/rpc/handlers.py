@@ -89,7 +89,7 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
 
     # Control
 
-    async def GetControl(self, _request: mobility_pb2.GetControlRequest, context: CallContext) -> None:  # noqa: N802
+    async def GetControl(self, request: mobility_pb2.GetControlRequest, context: CallContext) -> None:  # noqa: N802
         """See mobility.proto."""
         async with self.admission.call(context, lasting=True) as caller:
             grant = self.admission.grant_of(caller)
@@ -98,12 +98,20 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
                 # The stream ends at the latest when the certificate that authenticated the connection expires.
                 async with (
                     asyncio.timeout(caller.left_s),
-                    aclosing(self._streams.follow(grant)) as events,
+                    aclosing(self._streams.follow(grant, request.response_timeout_s)) as events,
                 ):
                     async for event in events:
                         await context.write(control_event(event, grant.spec.control_points))
             except TimeoutError:
                 caller.check()
+
+    async def ConfirmAlive(  # noqa: N802
+        self, request: mobility_pb2.ConfirmAliveRequest, context: CallContext
+    ) -> mobility_pb2.ConfirmAliveResponse:
+        """See mobility.proto."""
+        async with self.admission.call(context, urgent=True) as caller:
+            self._control.confirm_alive(self.admission.grant_of(caller), request.ping)
+            return mobility_pb2.ConfirmAliveResponse()
 
     async def ReturnControl(  # noqa: N802
         self, _request: mobility_pb2.ReturnControlRequest, context: CallContext

@@ -134,6 +134,7 @@ def control_event(event: ControlEvent, points: Sequence[ControlPoint]) -> mobili
     )
     if event.state is StreamState.GRANTED and event.control_point < len(points):
         message.task.CopyFrom(_task(points[event.control_point]))
+    message.ping = event.ping
     if event.code:
         message.decision.CopyFrom(decision(Verdict("takeover", None, event.code, event.reason, event.policies)))
     return message
@@ -217,6 +218,7 @@ def _invalid(reason: str) -> Refused:
 
 _STATES = {
     StreamState.WAITING: mobility_pb2.ControlEvent.STATE_WAITING,
+    StreamState.PING: mobility_pb2.ControlEvent.STATE_PING,
     StreamState.PASSENGER: mobility_pb2.ControlEvent.STATE_PASSENGER,
     StreamState.GRANTED: mobility_pb2.ControlEvent.STATE_GRANTED,
     StreamState.LOST: mobility_pb2.ControlEvent.STATE_LOST,

@@ -6,7 +6,8 @@ Each row of `tests/golden/vehicle/arducopter-4.6.3.tsv` is a step: name, action,
 explains an intended difference of the simulated vehicle, or why a step cannot be repeated. Numbers in responses may
 have a tolerance: `4.2~10%` accepts a deviation of 10 %, and `4.2~0.5` a deviation of 0.5.
 
-Without --autopilot, the script is played on the simulated vehicle after a cold start, in simulated time.
+Without --autopilot, the script is played on the simulated vehicle after a cold start, in simulated time. With --autopilot, steps that
+abort SITL are not played. If the link is lost, the script continues after a reconnection, and the summary is printed in any case.
 """
 
 from __future__ import annotations
@@ -31,6 +32,12 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 STEPS = Path(__file__).parents[1] / "golden/vehicle/arducopter-4.6.3.tsv"
 HOME = Place.from_degrees(50.864, 4.679, 0.1)
 """Position of the recorded vehicle."""
+
+RECONNECT_TIMEOUT_S = 20.0
+"""Time within which a lost link must be open again. A vehicle that has aborted does not return."""
+
+LONGEST_INTERVAL_US = 2.0**31
+"""Message interval from which the conversion to an integer aborts SITL, in microseconds."""
 
 ELSEWHERE_M = 5_000.0
 """A vehicle at least this far from the recorded position, in metres, has another home."""
@@ -114,6 +121,9 @@ class Connection(Protocol):
     def receive(self) -> list[Message]:
         """Return the messages received since the last call. Time advances by a small step."""
 
+    def reconnect(self) -> bool:
+        """Open a lost link again. Return False if that failed."""
+
 
 class SimulatedConnection:
     """The simulated vehicle after a cold start, in simulated time."""
@@ -135,13 +145,18 @@ class SimulatedConnection:
         self.now_s = self._simulation.time_s
         return self._endpoint.decode(self._channel.take())
 
+    def reconnect(self) -> bool:
+        """Return True, because this link is never lost."""
+        return True
+
 
 class TcpConnection:
     """An autopilot behind a TCP link, in real time."""
 
     def __init__(self, address: str) -> None:
         _, host, port = address.split(":")
-        self._socket = socket.create_connection((host, int(port)), 10.0)
+        self._address = host, int(port)
+        self._socket = socket.create_connection(self._address, 10.0)
         self._endpoint = Endpoint(255, mavlink.MAV_COMP_ID_MISSIONPLANNER, saturate=True)
         self._begun_s = time.monotonic()
         self.now_s = 0.0
@@ -158,6 +173,19 @@ class TcpConnection:
             raise ConnectionError("the autopilot closed the link")
         self.now_s = time.monotonic() - self._begun_s
         return self._endpoint.decode(data)
+
+    def reconnect(self) -> bool:
+        """Try to connect for `RECONNECT_TIMEOUT_S`."""
+        self._socket.close()
+        deadline = time.monotonic() + RECONNECT_TIMEOUT_S
+        while time.monotonic() < deadline:
+            try:
+                self._socket = socket.create_connection(self._address, 1.0)
+            except OSError:
+                time.sleep(0.5)
+            else:
+                return True
+        return False
 
 
 @dataclass(frozen=True, slots=True)
@@ -659,51 +687,118 @@ class Player:
         return f"s={waited_s:.1f} mode={self._mode()}"
 
 
-def compare(connection: Connection, report: Callable[[Step, str, str], None], script: Sequence[Step]) -> int:
-    """Play and report all steps (`same`, `differs`, `intended` or `not played`). Return the number of differences."""
+def abort_reason(action: str) -> str:
+    """Return why a step aborts SITL. Such a step is played on the simulated vehicle only. The text is empty for all other steps."""
+    verb, *words = action.split()
+    lists = words[1:2] if verb in ("upload", "stored") and words[0] == "fence" else []
+    if any(not math.isfinite(value) for name in lists for *_, params in LISTS.get(name, ()) for value in params):
+        return "a fence item that is not a number aborts SITL"
+    intervals = words[1:2] if verb in ("interval", "rate") else []
+    if verb == "command" and words[:1] == [str(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL)]:
+        intervals = words[2:3]
+    # The comparison is also False for NaN.
+    if any(not float(interval) < LONGEST_INTERVAL_US for interval in intervals):
+        return "this message interval aborts SITL"
+    return ""
+
+
+@dataclass(slots=True)
+class Summary:
+    """Result of a comparison.
+
+    Attributes:
+        played: Number of steps with a response.
+        wrong: Number of steps that differ unintentionally.
+        lost: True if the link was lost and did not return.
+    """
+
+    played: int = 0
+    wrong: int = 0
+    lost: bool = False
+
+
+def compare(
+    connection: Connection,
+    report: Callable[[Step, str, str], None],
+    script: Sequence[Step],
+    summary: Summary,
+    *,
+    simulated: bool,
+) -> None:
+    """Play and report all steps: `same`, `differs`, `intended` or `not played`.
+
+    Args:
+        connection: Link to the autopilot.
+        report: Called with each step, its response (or the reason why it was not played) and the verdict.
+        script: Steps.
+        summary: Updated with each step, so that it is valid after an interruption.
+        simulated: True if the autopilot is the simulated vehicle, on which all steps are played.
+    """
     player = Player(connection)
-    wrong = 0
     for step in script:
-        if not step.action:
-            report(step, "", "not played")
+        if summary.lost or not step.action:
+            report(step, "the link was lost" if summary.lost else "", "not played")
+            continue
+        if not simulated and (reason := abort_reason(step.action)):
+            report(step, reason, "not played")
             continue
         try:
             response = player.play(step.action)
-        except (TimeoutError, AssertionError) as error:
+        except OSError as error:
+            # TimeoutError of the player is an OSError too, but then the link still works.
             response = f"no response ({error})"
+            summary.lost = not isinstance(error, TimeoutError) and not connection.reconnect()
+        except (AssertionError, LookupError) as error:
+            response = f"no response ({error or type(error).__name__})"
         verdict = "same" if matches(step.recorded, response) else "intended" if step.note else "differs"
-        wrong += verdict == "differs"
+        summary.played += 1
+        summary.wrong += verdict == "differs"
         report(step, response, verdict)
-    return wrong
 
 
-def main() -> None:
-    """Print the table."""
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Print the table, and return the exit code: 0 if all steps were played and none differs unintentionally."""
     parser = argparse.ArgumentParser(description="Compare an autopilot with a real ArduCopter 4.6.3.")
     parser.add_argument("--autopilot", help="tcp:HOST:PORT, freshly booted; default: the simulated vehicle")
     parser.add_argument(
         "--all", action="store_true", help="also print steps without differences and steps that are not played"
     )
     parser.add_argument("--steps", type=Path, default=STEPS, help="another script in the same format")
-    options = parser.parse_args()
-    connection: Connection = TcpConnection(options.autopilot) if options.autopilot else SimulatedConnection()
+    options = parser.parse_args(arguments)
+    connection: Connection
+    try:
+        connection = TcpConnection(options.autopilot) if options.autopilot else SimulatedConnection()
+    except (OSError, ValueError) as error:
+        parser.error(f"cannot connect to {options.autopilot}: {error}; expected tcp:HOST:PORT of a running autopilot")
 
     script = steps(options.steps)
     begun_s = time.monotonic()
-    played = 0
+    reported = 0
 
     def report(step: Step, response: str, verdict: str) -> None:
-        nonlocal played
-        played += 1
+        nonlocal reported
+        reported += 1
         if options.all or verdict in ("differs", "intended"):
             print(f"{verdict:10} | {step.name} | {step.recorded} | {response} | {step.note}", flush=True)
-        progress = f"{played} of {len(script)} steps, {time.monotonic() - begun_s:.0f} s"
+        progress = f"{reported} of {len(script)} steps, {time.monotonic() - begun_s:.0f} s"
         print(progress, end="\r" if sys.stderr.isatty() else "\n", file=sys.stderr, flush=True)
 
-    wrong = compare(connection, report, script)
-    print(f"{wrong} of {len(script)} steps differ unintentionally")
-    sys.exit(1 if wrong else 0)
+    summary = Summary()
+    interrupted = False
+    try:
+        compare(connection, report, script, summary, simulated=not options.autopilot)
+    except KeyboardInterrupt:
+        interrupted = True
+    ending = ""
+    if summary.lost:
+        ending = "; the link to the autopilot was lost"
+    elif interrupted:
+        ending = "; interrupted"
+    print(
+        f"{summary.wrong} of {summary.played} played steps differ unintentionally, {len(script)} steps in total{ending}"
+    )
+    return 1 if summary.wrong or ending else 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

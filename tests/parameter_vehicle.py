@@ -9,6 +9,7 @@ from collections.abc import Collection, Mapping
 from fractus_runtime.mavlink_codec import Message, message
 from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
 from fractus_services.mobility.mavlink.mavlink_autopilot import MavlinkAutopilot
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 BY_NAME = 65535
 """Parameter index in responses to requests by name, and in reports of a change."""
@@ -29,7 +30,12 @@ FAILSAFES = {
 
 
 def parameter_responses(
-    values: dict[str, float], outgoing: Message, fixed: Collection[str] = (), hidden: Collection[str] = ()
+    values: dict[str, float],
+    outgoing: Message,
+    fixed: Collection[str] = (),
+    hidden: Collection[str] = (),
+    *,
+    errors: bool = False,
 ) -> list[Message]:
     """Return the responses of a vehicle to a parameter message.
 
@@ -38,6 +44,7 @@ def parameter_responses(
         outgoing: Received message.
         fixed: Parameters that cannot be set.
         hidden: Parameters that are missing in the list.
+        errors: True to answer with PARAM_ERROR, as ArduCopter does from 4.7 on.
     """
     listed = [name for name in values if name not in hidden]
 
@@ -54,9 +61,15 @@ def parameter_responses(
     if isinstance(index, int) and index >= 0:
         return [value(listed[index], index)] if index < len(listed) else []
     name = outgoing.text("param_id")
-    if name in values and name not in fixed and outgoing.name == "PARAM_SET":
+    refusal = message("PARAM_ERROR", param_id=name.encode(), param_index=-1, error=mavlink.MAV_PARAM_ERROR_READ_ONLY)
+    if name not in values:
+        absent = refusal._replace(values={**refusal.values, "error": mavlink.MAV_PARAM_ERROR_DOES_NOT_EXIST})
+        return [absent] if errors else []
+    if outgoing.name == "PARAM_SET" and name in fixed:
+        return [value(name), refusal] if errors else [value(name)]
+    if outgoing.name == "PARAM_SET":
         values[name] = outgoing.real("param_value")
-    return [value(name)] if name in values else []
+    return [value(name)]
 
 
 class ParameterVehicle(MavlinkAutopilot):
@@ -69,6 +82,7 @@ class ParameterVehicle(MavlinkAutopilot):
         loss: Share of frames lost in each direction.
         seed: Seed of the lost frames.
         delay_s: Time from a request to its response.
+        errors: True to answer with PARAM_ERROR, as ArduCopter does from 4.7 on.
     """
 
     def __init__(
@@ -80,6 +94,7 @@ class ParameterVehicle(MavlinkAutopilot):
         loss: float = 0.0,
         seed: int = 0,
         delay_s: float = 0.0,
+        errors: bool = False,
     ) -> None:
         super().__init__("tcp:nowhere:1", ARDUCOPTER)
         self.target = (1, 1)
@@ -88,6 +103,7 @@ class ParameterVehicle(MavlinkAutopilot):
         self.hidden = hidden
         self.loss = loss
         self.delay_s = delay_s
+        self.errors = errors
         self.received_names: list[str] = []
         self._random = random.Random(seed)
 
@@ -95,7 +111,7 @@ class ParameterVehicle(MavlinkAutopilot):
         self.received_names.append(outgoing.name)
         if self._is_lost():
             return
-        for response in parameter_responses(self.values, outgoing, self.fixed, self.hidden):
+        for response in parameter_responses(self.values, outgoing, self.fixed, self.hidden, errors=self.errors):
             if not self._is_lost():
                 asyncio.get_running_loop().call_later(self.delay_s, self.take, response)
 

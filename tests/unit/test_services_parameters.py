@@ -10,11 +10,13 @@ import pytest
 from depth import examples
 from fractus_core.policy.decision_types import Airframe
 from fractus_runtime.mavlink_codec import message
+from fractus_services.errors import AutopilotError
 from fractus_services.mobility.autopilot import FailsafeStatus
 from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
 from fractus_services.mobility.mavlink.failsafes import MavlinkFailsafes, Reader
 from fractus_services.mobility.mavlink.parameters import ParameterLost
 from parameter_vehicle import BY_NAME, ParameterVehicle
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from virtual_time import run
 
 OTHER_PARAMETERS = {f"P{number:04}": float(number) for number in range(1380)}
@@ -115,6 +117,54 @@ def test_absent_parameter_is_detected_by_one_list_request() -> None:
         assert vehicle.now - begun < 0.1
 
     run(read_parameters())
+
+
+def test_absent_parameter_is_detected_by_an_error_message_without_the_list() -> None:
+    async def read_parameters() -> None:
+        values = {name: value for name, value in AS_4_7.items() if name != "BATT_FS_CRT_ACT"} | OTHER_PARAMETERS
+        vehicle = ParameterVehicle(values, delay_s=0.05, errors=True)
+        begun = vehicle.now
+        checked = await started(vehicle)
+        assert not checked.problem
+        assert checked.missing == ("BATT_FS_CRT_ACT",)
+        assert "PARAM_REQUEST_LIST" not in vehicle.received_names
+        assert vehicle.now - begun < 2.0
+        vehicle.values["BATT_FS_CRT_ACT"] = 0.0
+        await started(vehicle)
+        assert not (await started(vehicle)).missing, "a parameter of a feature that was enabled meanwhile is used"
+
+    run(read_parameters())
+
+
+@pytest.mark.parametrize("release", [AS_4_6, AS_4_7, AS_4_7_0])
+def test_startup_with_lost_error_messages_uses_only_values_of_the_vehicle(release: dict[str, float]) -> None:
+    for seed in range(examples(10)):
+        vehicle = ParameterVehicle(release | OTHER_PARAMETERS, loss=0.2, seed=seed, delay_s=0.05, errors=True)
+        checked = run(started(vehicle))
+        assert checked.problem or rounded(checked.airframe) == FIGURES, f"seed {seed}"
+
+
+def test_refused_parameter_keeps_its_value_and_is_not_sent_again() -> None:
+    async def written() -> None:
+        fixed = ParameterVehicle({"RTL_ALT": 1500.0}, fixed=("RTL_ALT",), errors=True)
+        await fixed.vehicle_parameters.read([("RTL_ALT",)])
+        assert await fixed.vehicle_parameters.write("RTL_ALT", 3000.0) == 1500.0
+        assert fixed.received_names.count("PARAM_SET") == 1
+        with pytest.raises(AutopilotError, match="RTL_ALT_M cannot be set to 30: the autopilot has no such parameter"):
+            await fixed.vehicle_parameters.write("RTL_ALT_M", 30.0)
+
+    run(written())
+
+
+def test_error_message_of_an_earlier_request_does_not_refuse_a_later_one() -> None:
+    async def written() -> None:
+        vehicle = ParameterVehicle({"RTL_ALT": 1500.0}, errors=True)
+        absent = mavlink.MAV_PARAM_ERROR_DOES_NOT_EXIST
+        vehicle.take(message("PARAM_ERROR", param_id=b"RTL_ALT", param_index=-1, error=absent))
+        assert await vehicle.vehicle_parameters.write("RTL_ALT", 3000.0) == 3000.0
+        assert await vehicle.vehicle_parameters.read([("RTL_ALT",)]) == {"RTL_ALT": 3000.0}
+
+    run(written())
 
 
 def test_parameter_list_is_not_requested_if_all_parameters_are_reported() -> None:

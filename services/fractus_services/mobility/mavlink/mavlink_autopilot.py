@@ -337,6 +337,8 @@ class MavlinkAutopilot(AutopilotLink):
         self._rates.take(incoming.name)
         if incoming.name == "PARAM_VALUE":
             self.vehicle_parameters.take(incoming)
+        elif incoming.name == "PARAM_ERROR":
+            self.vehicle_parameters.take_error(incoming)
         elif incoming.name == "COMMAND_ACK":
             self._acknowledgements.take(incoming, self.now)
         elif incoming.name == "GIMBAL_DEVICE_ATTITUDE_STATUS" and self.vehicle.gimbal_measured is None:

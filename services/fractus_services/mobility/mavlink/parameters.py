@@ -59,8 +59,9 @@ class Recipient(Protocol):
 class Parameters:
     """Reads and writes parameters, and reports changes by other stations.
 
-    A parameter is absent only if the complete list is known and does not contain it. ArduPilot omits parameters of disabled features from
-    its list, so a parameter is requested by name first, and again afterwards.
+    A parameter is absent only if the autopilot reports that it does not exist (PARAM_ERROR, from ArduCopter 4.7 on), or if the complete
+    list is known and does not contain it. ArduPilot omits parameters of disabled features from its list, so a parameter is requested by
+    name first, and again afterwards.
 
     Args:
         link: Link to the vehicle.
@@ -92,6 +93,7 @@ class Parameters:
         self._list: dict[int, str] = {}
         self._size: int | None = None
         self._absent: set[str] = set()
+        self._errors: dict[str, int] = {}
 
     def take(self, message: Message) -> None:
         """Process a PARAM_VALUE: an answer, or a report that another station changed a parameter."""
@@ -116,6 +118,16 @@ class Parameters:
         if before is not None and not same(before, value) and not same(self._written.get(name, math.nan), value):
             self._on_change(name)
 
+    def take_error(self, message: Message) -> None:
+        """Process a PARAM_ERROR: a request for a parameter was refused."""
+        name = message.text("param_id")
+        self._number += 1
+        self._errors[name] = self._number
+        if message.integer("error") == mavlink.MAV_PARAM_ERROR_DOES_NOT_EXIST:
+            self._absent.add(name)
+        self._value_received.set()
+        self._value_received = asyncio.Event()
+
     def request(self, name: str) -> None:
         """Request one parameter without waiting for the answer."""
         self._request(name.encode(), -1)
@@ -135,7 +147,8 @@ class Parameters:
             self._request(name.encode(), -1)
 
         def fresh(names: Spellings) -> bool:
-            return any(self._received.get(name, 0) > begun for name in names)
+            received = any(self._received.get(name, 0) > begun for name in names)
+            return received or all(self._errors.get(name, 0) > begun for name in names)
 
         unanswered = await self._request_by_name(expected, fresh, ATTEMPTS_BEFORE_LIST)
         unknown = [" or ".join(names) for names in unanswered if not self._known(names)]
@@ -156,12 +169,14 @@ class Parameters:
 
         Raises:
             ParameterLost: The vehicle does not answer.
-            AutopilotError: The vehicle is not connected.
+            AutopilotError: The vehicle is not connected, or does not have the parameter any more.
         """
         async with self._locks.setdefault(name, asyncio.Lock()):
             self._written[name] = value
-            last_number = self._number
+            begun = self._number
+            last_number = begun
             different_values = 0
+            refused = False
             for _ in range(PARAMETER_ATTEMPTS):
                 self._link.send(
                     message(
@@ -172,16 +187,23 @@ class Parameters:
                         **self._link.address(silent=True),
                     )
                 )
-                while different_values < 2 and await self._answered(lambda: self._received.get(name, 0) > last_number):  # noqa: B023
+                while different_values < 2 and await self._answered(
+                    lambda: max(self._received.get(name, 0), self._errors.get(name, 0)) > last_number  # noqa: B023
+                ):
+                    refused = self._errors.get(name, 0) > begun
+                    if refused:
+                        break
                     if same(self.values[name], value):
                         return value
                     # The first different value may be a late answer to an earlier request.
                     last_number = self._received[name]
                     different_values += 1
-                if different_values > 1:
+                if different_values > 1 or refused:
                     break
             del self._written[name]
-        if not different_values:
+        if refused and (name in self._absent or name not in self.values):
+            raise AutopilotError(f"{name} cannot be set to {value:g}: the autopilot has no such parameter")
+        if not different_values and not refused:
             raise ParameterLost(f"{name} cannot be set to {value:g}: the autopilot does not answer")
         return self.values[name]
 
@@ -208,7 +230,7 @@ class Parameters:
         return [names for names in unanswered if not fresh(names)]
 
     def _names_to_request(self, names: Spellings) -> Spellings:
-        known = tuple(name for name in names if name in self._received)
+        known = tuple(name for name in names if name in self._received and name not in self._absent)
         return known[:1] or names
 
     def _request(self, name: bytes, index: int) -> None:

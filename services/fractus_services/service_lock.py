@@ -23,7 +23,7 @@ from fractus_services.options import CannotServe
 log = logging.getLogger(__name__)
 
 DEFAULT_LOCK_TIMEOUT_S = 60.0
-"""Default time to wait for the lock. It exceeds the 30 s after which Kubernetes kills the processes of a deleted pod."""
+"""Default time to wait for the lock. It exceeds the 40 s after which Kubernetes kills the processes of a deleted pod."""
 
 CHECK_INTERVAL_S = 0.2
 """Interval at which the holder checks that its lock file still exists under its path."""

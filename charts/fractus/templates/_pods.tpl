@@ -61,7 +61,8 @@ nodeAffinity:
 
 {{/*
 Common pod fields on drones and edge nodes. Argument: (dict "root" $ "part" "camera" "classes" (list "drone")). All pods tolerate
-every taint and have one PriorityClass, and the policy fractus-pods keeps other pods below it.
+every taint and have one PriorityClass, and the policy fractus-pods keeps other pods below it. "graceSeconds" is the time that a pod
+needs to stop (default 10).
 */}}
 {{- define "fractus.nodePod" -}}
 {{- $values := index .root.Values .part -}}
@@ -69,7 +70,7 @@ hostNetwork: true
 dnsPolicy: Default
 enableServiceLinks: false
 priorityClassName: {{ .root.Values.priorityClass.name | quote }}
-terminationGracePeriodSeconds: 10
+terminationGracePeriodSeconds: {{ .graceSeconds | default 10 }}
 affinity:
   {{- $ours := printf `{"key": "fractus.dev/class", "operator": "In", "values": %s}` (toJson .classes) | fromJson }}
   {{- $ours = dict "nodeSelectorTerms" (list (dict "matchExpressions" (list $ours))) }}

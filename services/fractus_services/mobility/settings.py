@@ -100,6 +100,15 @@ class MobilitySettings:
     A repeated arming attempt in this time can still use it.
     """
 
+    stop_timeout_s: float = 25.0
+    """Longest time for which a stopped service restores the owner's fence and parameters.
+
+    The chart's termination grace period of the service is longer.
+    """
+
+    stop_retry_s: float = 1.0
+    """Seconds between attempts to restore the owner's fence and parameters while the service stops."""
+
     verify_min_retry_s: float = 0.5
     """Shortest time between two checks of the failsafes."""
 

@@ -181,7 +181,10 @@ class Arming:
 
         Raises:
             PreconditionFailed: One of these conditions is not met.
+            Unavailable: The service is stopping.
         """
+        if self._control.stopping:
+            raise Unavailable("ServiceStopping", "the mobility service is stopping; arm again when it has started")
         status = self._control.failsafe_status
         if status is None or status.problem or (chosen is not None and status is not chosen):
             problem = (status.problem if status is not None else "") or BEING_SET

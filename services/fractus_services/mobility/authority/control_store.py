@@ -76,6 +76,7 @@ class ControlStore:
         effects: Execution of the state machine's actions.
         tasks: Background tasks.
         failsafe_status: Result of the last failsafe verification; None if it is outdated.
+        stopping: True once the service stops. The drone is then not armed any more.
     """
 
     def __init__(
@@ -110,6 +111,7 @@ class ControlStore:
         self._timer: asyncio.TimerHandle | None = None
         self._closed = False
         self.failsafe_status: FailsafeStatus | None = None
+        self.stopping = False
         self._constraints: FlightConstraints | None = None
         self._removed: ActiveGrant | None = None
         self._transit: tuple[ActiveGrant, CompiledGrant] | None = None

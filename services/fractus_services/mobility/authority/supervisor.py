@@ -1,6 +1,7 @@
 """Supervision of the control authority, on which the companion heartbeats depend.
 
-An armed drone without control authority is brought home. The fence and limits of a mission are removed after the mission.
+An armed drone without control authority is brought home. The fence and limits of a mission are removed after the mission, and
+before the service stops.
 """
 
 from __future__ import annotations
@@ -8,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import math
+from collections.abc import Callable
 
 from fractus_core.control.events import Tick
 
@@ -50,10 +52,33 @@ class Supervisor:
         if needed:
             self._needed_at = now
         due = now >= max(self._lower_at, self._needed_at + SETTINGS.lower_after_s)
-        if not needed and due and (self._fence.raised or self._limits.limited):
+        if not needed and due and self._restore_pending:
             self._lower_at = now + SETTINGS.lower_retry_s
             if self._lowering is None or self._lowering.done():
-                self._lowering = control.tasks.spawn(self._lower())
+                self._lowering = control.tasks.spawn(self._restore(self._idle))
+
+    async def stop(self) -> None:
+        """Restore the owner's fence and parameters before the service ends. No drone is armed any more.
+
+        The method waits while a drone stands on the ground with running motors, and until an arming attempt has ended. It returns
+        at once if the drone is in the air, because the autopilot's failsafe brings it home, or if the autopilot is silent. Values
+        that could not be restored are on disk, and the next start of the service restores them.
+        """
+        control = self._control
+        control.stopping = True
+        try:
+            async with asyncio.timeout(SETTINGS.stop_timeout_s):
+                while control.autopilot.starting.locked() or self._restore_pending:
+                    if control.state.vehicle.in_air or not control.state.vehicle.connected:
+                        break
+                    await self._restore(self._is_disarmed)
+                    await asyncio.sleep(SETTINGS.stop_retry_s)
+        except TimeoutError:
+            pass
+        if self._restore_pending:
+            log.warning(
+                "supervisor: stopping, the owner's fence or parameters are not restored yet; the next start restores them"
+            )
 
     def alive(self) -> bool:
         """Return True if this companion may hold off the autopilot's failsafe."""
@@ -71,14 +96,23 @@ class Supervisor:
         """Return True if the drone is disarmed, and no mission that has taken off before still runs."""
         state = self._control.state
         mission = state.mission
-        if not (state.decided and state.vehicle.connected) or state.vehicle.armed:
-            return False
         ended = mission is None or mission.outcome is not None or not mission.flown
-        return ended and not state.preparing
+        return state.decided and ended and self._is_disarmed()
 
-    async def _lower(self) -> None:
+    def _is_disarmed(self) -> bool:
+        """Return True if the motors are off and nobody is about to start them."""
+        state = self._control.state
+        return state.vehicle.connected and not state.vehicle.armed and not state.preparing
+
+    @property
+    def _restore_pending(self) -> bool:
+        """True while the vehicle has a fence or parameters of a mission."""
+        return self._fence.raised or self._limits.limited
+
+    async def _restore(self, allowed: Callable[[], bool]) -> None:
+        """Try to restore the owner's fence and parameters while `allowed` returns True."""
         for restore in (self._fence.lower, self._limits.lift):
             try:
-                await self._control.tasks.attempt(restore, self._idle)
+                await self._control.tasks.attempt(restore, allowed)
             except Exception:
                 log.exception("supervisor: cannot restore the owner's fence or limits, retrying")

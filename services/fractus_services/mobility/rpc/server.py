@@ -20,6 +20,7 @@ from fractus_services.grant_files import GrantFiles
 from fractus_services.grant_verifier import GrantVerifier
 from fractus_services.grpc_server import run_until, serve_grpc
 from fractus_services.mobility.authority.journal import Journal
+from fractus_services.mobility.authority.supervisor import Supervisor
 from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
 from fractus_services.mobility.mavlink.expected_position import EXPECTED_POSITION_FILE, ExpectedPositionFile
 from fractus_services.mobility.mavlink.failsafes import MavlinkFailsafes
@@ -130,7 +131,7 @@ def _connect(
 
 
 async def run(options: MobilityOptions, stop: asyncio.Event) -> None:
-    """Serve until `stop` is set, or a task of the service fails.
+    """Serve until `stop` is set and the owner's fence and parameters are restored, or a task of the service fails.
 
     Raises:
         CannotServe: An option is wrong. The error may be inside an ExceptionGroup.
@@ -177,18 +178,27 @@ async def run(options: MobilityOptions, stop: asyncio.Event) -> None:
     calls = serve_grpc("mobility", options.listen, tls, register, handlers.admission, node=node)
     running = [autopilot.run(), grants.run(), monitor.run(), monitor.record(), poi_missions.run(), calls]
     running.append(_watch_description(description, url, identified, fixed_link=bool(options.autopilot)))
+    stopped = asyncio.Event()
+    running.append(_stop(stop, components.supervisor, stopped))
     metrics.add_callback(
         partial(common_metrics, BackgroundReader(tls.expires_s), grants, audit, lambda: recorder.problem)
     )
     metrics.add_callback(partial(flight_metrics, control, components.supervisor))
     try:
         async with serve_metrics(options.metrics, metrics.collect):
-            await run_until(stop, *running)
+            await run_until(stopped, *running)
     finally:
         control.close()
     log.info("mobility: stopped, the autopilot's failsafe brings a flying drone home")
     await audit.close()
     await recorder.close()
+
+
+async def _stop(stop: asyncio.Event, supervisor: Supervisor, stopped: asyncio.Event) -> None:
+    """Set `stopped` when the vehicle is ready for the end of the service, after `stop` was set."""
+    await stop.wait()
+    await supervisor.stop()
+    stopped.set()
 
 
 def _record_grant(audit: AuditLog, old: Any, new: Any) -> None:

@@ -34,9 +34,9 @@ demo: packages uv ## Fly the traffic-monitoring example and leave its report in 
 # AUTOPILOT=tcp:HOST:PORT flies a running ArduCopter (SITL or a vehicle) at SPEEDUP=1, instead of simulated vehicles.
 SPEEDUP ?= $(if $(AUTOPILOT),1,3)
 .PHONY: scenario-field
-scenario-field: env ## Fly the field experiment and leave its report in out/field (AUTOPILOT=tcp:HOST:PORT)
+scenario-field: env ## Fly the field experiment and leave its report in out/field (AUTOPILOT=tcp:HOST:PORT; RESTORE=1: only restore what an interrupted run left there)
 	$(RUN) python -m fractus_sim.scenarios.field --out $(OUT)/field --speedup $(SPEEDUP) \
-		$(if $(AUTOPILOT),--autopilot $(AUTOPILOT))
+		$(if $(AUTOPILOT),--autopilot $(AUTOPILOT)) $(if $(RESTORE),--restore)
 
 .PHONY: scenario-links
 scenario-links: packages uv ## Fly past edge nodes with WiFi on an embedded cluster and leave the report in out/links (FACTOR=1: ratio of real to declared radio range)

@@ -180,6 +180,20 @@ def test_processes_are_killed_if_they_ignore_sigterm(tmp_path: Path, monkeypatch
     assert processes.exit_code("stubborn") == -signal.SIGKILL
 
 
+def test_processes_get_their_own_time_to_stop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("fractus_sim.testbeds.local_processes.STOP_TIMEOUT_S", 0.2)
+    slow = "import signal, sys, time; signal.signal(signal.SIGTERM, lambda *_: (time.sleep(1.5), sys.exit(7))); print('up', flush=True); time.sleep(60)"
+    processes = Processes(tmp_path)
+    processes.start("slow", [sys.executable, "-c", slow], {}, stop_timeout_s=30.0)
+    processes.start("killed", [sys.executable, "-c", slow], {})
+    for name in ("slow", "killed"):
+        processes.wait(name, lambda name=name: "up" in processes.log(name).read_text(), 20)  # type: ignore[misc]
+    processes.stop("killed")
+    processes.stop_all()
+    assert processes.exit_code("slow") == 7
+    assert processes.exit_code("killed") == -signal.SIGKILL
+
+
 def test_child_processes_end_with_their_program(tmp_path: Path) -> None:
     processes = Processes(tmp_path)
     child = f"sleep 600; : {tmp_path}"

@@ -32,10 +32,25 @@ class Processes:
     def __init__(self, logs: Path) -> None:
         self._logs = logs
         self._running: dict[str, subprocess.Popen[bytes]] = {}
+        self._stop_timeouts_s: dict[int, float] = {}
         self._guard = ProcessGuard()
 
-    def start(self, name: str, argv: Sequence[str], environment: Mapping[str, str], folder: Path | None = None) -> None:
+    def start(
+        self,
+        name: str,
+        argv: Sequence[str],
+        environment: Mapping[str, str],
+        folder: Path | None = None,
+        stop_timeout_s: float | None = None,
+    ) -> None:
         """Start a process. Its output is appended to `NAME.log`.
+
+        Args:
+            name: Name of the process.
+            argv: Program and arguments.
+            environment: Complete environment of the process.
+            folder: Working directory.
+            stop_timeout_s: Seconds between SIGTERM and SIGKILL when the process is stopped; `STOP_TIMEOUT_S` by default.
 
         Raises:
             ExperimentError: The process cannot be started, or a process with this name is running.
@@ -58,6 +73,8 @@ class Processes:
                 raise ExperimentError(f"{name}: cannot start {argv[0]}: {error.strerror}") from None
             self._running.pop(name, None)
             self._running[name] = process
+            if stop_timeout_s is not None:
+                self._stop_timeouts_s[process.pid] = stop_timeout_s
             self._guard.hold(process.pid)
 
     def log(self, name: str) -> Path:
@@ -143,8 +160,11 @@ class Processes:
             self._guard.close()
 
     def _wait_ended(self, processes: Sequence[subprocess.Popen[bytes]]) -> None:
-        deadline = time.monotonic() + STOP_TIMEOUT_S
-        while any(self._poll(process) is None for process in processes) and time.monotonic() < deadline:
+        began_s = time.monotonic()
+        while processes := [process for process in processes if self._poll(process) is None]:
+            waited_s = time.monotonic() - began_s
+            if all(waited_s >= self._stop_timeouts_s.get(process.pid, STOP_TIMEOUT_S) for process in processes):
+                return
             time.sleep(STOP_POLL_S)
 
     def _poll(self, process: subprocess.Popen[bytes]) -> int | None:

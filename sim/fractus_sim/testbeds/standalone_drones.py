@@ -231,6 +231,9 @@ class Standalone:
 
 
 START_TIMEOUT_S = 30.0
+MOBILITY_STOP_TIMEOUT_S = 40.0
+"""Time for which a stopped mobility service may restore the fence and the parameters of the vehicle's owner, as in the chart."""
+
 LOOPBACK = "127.0.0.1"
 _CAMERA_METHODS = ("CaptureImage", "RetrieveImage", "ListImages", "DeleteImage")
 _MOBILITY_METHODS = (
@@ -266,6 +269,8 @@ class DroneSetup:
         vehicle_arguments: Additional arguments of `fractus-vehicle`, such as `("--wind", "4,270,1")`.
         service_arguments: Additional arguments of `fractus mobility serve`.
         autopilot: `tcp:HOST:PORT` of a running autopilot. None: a simulated autopilot is started.
+        state: State directory of the mobility service. None: a directory in the directory of the drone. For a running autopilot,
+            use a directory that outlives the drone, because it contains the values of the vehicle's owner until they are restored.
     """
 
     name: str
@@ -281,6 +286,7 @@ class DroneSetup:
     vehicle_arguments: Sequence[str] = ()
     service_arguments: Sequence[str] = ()
     autopilot: str | None = None
+    state: Path | None = None
 
 
 class RunningDrone:
@@ -302,6 +308,7 @@ class RunningDrone:
         self.folder = folder / setup.name
         self.grants = self.folder / "grants"
         self.audit = self.folder / "mobility.jsonl"
+        self._state = setup.state or self.folder / "state"
         self.tlog = folder / "logs" / f"{setup.name}.tlog"
         self._processes = processes
         self._tls = tls
@@ -334,7 +341,7 @@ class RunningDrone:
         Raises:
             ExperimentError: A process did not start.
         """
-        for folder in (self.grants, self.folder / "state"):
+        for folder in (self.grants, self._state):
             folder.mkdir(parents=True, exist_ok=True)
         self._write_description()
         if self.setup.autopilot is None:
@@ -355,7 +362,12 @@ class RunningDrone:
         Raises:
             ExperimentError: A service did not start.
         """
-        self._processes.start(self.process("mobility"), self._mobility_command(), base_environment())
+        self._processes.start(
+            self.process("mobility"),
+            self._mobility_command(),
+            base_environment(),
+            stop_timeout_s=MOBILITY_STOP_TIMEOUT_S,
+        )
         if self._camera_port is not None:
             self._processes.start(self.process("camera"), self._camera_command(), base_environment())
         if wait:
@@ -435,7 +447,7 @@ class RunningDrone:
     def _mobility_command(self) -> list[str]:
         return [
             *_module("fractus_services.mobility"), "serve", "--grants", str(self.grants), "--tls", str(self._tls),
-            "--state", str(self.folder / "state"), "--audit", str(self.audit), "--node", self.name,
+            "--state", str(self._state), "--audit", str(self.audit), "--node", self.name,
             "--autopilot", f"tcp:{LOOPBACK}:{self._tap_port}", "--listen", self.mobility_address,
             "--description", str(self.folder / "node.yaml"), *self.setup.service_arguments,
         ]  # fmt: skip

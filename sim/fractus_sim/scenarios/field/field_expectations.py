@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import shapely
 from fractus_core.api.geometry import Point
@@ -42,6 +43,21 @@ def evaluate_run(site: FieldSite, run: Evidence) -> list[Expectation]:
         "unguarded": evaluation.unguarded,
     }
     return evaluations[run.name]()
+
+
+def evaluate_owner(run: str, differences: Sequence[str]) -> Expectation:
+    """Evaluate if a running autopilot has the settings of its owner again after a run.
+
+    Args:
+        run: Name of the run.
+        differences: Differences as sentences.
+    """
+    return Expectation(
+        "the vehicle has the parameters, the fence and the rally points of its owner again",
+        not differences,
+        "; ".join(differences) or "no difference",
+        run,
+    )
 
 
 class RunEvaluation:

@@ -9,9 +9,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from fractus_radio.follower import parse_address
 from fractus_runtime.audit_chain import entries
-from fractus_runtime.mavlink_codec import Endpoint, Message, Value, message_id
 from fractus_vehicle.estimator import FULL_START_S
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
@@ -27,8 +25,9 @@ from fractus_sim.scenarios.field.field_site import (
     FieldSite,
     format_position,
 )
-from fractus_sim.testbeds.ground_station import OBSERVER_ID, STATION_COMPONENT, TcpLink
+from fractus_sim.testbeds.borrowed_autopilot import BorrowedAutopilot
 from fractus_sim.testbeds.standalone_drones import CameraSetup, DroneSetup, RunningDrone, Standalone
+from fractus_sim.testbeds.vehicle_settings import AutopilotConnection
 
 PICTURE_INTERVAL_S = 10.0
 HOVER_S = 2 * PICTURE_INTERVAL_S
@@ -41,11 +40,7 @@ PARAMETERS: Mapping[str, float] = {"WPNAV_SPEED": 500.0}
 WIND = "2,240,0.5"
 """Speed (m/s), direction (degrees) and turbulence of the wind."""
 
-CONNECT_TIMEOUT_S = 5.0
-HEARTBEAT_TIMEOUT_S = 15.0
 POSITION_TIMEOUT_S = 120.0
-REQUEST_INTERVAL_S = 1.0
-LINK_POLL_S = 0.05
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,11 +70,11 @@ class Autopilot:
     """The vehicle of a run.
 
     Attributes:
-        link: Endpoint of a running autopilot, such as `tcp:127.0.0.1:5760`. None: start a simulated one for each run.
+        borrowed: A running autopilot. None: start a simulated one for each run.
         speedup: Factor of real time.
     """
 
-    link: str | None
+    borrowed: BorrowedAutopilot | None
     speedup: float
 
 
@@ -93,7 +88,7 @@ def fly(run: Run, site: FieldSite, autopilot: Autopilot, folder: Path, report: C
     manifests = site.write(folder)
     grants = site.grants(manifests, policies=run.policies)
     with Standalone(folder) as drones:
-        drone = drones.add_drone(_drone_setup(site, autopilot))
+        drone = drones.add_drone(drone_setup(site, autopilot))
         identities = {grant["spec"]["component"]: drones.grant(grant) for grant in grants}
         environment = navigator_environment(run, site, HOVER_S / autopilot.speedup)
         programs = {NAVIGATOR: "navigator", VIEWER: "aerial_viewer"}
@@ -102,6 +97,9 @@ def fly(run: Run, site: FieldSite, autopilot: Autopilot, folder: Path, report: C
             command = [sys.executable, str(EXAMPLE.absolute() / f"{program}.py")]
             drones.run(program, command, identities[component], environment={**environment, **interval})
         _wait_landed(drones, drone, autopilot, report)
+        if autopilot.borrowed is not None:
+            report("waiting until the service has restored the fence and the parameters of the owner")
+            autopilot.borrowed.wait_restored()
         drones.stop_services()
     audits = (drone.audit, drone.audit.with_name("camera.jsonl"))
     return read_evidence(run.name, run.title, policies=run.policies, tlog=drone.tlog, audits=audits)
@@ -118,8 +116,9 @@ def navigator_environment(run: Run, site: FieldSite, hover_s: float) -> dict[str
     return {**environment, "ALTITUDES": "1:20,3:20,6:4", "DETOURS": detours}
 
 
-def _drone_setup(site: FieldSite, autopilot: Autopilot) -> DroneSetup:
-    simulated = autopilot.link is None
+def drone_setup(site: FieldSite, autopilot: Autopilot) -> DroneSetup:
+    """Return the configuration of the drone."""
+    borrowed = autopilot.borrowed
     return DroneSetup(
         DRONE,
         site.home,
@@ -128,9 +127,10 @@ def _drone_setup(site: FieldSite, autopilot: Autopilot) -> DroneSetup:
         parameters=PARAMETERS,
         description=site.drone.spec.to_dict(),
         # The camera world needs a second link to the vehicle. A running autopilot may offer only one.
-        camera=CameraSetup(("--seed", "3")) if simulated else CameraSetup(None),
+        camera=CameraSetup(("--seed", "3")) if borrowed is None else CameraSetup(None),
         vehicle_arguments=("--wind", WIND),
-        autopilot=autopilot.link,
+        autopilot=borrowed.link if borrowed is not None else None,
+        state=borrowed.service_state if borrowed is not None else None,
     )
 
 
@@ -172,18 +172,6 @@ class ParkedVehicle:
     home: tuple[float, float, float]
 
 
-def parse_link(text: str) -> tuple[str, int]:
-    """Parse `tcp:HOST:PORT`.
-
-    Raises:
-        ExperimentError: The text has a different format.
-    """
-    try:
-        return parse_address(text)
-    except ValueError:
-        raise ExperimentError(f"autopilot {text!r}: expected tcp:HOST:PORT") from None
-
-
 def find_parked_vehicle(link: str, report: Callable[[str], None]) -> ParkedVehicle:
     """Wait until an ArduPilot vehicle on the ground has a position, then close the link.
 
@@ -191,21 +179,8 @@ def find_parked_vehicle(link: str, report: Callable[[str], None]) -> ParkedVehic
         ExperimentError: The autopilot does not respond, is not ArduPilot, is flying, or has no position before the
             timeout.
     """
-    host, port = parse_link(link)
-    connection = _AutopilotConnection(TcpLink.connect(host, port, CONNECT_TIMEOUT_S))
-    try:
-        heartbeat = connection.wait(
-            lambda m: m.name == "HEARTBEAT" and m.compid == mavlink.MAV_COMP_ID_AUTOPILOT1,
-            HEARTBEAT_TIMEOUT_S,
-            "no heartbeat",
-        )
-        if heartbeat.integer("autopilot") != mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA:
-            raise ExperimentError(f"the autopilot at {link} is not ArduPilot")
-        if heartbeat.integer("base_mode") & mavlink.MAV_MODE_FLAG_SAFETY_ARMED:
-            raise ExperimentError(f"the vehicle at {link} is armed; land and disarm it first")
-        connection.system_id = heartbeat.sysid
-        report(f"vehicle {heartbeat.sysid} at {link}; waiting for its position")
-        connection.request("GPS_RAW_INT")
+    with AutopilotConnection.open(link) as connection:
+        report(f"vehicle {connection.system_id} at {link}; waiting for its position")
         connection.wait(
             lambda m: m.name == "GPS_RAW_INT" and m.integer("fix_type") >= mavlink.GPS_FIX_TYPE_3D_FIX,
             POSITION_TIMEOUT_S,
@@ -215,50 +190,5 @@ def find_parked_vehicle(link: str, report: Callable[[str], None]) -> ParkedVehic
         home = connection.wait(
             lambda m: m.name == "HOME_POSITION", POSITION_TIMEOUT_S, "no home position", "HOME_POSITION"
         )
-    finally:
-        connection.close()
-    place = (home.integer("latitude") / 1e7, home.integer("longitude") / 1e7, home.integer("altitude") / 1000.0)
-    return ParkedVehicle(heartbeat.sysid, place)
-
-
-class _AutopilotConnection:
-    """A short exchange over one link."""
-
-    def __init__(self, link: TcpLink) -> None:
-        self.system_id = 0
-        self._link = link
-        self._endpoint = Endpoint(OBSERVER_ID, STATION_COMPONENT)
-
-    def request(self, name: str) -> None:
-        """Request one message of a type."""
-        values: dict[str, Value] = {"command": int(mavlink.MAV_CMD_REQUEST_MESSAGE), "param1": float(message_id(name))}
-        values |= {"target_system": self.system_id, "target_component": 1}
-        self._link.send(self._endpoint.encode("COMMAND_LONG", values))
-
-    def wait(self, matches: Callable[[Message], bool], timeout_s: float, missing: str, requested: str = "") -> Message:
-        """Return the first message that matches.
-
-        Args:
-            matches: Condition of the message.
-            timeout_s: Maximum time to wait, seconds.
-            missing: Description of the message for the error.
-            requested: Name of a message to request every second.
-
-        Raises:
-            ExperimentError: No message matched before the timeout.
-        """
-        deadline = time.monotonic() + timeout_s
-        next_request_s = time.monotonic()
-        while time.monotonic() < deadline:
-            if requested and time.monotonic() >= next_request_s:
-                next_request_s += REQUEST_INTERVAL_S
-                self.request(requested)
-            for message in self._endpoint.decode(self._link.receive()):
-                if matches(message):
-                    return message
-            time.sleep(LINK_POLL_S)
-        raise ExperimentError(f"{missing} from the autopilot within {timeout_s:.0f} s")
-
-    def close(self) -> None:
-        """Close the link."""
-        self._link.close()
+        place = (home.integer("latitude") / 1e7, home.integer("longitude") / 1e7, home.integer("altitude") / 1000.0)
+        return ParkedVehicle(connection.system_id, place)

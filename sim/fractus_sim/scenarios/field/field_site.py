@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+import uuid
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -141,13 +142,19 @@ class FieldSite:
     def grants(self, manifests: Path, *, policies: bool) -> list[dict[str, Any]]:
         """Return the Grants that the operator would create. Without policies, they allow everything everywhere.
 
+        Each call returns Grants of another mission, because a service does not fly a completed mission again.
+
         Raises:
             ExperimentError: The application cannot be planned.
         """
-        return [
+        mission = uuid.uuid4().hex[:8]
+        grants = [
             grant_manifest(spec if policies else self._unrestricted(spec))
             for spec in planned_grants(read_all_manifests([manifests]))
         ]
+        for grant in grants:
+            grant["metadata"]["uid"] += f"-{mission}"
+        return grants
 
     def operation_area(self, grants: Sequence[Mapping[str, Any]]) -> list[Any]:
         """Return the shapes of the operation area in the Grants, in metres."""

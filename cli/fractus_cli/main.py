@@ -63,6 +63,7 @@ COMMANDS: dict[str, Entry] = {
     "audit": Entry("fractus_cli.audit:audit", "Verify, show and export audit logs of a node's services and agent.", "services"),
     "camera": Entry("fractus_services.commands:camera", "Run the camera service of a node.", "services"),
     "camera-world": Entry("fractus_world.__main__:camera_world", "Serve images of a camera above a simulated world.", "sim"),
+    "check": Entry("fractus_cli.check:check", "Check driver programs without running them."),
     "cluster": Entry("fractus_cluster.cli:cluster", "Run a Kubernetes cluster of several nodes on this machine.", "sim"),
     "completion": Entry("fractus_cli.completion:completion", "Print the completion script of a shell."),
     "doctor": Entry("fractus_cli.doctor:doctor", "Check a cluster and print a remedy for each problem.", "operator"),

@@ -156,14 +156,15 @@ class Control:
         self.attitude = (0.0, 0.0)
         self._integral = [0.0, 0.0, 0.0]
 
-    def shift(self, north: float, east: float) -> None:
+    def shift(self, north: float, east: float, down: float) -> None:
         """Move the trajectory with an estimate that was reset, as ArduCopter does.
 
         A vehicle that flies with a velocity, or has stopped, therefore does not move. A vehicle that flies to a point corrects its
-        course.
+        course. The vehicle returns to its altitude.
         """
         self.pos[0] += north
         self.pos[1] += east
+        self.pos[2] += down
         if self._stopped:
             self.target = (self.target[0] + north, self.target[1] + east)
 

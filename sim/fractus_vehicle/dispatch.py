@@ -10,7 +10,9 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fractus_vehicle.channel import Channel
 from fractus_vehicle.commands import handle_command, set_mode_number
+from fractus_vehicle.earth import Place, valid_place
 from fractus_vehicle.flight import Flight
+from fractus_vehicle.gps_receivers import InputFix
 from fractus_vehicle.home import set_home_at
 from fractus_vehicle.mission_orders import set_current
 from fractus_vehicle.report_units import UNKNOWN_U16
@@ -189,6 +191,19 @@ def _setup_signing(vehicle: Vehicle, m: Message, _c: Channel) -> None:
     v.send_text(mavlink.MAV_SEVERITY_INFO, "Signing key set" if any(key) else "Signing off")
 
 
+def _gps_input(vehicle: Vehicle, m: Message, _c: Channel) -> None:
+    v = vehicle.state
+    if valid_place(m.integer("lat"), m.integer("lon"), m.real("alt")):
+        fix = InputFix(
+            Place(m.integer("lat"), m.integer("lon"), m.real("alt")),
+            m.integer("fix_type"),
+            m.integer("satellites_visible"),
+            max(m.real("horiz_accuracy"), 0.0),
+            v.time_s,
+        )
+        v.estimator.gps_receivers.take_input(m.integer("gps_id"), fix)
+
+
 HANDLERS: dict[str, Handler] = {
     "HEARTBEAT": _heartbeat,
     "COMMAND_LONG": handle_command,
@@ -211,6 +226,7 @@ HANDLERS: dict[str, Handler] = {
     "SET_GPS_GLOBAL_ORIGIN": _reply_with("GPS_GLOBAL_ORIGIN"),
     "SET_HOME_POSITION": _set_home,
     "SETUP_SIGNING": _setup_signing,
+    "GPS_INPUT": _gps_input,
     **dict.fromkeys(
         (
             "MISSION_COUNT",

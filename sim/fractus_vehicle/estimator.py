@@ -8,11 +8,14 @@ from collections.abc import Callable
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from fractus_vehicle.altitude_source import AltitudeSource
 from fractus_vehicle.body import Body, euler_of
 from fractus_vehicle.control import Estimate
-from fractus_vehicle.earth import UNIT, Place
+from fractus_vehicle.earth import Place
+from fractus_vehicle.gps_receivers import GpsReceivers
 from fractus_vehicle.params import Parameters
-from fractus_vehicle.sensors import Drift, Gps
+from fractus_vehicle.sensor_selection import SensorSelection
+from fractus_vehicle.sensors import Drift
 
 GPS_INTERVAL_S = 0.2
 GPS_TIMEOUT_S = 7.0
@@ -56,10 +59,13 @@ ANNOUNCEMENTS = (
 # Height at which the EKF aligns its heading again, in the first climb.
 FINAL_ALIGNMENT_M = 2.5
 
-_FLAGS_STARTING = (
-    mavlink.EKF_ATTITUDE | mavlink.EKF_VELOCITY_VERT | mavlink.EKF_POS_VERT_ABS | mavlink.EKF_CONST_POS_MODE
+_FLAGS_NO_POSITION = (
+    mavlink.EKF_ATTITUDE
+    | mavlink.EKF_VELOCITY_HORIZ
+    | mavlink.EKF_VELOCITY_VERT
+    | mavlink.EKF_POS_VERT_ABS
+    | mavlink.EKF_CONST_POS_MODE
 )
-_FLAGS_NO_POSITION = _FLAGS_STARTING | mavlink.EKF_VELOCITY_HORIZ
 _FLAGS_READY = (
     mavlink.EKF_ATTITUDE
     | mavlink.EKF_VELOCITY_HORIZ
@@ -96,11 +102,10 @@ class Estimator:
     ) -> None:
         self._start = start
         self._ready_after_s = ready_after_s
-        self._noise_m = noise_m
-        self._rng = rng
-        self._params = params
         self._send_text = send_text
-        self.gps = Gps()
+        self.gps_receivers = GpsReceivers(start, noise_m=noise_m, rng=rng, params=params)
+        self.altitude = AltitudeSource(params)
+        self.sensors = SensorSelection(params, send_text)
         self.origin: Place | None = None
         self.position_ok = False
         self._drift = Drift(rng, noise_m)
@@ -144,9 +149,7 @@ class Estimator:
         """Flags of EKF_STATUS_REPORT."""
         if self.position_ok:
             return _FLAGS_READY | (mavlink.EKF_GPS_GLITCHING if self._glitching else 0)
-        if not self.aligned:
-            return mavlink.EKF_UNINITIALIZED
-        return _FLAGS_NO_POSITION if self.origin is not None else _FLAGS_STARTING
+        return _FLAGS_NO_POSITION if self.aligned else mavlink.EKF_UNINITIALIZED
 
     def estimate(self, body: Body) -> Estimate:
         """Return the current estimate."""
@@ -156,7 +159,7 @@ class Estimator:
         return Estimate(
             body.north + drift.north + self._gps_error[0],
             body.east + drift.east + self._gps_error[1],
-            body.down + drift.down,
+            body.down + drift.down - self.altitude.error_m,
             body.vn + drift.rate_n,
             body.ve + drift.rate_e,
             body.vd,
@@ -175,40 +178,28 @@ class Estimator:
         if time_s < self._next_fix_s:
             return
         self._next_fix_s += GPS_INTERVAL_S
-        if not int(self._params["SIM_GPS_DISABLE"]) and self.since_boot(FIRST_FIX_S):
-            glitch_n, glitch_e, glitch_d = self._glitch()
-            self.gps.update(
-                self._start.offset(body.north + glitch_n, body.east + glitch_e, body.down + glitch_d),
-                (body.vn, body.ve),
-                noise_m=max(self._params["SIM_GPS_NOISE"], 0.0) + self._noise_m,
-                satellites=int(self._params["SIM_GPS_NUMSATS"]),
-                rng=self._rng,
-            )
-            if self.gps.fix_type >= mavlink.GPS_FIX_TYPE_3D_FIX:
-                self._fix_s = time_s
-        elif self.since_boot(FILTER_STARTED_S):
-            self.gps.lose()
+        self.gps_receivers.step(
+            time_s, body, found=self.since_boot(FIRST_FIX_S), powered=self.since_boot(FILTER_STARTED_S)
+        )
+        if self.gps_receivers.fix_type >= mavlink.GPS_FIX_TYPE_3D_FIX:
+            self._fix_s = time_s
+        if self.aligned:
+            self.altitude.step(GPS_INTERVAL_S)
+            self.sensors.step(GPS_INTERVAL_S)
         self._announce(body)
         self._update_position(time_s)
         if self.position_ok and self._fix_s == time_s:
             self._follow_gps(time_s)
 
-    def take_shift(self) -> tuple[float, float]:
-        """Return by how far the estimate was reset to the GPS position since the last call, north and east in metres."""
-        shift = self._shift
+    def take_shift(self) -> tuple[float, float, float]:
+        """Return by how far the estimate was reset to its sensors since the last call, north, east and down in metres."""
+        north, east = self._shift
         self._shift = (0.0, 0.0)
-        return shift
-
-    def _glitch(self) -> tuple[float, float, float]:
-        """Return the error of the GPS position (north, east, down) in metres."""
-        north_deg, east_deg, up_m = (self._params[f"SIM_GPS_GLITCH_{axis}"] for axis in "XYZ")
-        start = self._start
-        wrong = Place(start.lat_e7 + round(north_deg / UNIT), start.lon_e7 + round(east_deg / UNIT), start.alt_m + up_m)
-        return start.vector_to(wrong)
+        return north, east, -self.altitude.take_reset()
 
     def _follow_gps(self, time_s: float) -> None:
         """Follow the GPS position, or reject it while it is too far away. After a long rejection, jump to it."""
-        glitch_n, glitch_e, _ = self._glitch()
+        glitch_n, glitch_e = self.gps_receivers.error
         off_n = glitch_n - self._gps_error[0]
         off_e = glitch_e - self._gps_error[1]
         follow = 1.0 - math.exp(-GPS_INTERVAL_S / GPS_FUSION_S)
@@ -248,7 +239,11 @@ class Estimator:
     def _update_position(self, time_s: float) -> None:
         age_s = time_s - self._fix_s
         self._drift.step(GPS_INTERVAL_S, aided=self.origin is None or age_s <= 2.0 * GPS_INTERVAL_S)
-        if self.origin is None and self.gps.fix_type >= mavlink.GPS_FIX_TYPE_3D_FIX and self.since_boot(ORIGIN_SET_S):
+        if (
+            self.origin is None
+            and self.gps_receivers.fix_type >= mavlink.GPS_FIX_TYPE_3D_FIX
+            and self.since_boot(ORIGIN_SET_S)
+        ):
             self.origin = self._start
             self._inform("EKF3 IMU0 origin set")
             self._inform(f"Field Elevation Set: {self._start.alt_m:.0f}m")

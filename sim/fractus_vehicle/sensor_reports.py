@@ -10,6 +10,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from fractus_vehicle import noise
 from fractus_vehicle.body import GRAVITY
 from fractus_vehicle.report_units import UNKNOWN_U16, Values, boot_ms, boot_us, centi, milli
+from fractus_vehicle.sensors import Gps
 from fractus_vehicle.shaping import clamp
 from fractus_vehicle.state import VehicleState
 
@@ -18,8 +19,17 @@ SERVOS_REPORTED = 16
 
 
 def gps_raw_int(v: VehicleState) -> Values:
-    """Build GPS_RAW_INT from the noisy fix of the receiver."""
-    g = v.gps
+    """Build GPS_RAW_INT from the noisy fix of the first receiver."""
+    return _gps_values(v, v.gps)
+
+
+def gps2_raw(v: VehicleState) -> Values | None:
+    """Build GPS2_RAW from the noisy fix of the second receiver, if there is one."""
+    receivers = v.estimator.gps_receivers
+    return _gps_values(v, receivers.receivers[1]) if receivers.has_second else None
+
+
+def _gps_values(v: VehicleState, g: Gps) -> Values:
     if g.fix_type < mavlink.GPS_FIX_TYPE_2D_FIX or g.place is None:
         return {
             "time_usec": boot_us(v),
@@ -29,7 +39,7 @@ def gps_raw_int(v: VehicleState) -> Values:
             "satellites_visible": g.satellites,
         }
     return {
-        "time_usec": boot_us(v),
+        "time_usec": round(g.fix_s * 1e6),
         "fix_type": g.fix_type,
         "lat": g.place.lat_e7,
         "lon": g.place.lon_e7,
@@ -39,7 +49,7 @@ def gps_raw_int(v: VehicleState) -> Values:
         "vel": max(0, centi(math.hypot(g.vn, g.ve))),
         "cog": round(math.degrees(math.atan2(g.ve, g.vn)) % 360.0 * 100.0) % 36000,
         "satellites_visible": g.satellites,
-        "h_acc": round(max(v.params["SIM_GPS_ACC"], 0.0) * 1000.0),
+        "h_acc": round(g.accuracy_m * 1000.0),
         "v_acc": 300,
     }
 
@@ -89,7 +99,7 @@ def scaled_imu3(v: VehicleState) -> Values:
 
 def scaled_pressure(v: VehicleState) -> Values:
     """Build SCALED_PRESSURE from the standard atmosphere."""
-    altitude = v.true_altitude_amsl_m
+    altitude = v.true_altitude_amsl_m + v.estimator.altitude.barometer_error_m
     altitude += max(v.params["SIM_BARO_RND"], 0.0) * noise.gaussian(v.noise_seed, v.ticks, _BARO_AXIS)
     return {
         "time_boot_ms": boot_ms(v),
@@ -178,6 +188,6 @@ def ekf_status_report(v: VehicleState) -> Values:
         "flags": v.estimator.flags,
         "velocity_variance": 0.02 if v.position_ok else 1.2,
         "pos_horiz_variance": 0.03 if v.position_ok else 1.5,
-        "pos_vert_variance": 0.01,
-        "compass_variance": 0.01,
+        "pos_vert_variance": v.estimator.altitude.variance,
+        "compass_variance": v.estimator.sensors.compass_variance,
     }

@@ -81,13 +81,22 @@ class Battery:
 
 @dataclass(slots=True)
 class Gps:
-    """GPS receiver: fix type and measured position."""
+    """GPS receiver: fix type and measured position.
+
+    Attributes:
+        fix_s: Time of the last fix.
+        error: Injected error of the position, north and east in metres.
+        accuracy_m: Horizontal accuracy that the receiver reports.
+    """
 
     fix_type: int = mavlink.GPS_FIX_TYPE_NO_GPS
     satellites: int = 0
     place: Place | None = None
     vn: float = 0.0
     ve: float = 0.0
+    fix_s: float = 0.0
+    error: tuple[float, float] = (0.0, 0.0)
+    accuracy_m: float = 0.0
 
     def update(
         self, truth: Place, velocity: tuple[float, float], *, noise_m: float, satellites: int, rng: random.Random

@@ -151,8 +151,8 @@ class VehicleState:
 
     @property
     def gps(self) -> Gps:
-        """The GPS receiver."""
-        return self.estimator.gps
+        """The first GPS receiver."""
+        return self.estimator.gps_receivers.receivers[0]
 
     @property
     def sticks(self) -> tuple[int, ...]:

@@ -77,10 +77,10 @@ class Vehicle:
         v = self.state
         v.advance_time()
         v.estimator.step(v.time_s, v.body)
-        north_m, east_m = v.estimator.take_shift()
-        if north_m or east_m:
+        shift = v.estimator.take_shift()
+        if any(shift):
             v.est = v.estimator.estimate(v.body)
-            v.control.shift(north_m, east_m)
+            v.control.shift(*shift)
         if v.home is None and v.origin is not None and v.estimator.since_boot(HOME_SET_S):
             set_home(v, v.place)
         self.failsafes.step()

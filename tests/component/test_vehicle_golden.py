@@ -12,14 +12,14 @@ from vehicle_flights import at_random, breaches, by_hand, failing, mission, pilo
 from vehicle_pilot import Pilot
 
 FLIGHTS: tuple[tuple[Callable[[Pilot], None], int, dict[str, float], str], ...] = (
-    (mission, 2, {"SIM_WIND_SPD": 5.0, "SIM_WIND_TURB": 1.5, "WP_YAW_BEHAVIOR": 0.0}, "148c5aaf26fb501a"),
-    (by_hand, 3, {"SIM_WIND_SPD": 4.0, "SIM_WIND_TURB": 2.0}, "7370294851b0f38d"),
-    (smart_return, 4, {}, "52bace01359d30c2"),
-    (breaches, 5, {}, "eeac150a02ecce96"),
-    (breaches, 6, {"FENCE_ACTION": 3.0}, "b32f502e5493fe61"),
-    (failing, 7, {}, "3812c15abb37984e"),
-    (at_random, 10, {}, "3520ebfb3509fbaf"),
-    (at_random, 17, {}, "383365f682249acd"),
+    (mission, 2, {"SIM_WIND_SPD": 5.0, "SIM_WIND_TURB": 1.5, "WP_YAW_BEHAVIOR": 0.0}, "5ca176b649012394"),
+    (by_hand, 3, {"SIM_WIND_SPD": 4.0, "SIM_WIND_TURB": 2.0}, "76d9df1a561c563f"),
+    (smart_return, 4, {}, "d2924d3b44d5e950"),
+    (breaches, 5, {}, "1eec74dd0420bc9a"),
+    (breaches, 6, {"FENCE_ACTION": 3.0}, "2ab40d8b3ed68c7b"),
+    (failing, 7, {}, "a3c1b5babcb1b4dc"),
+    (at_random, 10, {}, "45461fb866460899"),
+    (at_random, 17, {}, "b122190511f0e0ac"),
 )
 
 

@@ -44,7 +44,8 @@ async def test_mobility_mission_applies_corrections_and_denials(rig: Rig) -> Non
     rig.write_grant(grant(altitude_limit(5, 15), fence("no-fly", "exclusion", "ignore", -60, -10, -40, 10)))
     rig.write_grant(passenger_grant())
     port = free_port()
-    rig.start_service("--metrics", f"127.0.0.1:{port}")  # the service starts first and waits for the vehicle
+    # The service starts first, waits for the vehicle, and identifies it.
+    rig.start_service("--metrics", f"127.0.0.1:{port}", knows_vehicle=False)
     rig.start_vehicle()
     driver = Driver(rig)
     climbed = await driver.up(3.0)

@@ -19,12 +19,12 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 LOST = pb.ControlEvent.STATE_LOST
 
 
-async def flying(rig: Rig, *policies: dict[str, Any], speedup: float = 3.0, **changes: Any) -> Driver:
-    rig.write_grant(grant(*policies, **changes))
+async def flying(rig: Rig, *policies: dict[str, Any], speedup: float = 3.0, altitude_m: float = 6.0) -> Driver:
+    rig.write_grant(grant(*policies))
     rig.start_service()
     rig.start_vehicle(speedup)
     driver = Driver(rig)
-    await driver.up()
+    await driver.up(altitude_m)
     return driver
 
 
@@ -68,7 +68,7 @@ async def test_driver_resumes_control_within_grace(rig: Rig) -> None:
 
 
 async def test_killed_service_resumes_flight_after_restart(rig: Rig) -> None:
-    driver = await flying(rig, speedup=1.0)
+    driver = await flying(rig, speedup=1.0)  # the service restarts before the failsafe of the vehicle acts
     going = driver.start_goto(0, 90)
     await rig.until(lambda t: t.velocity.north_mps > 3)
     del going
@@ -78,17 +78,17 @@ async def test_killed_service_resumes_flight_after_restart(rig: Rig) -> None:
     assert hover.in_air
     again = Driver(rig)
     await again.take(5)
-    await goto_once_located(again, 0, 40)
+    await goto_once_located(again, 0, 30)
     reply = await again.stub.ReturnControl(pb.ReturnControlRequest(), timeout=5)
     assert reply.mission_complete
     assert "drone in flight, sending heartbeats" in rig.log("service"), (
         "the starting service sent no heartbeats while it imported modules"
     )
-    await rig.until(lambda t: not t.armed, 90, "landing")
+    await rig.until(lambda t: t.controller == "system" and t.velocity.north_mps < -1, 30, "return flight")
 
 
 async def test_autopilot_returns_home_while_service_is_down(rig: Rig) -> None:
-    await flying(rig, speedup=2.0)
+    await flying(rig)
     rig.kill("service")
     # The autopilot's failsafe acts after 5 s of vehicle time. The service must not give control back to the driver.
     await until_mode(rig.link, ARDUCOPTER.return_retracing)
@@ -136,7 +136,7 @@ async def first(driver: Driver) -> None:
 
 
 async def test_zone_added_in_flight_stops_drone(rig: Rig) -> None:
-    driver = await flying(rig, speedup=1.0)
+    driver = await flying(rig, speedup=2.0)
     going = driver.start_goto(0, 90)
     await rig.until(lambda t: xy(t.position)[1] > 5)
     rig.write_grant(grant(fence("new", "exclusion", "ignore", -30, 50, 30, 70)))
@@ -151,7 +151,7 @@ async def test_zone_added_in_flight_stops_drone(rig: Rig) -> None:
 
 
 async def test_zone_added_around_drone_revokes_control_and_lands(rig: Rig) -> None:
-    driver = await flying(rig, speedup=1.0)
+    driver = await flying(rig)
     rig.write_grant(grant(fence("new", "exclusion", "revoke", -30, -30, 30, 30)))
     event = await driver.next(LOST, 10)
     assert "new" in event.reason
@@ -162,7 +162,11 @@ async def test_zone_added_around_drone_revokes_control_and_lands(rig: Rig) -> No
     await rig.until(lambda t: not t.armed, 90, "landing")
 
 
-@pytest.mark.parametrize("action", ["land", "returnToLaunch", "revoke"])
+@pytest.mark.parametrize(
+    "action",
+    # The component tests fly all actions in virtual time (control_scripts.py).
+    ["revoke", *(pytest.param(action, marks=pytest.mark.slow) for action in ("land", "returnToLaunch"))],
+)
 async def test_goto_into_zone_with_takeover_action_ends_mission(rig: Rig, action: str) -> None:
     driver = await flying(rig, fence("no-fly", "exclusion", action, -60, -10, -40, 10))
     code, why = await denied(flown(driver.start_goto(-50, 0)))
@@ -227,24 +231,29 @@ async def test_suspended_driver_process_is_detected_as_lost(rig: Rig) -> None:
     await asyncio.sleep(0)
     rig.write_grant(grant())
     rig.start_service()
-    rig.start_vehicle(1.0)
+    rig.start_vehicle()
     await rig.until(lambda t: t.ready and t.HasField("position"), 20)
     rig.start_driver()
-    await rig.until(lambda t: t.controller == DRIVER and t.position.altitude_m > 8, 30, "flight of the driver process")
+    await rig.until(lambda t: t.controller == DRIVER and t.position.altitude_m > 2, 30, "flight of the driver process")
     rig.send_signal("driver", signal.SIGSTOP)
     await rig.until(lambda t: t.controller == "system", 20, "loss of the driver")
     rig.send_signal("driver", signal.SIGCONT)
 
 
+CONTROL_POINTS = ((15, 20), (30, 20))
+"""Path of the driver with partial control, as offsets in metres (x, y)."""
+
+
+def partial() -> dict[str, Any]:
+    """Return a Grant with which the system flies the drone to the first control point."""
+    path = [dict(zip(("lat", "lon", "alt"), (*FRAME.latlon(x, y), 8.0), strict=True)) for x, y in CONTROL_POINTS]
+    points = [{"navigation": "pathBased", "path": path}]
+    services = [{"service": "mobility", "methods": ["Goto", "GetPosition"]}]
+    return grant(control="partial", controlPoints=points, services=services)
+
+
 async def test_partial_control_begins_at_control_point_after_transit(rig: Rig) -> None:
-    path = [dict(zip(("lat", "lon", "alt"), (*FRAME.latlon(x, y), 12.0), strict=True)) for x, y in ((30, 40), (60, 40))]
-    rig.write_grant(
-        grant(
-            control="partial",
-            controlPoints=[{"navigation": "pathBased", "path": path}],
-            services=[{"service": "mobility", "methods": ["Goto", "GetPosition"]}],
-        )
-    )
+    rig.write_grant(partial())
     rig.start_service()
     rig.start_vehicle()
     driver = Driver(rig)
@@ -253,19 +262,12 @@ async def test_partial_control_begins_at_control_point_after_transit(rig: Rig) -
     waits = [e.reason for e in driver.events if e.state == pb.ControlEvent.STATE_WAITING]
     assert "the system flies to the control point" in waits
     state = await rig.telemetry()
-    assert math.dist(xy(state.position), (30, 40)) < 2.0
+    assert math.dist(xy(state.position), CONTROL_POINTS[0]) < 2.0
     _, why = await denied(driver.stub.Hover(pb.HoverRequest(), timeout=5))
     assert why.code == "MethodNotGranted"
-    await driver.goto(60, 40)
+    await driver.goto(*CONTROL_POINTS[1])
     await driver.stub.ReturnControl(pb.ReturnControlRequest(), timeout=5)
     await rig.until(lambda t: not t.armed, 90, "landing")
-
-
-def partial(**changes: Any) -> dict[str, Any]:
-    path = [dict(zip(("lat", "lon", "alt"), (*FRAME.latlon(x, y), 12.0), strict=True)) for x, y in ((30, 40), (60, 40))]
-    points = [{"navigation": "pathBased", "path": path}]
-    services = [{"service": "mobility", "methods": ["Goto", "GetPosition"]}]
-    return grant(control="partial", controlPoints=points, services=services, **changes)
 
 
 async def until_reason(driver: Driver, reason: str) -> None:
@@ -301,10 +303,10 @@ async def test_grant_revoked_during_arming_prevents_takeoff(rig: Rig) -> None:
 
 async def test_landing_during_mission_does_not_move_home(rig: Rig) -> None:
     driver = await flying(rig)
-    await driver.goto(0, 60)
+    await driver.goto(0, 30)
     await flown(driver.stub.Land(pb.LandRequest(), timeout=60))
     await driver.arm()
-    await driver.take_off()
+    await driver.take_off(4.0)
     state = await rig.until(lambda t: t.home.latitude_deg != 0, 15)
     assert math.dist(xy(state.home), (0, 0)) < 2
 

@@ -115,16 +115,16 @@ print("then", server, flush=True)
 
 
 async def test_long_reply_on_a_slow_path_finishes_within_the_drain(world: Rig, redirector: Redirector) -> None:
-    redirector._drain_s = 20.0
+    redirector._drain_s = 10.0
     world.servers()
-    # 20 MB at 24 Mbit/s, with a queue so short that segments are lost and retransmitted.
+    # 12 MB at 24 Mbit/s, with a queue so short that segments are lost and retransmitted.
     slow = ("rate", "24mbit", "burst", "6kb", "limit", "30kb")
     run(*world.inside("cloud"), "tc", "qdisc", "add", "dev", "eth0", "root", "tbf", *slow)
     refresh = asyncio.create_task(redirector.run())
-    loader = world.python("dpod", LOADER, f"{VIP.address}:{VIP.port}", 20_000_000)
+    loader = world.python("dpod", LOADER, f"{VIP.address}:{VIP.port}", 12_000_000)
     await asyncio.sleep(1.0)
     result = await redirector.switch(TO_EDGE, planned=True)
-    assert await asyncio.to_thread(responses, loader) == [["received", "20000000"], ["then", "edge"]]
+    assert await asyncio.to_thread(responses, loader) == [["received", "12000000"], ["then", "edge"]]
     refresh.cancel()
     assert (result.drained, result.cut) == (1, 0)
 
@@ -146,17 +146,17 @@ async def test_abrupt_switch_moves_traffic_to_the_cloud_path_at_once(world: Rig,
     assert received[-1][1] == "cloud"
 
 
-@pytest.mark.parametrize(("drain_s", "reply"), [(5.0, "cloud"), (1.0, "FAILED")])
+@pytest.mark.parametrize(("drain_s", "reply"), [(3.0, "cloud"), (0.5, "FAILED")])
 @pytest.mark.parametrize("before", [0, 1])
 async def test_call_is_cut_only_if_it_takes_longer_than_the_drain(
     world: Rig, redirector: Redirector, drain_s: float, reply: str, before: int
 ) -> None:
     redirector._drain_s = drain_s
-    world.servers(work_s=4.0)
+    world.servers(work_s=3.0)
     refresh = asyncio.create_task(redirector.run())
-    client = world.client(before + 2, pause_s=7.0)
+    client = world.client(before + 2, pause_s=5.0)
     received = await asyncio.to_thread(responses, client, before)
-    await asyncio.sleep(4.0 if before else 1.0)  # the next call is in progress, for about one second
+    await asyncio.sleep(3.0 if before else 1.0)  # the next call is in progress, for about one second
     result = await redirector.switch(TO_EDGE, planned=True)
     received += await asyncio.to_thread(responses, client)
     refresh.cancel()

@@ -120,6 +120,7 @@ lint: env ## Check style, types and import directions
 	$(RUN) ruff check
 	$(RUN) ruff format --check
 	$(RUN) mypy
+	$(RUN) mypy --config-file tests/mypy.ini
 	$(RUN) lint-imports
 
 .PHONY: format

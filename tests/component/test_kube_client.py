@@ -9,7 +9,7 @@ import json
 import socket
 import ssl
 import sys
-from collections.abc import AsyncIterator
+from collections.abc import AsyncGenerator, AsyncIterator
 from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
@@ -43,7 +43,7 @@ OBJECT = {"metadata": {"name": "a", "resourceVersion": "7"}}
 EVENT = json.dumps({"type": "ADDED", "object": OBJECT}).encode() + b"\n"
 
 
-async def events(client: Client, silence_s: float = 20.0) -> AsyncIterator[tuple[str, Any]]:
+async def events(client: Client, silence_s: float = 20.0) -> AsyncGenerator[tuple[str, Any], None]:
     async for event in client.watch(ZONE, resource_version="7", timeout_s=300, silence_s=silence_s):
         yield event
 

@@ -120,7 +120,9 @@ def _lookups(path: Path) -> frozenset[str]:
     """Return the qualified names of the properties in a module, and of functions that only return an expression."""
     lookups = set()
     module = ast.parse(path.read_text())
-    for owner in (module, *(node for node in module.body if isinstance(node, ast.ClassDef))):
+    owners: list[ast.Module | ast.ClassDef] = [module]
+    owners += [node for node in module.body if isinstance(node, ast.ClassDef)]
+    for owner in owners:
         for member in owner.body:
             if isinstance(member, ast.FunctionDef) and (_is_property(member) or _only_returns(member)):
                 lookups.add(f"{owner.name}.{member.name}" if isinstance(owner, ast.ClassDef) else member.name)

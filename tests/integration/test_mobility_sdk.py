@@ -8,7 +8,7 @@ import math
 import signal
 from collections.abc import AsyncIterator, Callable
 from dataclasses import replace
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import pytest
 from fractus import sync
@@ -166,14 +166,14 @@ async def test_sdk_dry_runs_and_passenger_poi_mission(rig: Rig) -> None:
     def plainly() -> None:
         with sync.Mobility(endpoint(rig)) as drone:
             assert drone.can_i.takeoff(40).altitude_m == pytest.approx(15.0)
-            samples = drone.telemetry(0.1)
+            samples: Any = drone.telemetry(0.1)
             assert next(samples).attitude is not None
             samples.close()
 
     await asyncio.to_thread(plainly)
 
-    tour = [dict(zip(("lat", "lon", "alt"), (*FRAME.latlon(0, 30), 10.0), strict=True))]
-    rig.write_grant(passenger_grant(tour=tour, services=[{"service": "mobility", "methods": ["GetControl"]}]))
+    points = [dict(zip(("lat", "lon", "alt"), (*FRAME.latlon(0, 30), 10.0), strict=True))]
+    rig.write_grant(passenger_grant(tour=points, services=[{"service": "mobility", "methods": ["GetControl"]}]))
     await rig.until(lambda t: t.ready and len(rig.entries("grant")) == 2, 20, "the passenger's grant")
     async with Mobility(endpoint(rig, PASSENGER)) as viewer:
         assert not await viewer.can_i.goto(*FRAME.latlon(0, 10), 10)

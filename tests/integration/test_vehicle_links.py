@@ -11,6 +11,7 @@ import socket
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pymavlink.dialects.v20.ardupilotmega as dialect
 import pytest
@@ -184,7 +185,7 @@ def _noise(count: int) -> list[bytes]:
     return frames
 
 
-def _frame(writer: dialect.MAVLink, message: type, payload: bytes) -> bytes:
+def _frame(writer: dialect.MAVLink, message: Any, payload: bytes) -> bytes:
     head = bytes((0xFD, len(payload), 0, 0, writer.seq, 77, 1)) + message.id.to_bytes(3, "little")
     crc = dialect.x25crc(bytearray(head[1:] + payload + bytes((message.crc_extra,))))
     writer.seq = (writer.seq + 1) % 256

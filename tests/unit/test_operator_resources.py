@@ -37,7 +37,7 @@ def built() -> dict[str, Any]:
         application=ApplicationReference(namespace="city", name="traffic", uid=APPLICATION.metadata.uid or ""),
         component="Navigator",
         instance="traffic-navigator",
-        class_="driver",
+        **{"class": "driver"},
     )
     checker = APPLICATION.spec.component("ImageChecker")
     data = {"tls.crt": "Y2VydA==", "tls.key": "a2V5", "ca.crt": "Y2E="}

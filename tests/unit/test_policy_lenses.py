@@ -80,7 +80,7 @@ def test_bounding_lens_covers_every_zone_a_picture_shows(
     half_deg: float,
     height: int,
     k: tuple[float, ...],
-    turn: tuple[float, ...],
+    turn: tuple[float, float, float],
     alt: float,
     seed: int,
 ) -> None:

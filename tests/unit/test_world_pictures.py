@@ -120,7 +120,8 @@ def test_boxes_and_shares_of_cut_objects_stay_in_range(world: World) -> None:
     """
     for east in range(0, 200, 25):
         truth = world.truth(above(world, float(east), 40.0, 50.0), LENS, mount=Mount(-60.0), time_s=TIME_S)
-        for sighting in (*truth.objects, *truth.faces):
+        sightings: list[Seen | SeenFace] = [*truth.objects, *truth.faces]
+        for sighting in sightings:
             left, top, right, bottom = sighting.box
             assert 0 <= left < right <= LENS.width
             assert 0 <= top < bottom <= LENS.height

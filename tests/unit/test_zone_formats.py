@@ -343,8 +343,8 @@ def test_import_rejects_properties_that_may_state_altitude_or_time(name, tmp_pat
     assert formats.read_kml(kml(f"<Polygon>EDGE</Polygon>{data}"), drop=[name]).zones
     source = tmp_path / "town.geojson"
     source.write_text(text)
-    refused = CliRunner().invoke(command, ["import", str(source), "--from", "geojson"])
-    assert (refused.exit_code, sentence in refused.stderr) == (1, True)
+    result = CliRunner().invoke(command, ["import", str(source), "--from", "geojson"])
+    assert (result.exit_code, sentence in result.stderr) == (1, True)
     assert CliRunner().invoke(command, ["import", str(source), "--from", "geojson", "--drop", name]).exit_code == 0
 
 

@@ -1,4 +1,7 @@
-"""Events of Drones about their flights: takeoff, mission, control authority with the reason, and landing."""
+"""Events of Drones about their flights: takeoff, mission, control authority with the reason, and landing.
+
+A takeover is also an Event of the Applications that the drone flies.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +16,7 @@ from fractus_core.api.names import CONTROL_TAKEN
 from fractus_core.api.nodes import DRONE_REPORT_S
 
 from fractus_operator.cache import ClusterCache
-from fractus_operator.kinds import DRONE, Key
+from fractus_operator.kinds import APPLICATION, DRONE, Body, Key
 from fractus_operator.status import controller_name
 from fractus_operator.store import Store
 from fractus_operator.work_queue import WorkQueue
@@ -22,6 +25,9 @@ EVENT_BURST = 20
 """Maximum number of Events of one drone without a pause. This number is sufficient for several flights."""
 EVENT_PERIOD_S = 60.0
 """Seconds until one more Event is allowed after a burst. The changes during this pause are summarised."""
+_TAKEOVERS = frozenset({"SystemTookControl", "PilotTookControl"})
+"""Reasons of Events that are also Events of the Applications that the drone flies."""
+
 MAX_LATE = timedelta(seconds=60)
 """Maximum age of a report, relative to the report before, that counts as late.
 
@@ -195,16 +201,28 @@ class DroneEventRecorder:
             asyncio.get_running_loop().call_later(wait_s, self.work_queue.add, key)
             return
         for reason, message, state in events:
-            await self._post(name, current, reason, message)
+            await self._post(DRONE.header(name, uid=current.uid), current, reason, message)
+            if reason in _TAKEOVERS:
+                for regarding in self._applications(state.missions):
+                    await self._post(regarding, current, reason, message)
             self._posted[name] = state
         self._posted[name] = replace(current, controller=current.controller or posted.controller)
 
-    async def _post(self, name: str, report: FlightReport, reason: str, message: str) -> None:
+    def _applications(self, names: Iterable[str]) -> Iterator[Body]:
+        """Yield the objects of Applications, given as NAMESPACE/NAME."""
+        for application in names:
+            namespace, _, name = application.partition("/")
+            submitted = self._cache.applications.get((namespace, name))
+            if submitted is not None:
+                yield APPLICATION.header(name, namespace, uid=submitted.body["metadata"].get("uid", ""))
+
+    async def _post(self, regarding: Body, report: FlightReport, reason: str, message: str) -> None:
         now = self._clock()
         # The time of the report is part of the name, so that the same Event is not created twice.
         stamp = int((report.time or now).timestamp())
+        name = regarding["metadata"]["name"]
         await self._store.create_event(
-            DRONE.header(name, uid=report.uid),
+            regarding,
             reason=reason,
             message=message,
             warning=False,

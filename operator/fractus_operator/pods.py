@@ -54,7 +54,8 @@ class PodView:
         daemon_set: Name of the DaemonSet that created it, if any.
         revision: Hash of the template of its DaemonSet.
         finished_at: Time since which it is stopped and only kept for its logs, if so.
-        failure: Exit code and last log lines of the last failure of its container, or an empty string.
+        failure: Exit code of the last failure of its container, the line that states the error, and the log lines before it, or an
+            empty string.
         unschedulable_since: Time since which the scheduler has found no node for it, if so.
         unschedulable_message: Message of the scheduler.
     """
@@ -152,13 +153,29 @@ def _failure(status: Body) -> str:
     for container in status.get("containerStatuses") or ():
         ended = (container.get("state") or {}).get("terminated") or (container.get("lastState") or {}).get("terminated")
         if ended and ended.get("exitCode"):
-            output = str(ended.get("message") or ended.get("reason") or "")
-            lines = " | ".join(output.split("\n"))[-_MAX_LOG:].strip(" |")
-            return f"exit code {ended['exitCode']}" + (f": {lines}" if lines else "")
+            output = _last_line_first(str(ended.get("message") or ended.get("reason") or ""))
+            return f"exit code {ended['exitCode']}" + (f": {output}" if output else "")
         waiting = (container.get("state") or {}).get("waiting") or {}
         if waiting.get("reason") in _CANNOT_START:
             return f"{waiting['reason']}: {waiting.get('message', '')}".rstrip(": ")
     return ""
+
+
+def _last_line_first(output: str) -> str:
+    """Return the line that states the error, followed by the last lines before it.
+
+    In a Python traceback, this line is the first one after the frames. Otherwise it is the last line.
+    """
+    lines = [line.rstrip() for line in output.split("\n") if line.strip()]
+    if not lines:
+        return ""
+    error = len(lines) - 1
+    begins = [number for number, line in enumerate(lines) if line.startswith("Traceback (most recent call last)")]
+    if begins:
+        error = next((n for n in range(begins[-1] + 1, len(lines)) if not lines[n].startswith(" ")), error)
+    text = lines.pop(error).strip()[:_MAX_LOG]
+    before = " | ".join(lines)[-_MAX_LOG:].strip(" |")
+    return f"{text} (before: {before})" if before else text
 
 
 def _deployment(metadata: Body) -> str | None:

@@ -158,7 +158,7 @@ class Interrupted(FractusError):
 class MissionComplete(FractusError):
     """All control points of this component are complete. The drone is at home or on its return flight."""
 
-    remedy = "nothing remains to be done"
+    remedy = "for another flight, apply the application again, or give the Grant another uid"
 
 
 class Unavailable(FractusError):

@@ -52,6 +52,7 @@ def run(
     | The system or a pilot takes the drone (`ControlLost`) | Control is requested again |
     | The program causes the same takeover three times without another completed waypoint | The mission ends early |
     | Another process of this component has control (`ControlHeld`) | Control is requested again |
+    | An earlier run completed the mission | The program is not called. A warning names the remedy, and the process ends like after the mission |
     | The mission ends early (`MissionEnded`) | The process exits with 1 (in a pod it stays, because a restart would have no effect) |
     | The program raises another error, for example `PolicyDenied` | The drone hovers, and the process exits with 1 |
     | Tasks of an `asyncio.TaskGroup` fail | The reaction to the most severe of their errors |
@@ -146,12 +147,14 @@ async def fly(
 
 async def _fly(program: Program, drone: Mobility, response_timeout_s: float) -> None:
     complete = False
+    flown = False
     while not complete:
         try:
             async with drone.control(
                 progress=lambda reason: _log.info("run: waiting for the drone (reason=%s)", reason),
                 response_timeout_s=response_timeout_s,
             ) as control:
+                flown = True
                 reached = control.waypoints_reached
                 _log.info(
                     "run: control granted (control_point=%d waypoints_reached=%d)", control.control_point + 1, reached
@@ -159,8 +162,10 @@ async def _fly(program: Program, drone: Mobility, response_timeout_s: float) -> 
                 await _carry_out(program, drone, control)
             complete = control.mission_complete
             _log.info("run: control returned (mission_complete=%s)", complete)
-        except MissionComplete:
+        except MissionComplete as error:
             complete = True
+            if not flown:
+                _log.warning("run: no flight, because an earlier run completed this mission; %s", error.remedy)
         except MissionEnded:
             raise
         except (ControlLost, ControlHeld) as error:

@@ -400,7 +400,7 @@ def test_failed_component_is_reported_with_last_log_lines(
     status = {"conditions": [{"type": "Ready", "status": "False"}], "containerStatuses": [told]}
     world.api.merge(f"/api/v1/namespaces/{namespace}/pods/{pod['metadata']['name']}/status", {"status": status})
     wait_for(lambda: world.condition(namespace, "Ready")["reason"] == "ComponentFailed", "the failure in the status")
-    last_words = "traffic-navigator failed with exit code 1: flies | no route to the river"
+    last_words = "traffic-navigator failed with exit code 1: no route to the river (before: flies)"
     assert last_words in world.condition(namespace, "Ready")["message"]
     path = f"/api/v1/namespaces/{namespace}/events"
     wait_for(lambda: any(last_words in event["message"] for event in world.api.list(path)), "the Event")

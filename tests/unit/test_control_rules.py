@@ -57,7 +57,8 @@ def test_control_is_granted_and_returned() -> None:
     assert state.returning
     assert [action.event.state for action in actions if isinstance(action, SendEvent)] == [StreamState.COMPLETE]
     _, actions = apply_events(events.StreamOpened(2, "a", "A"), state=state)
-    assert actions == (RefuseStream(2, "MissionComplete", "the mission is complete"),)
+    reason = "the mission is complete; another flight needs a Grant with another uid"
+    assert actions == (RefuseStream(2, "MissionComplete", reason),)
 
 
 @pytest.mark.parametrize(

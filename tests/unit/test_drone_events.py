@@ -44,6 +44,7 @@ class Cluster:
         self.holders: list[str] = [APPLICATION]
         self.applications: dict[tuple[str, str], Any] = {}
         self.posted: dict[str, tuple[str, str]] = {}
+        self.of_application: dict[str, tuple[str, str, str]] = {}
         self.failing = 0
         self.landed = asyncio.Event()
         self.start()
@@ -58,8 +59,11 @@ class Cluster:
     async def create_event(
         self, regarding: Any, *, reason: str, message: str, name: str, warning: bool, **_: object
     ) -> None:
-        assert regarding["kind"] == "Drone"
         assert not warning
+        if regarding["kind"] == "Application":
+            self.of_application.setdefault(name, (regarding["metadata"]["uid"], reason, message))
+            return
+        assert regarding["kind"] == "Drone"
         self.failing -= 1
         if self.failing == 0:
             raise KubeError(503, "ServiceUnavailable", "not now")
@@ -90,7 +94,20 @@ def cluster() -> Cluster:
 
 def ended(message: str) -> Any:
     condition = {"type": "MissionComplete", "status": "True", "reason": "MissionComplete", "message": message}
-    return SimpleNamespace(body={"status": {"conditions": [condition]}})
+    return SimpleNamespace(body={"metadata": {"uid": "a1"}, "status": {"conditions": [condition]}})
+
+
+async def test_takeover_is_also_an_event_of_the_application(cluster: Cluster) -> None:
+    cluster.applications["city", "traffic"] = SimpleNamespace(body={"metadata": {"uid": "a1"}})
+    await cluster.observe(drone("inactive", at_s=0), drone("flying", DRIVER, at_s=2))
+    await cluster.observe(drone("flying", "system", at_s=12, reason="policy campus forbids it"))
+    assert list(cluster.of_application.values()) == [
+        (
+            "a1",
+            "SystemTookControl",
+            "the system has control of drone-1 instead of Navigator: policy campus forbids it",
+        )
+    ]
 
 
 async def test_events_of_a_complete_flight(cluster: Cluster) -> None:

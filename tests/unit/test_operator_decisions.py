@@ -229,6 +229,26 @@ def test_status_reports_why_pods_cannot_be_created() -> None:
     assert refused == {"a": why, "b": "", "c": "", "d": "", "e": ""}
 
 
+@pytest.mark.parametrize(
+    ("output", "text"),
+    [
+        ("flies\nno route to the river\n", "no route to the river (before: flies)"),
+        ("stops", "stops"),
+        (
+            'Traceback (most recent call last):\n  File "a.py", line 3\n    x = 1 / 0\nZeroDivisionError: division by zero\ngrpc: shutting down\n',
+            "ZeroDivisionError: division by zero (before: Traceback",
+        ),
+        ("a" * 5000 + "\nValueError: " + "b" * 5000, "ValueError: bbb"),
+    ],
+)
+def test_status_names_the_error_before_the_other_log_lines(output: str, text: str) -> None:
+    container = {"state": {"terminated": {"exitCode": 1, "message": output}}}
+    body = {"metadata": {"name": "p", "namespace": "ns"}, "spec": {}, "status": {"containerStatuses": [container]}}
+    failure = parse_pod(body).failure
+    assert failure.startswith(f"exit code 1: {text}")
+    assert len(failure) < 900
+
+
 def test_status_reports_exit_code_and_last_log_lines() -> None:
     ended = {"exitCode": 1, "message": "Traceback\nValueError: no route\n"}
     restarting = {"state": {"running": {}}, "lastState": {"terminated": ended}}
@@ -236,14 +256,14 @@ def test_status_reports_exit_code_and_last_log_lines() -> None:
     well = {"state": {"running": {}}, "lastState": {"terminated": {"exitCode": 0}}}
     body = {"metadata": {"name": "p", "namespace": "ns"}, "spec": {}}
     failures = [parse_pod(body | {"status": {"containerStatuses": [c]}}).failure for c in (restarting, never, well)]
-    assert failures == ["exit code 1: Traceback | ValueError: no route", "ImagePullBackOff: no such image", ""]
+    assert failures == ["exit code 1: ValueError: no route (before: Traceback)", "ImagePullBackOff: no such image", ""]
     pods = [view("a-c"), view("a-c"), view("a-1", ready=False, failure=failures[0])]
     update = status.deployed(PLAN, pods, 0)
     ready = next(c for c in update.conditions if c.type == "Ready")
     assert (ready.reason, ready.warning) == ("ComponentFailed", True)
-    assert update.message == "waiting for a-1; a-1 failed with exit code 1: Traceback | ValueError: no route"
+    assert update.message == "waiting for a-1; a-1 failed with exit code 1: ValueError: no route (before: Traceback)"
     failed = status.finished(Outcome(OutcomeKind.FAILED, "driver lost"), "d", None, pods)
-    assert failed.message == "driver lost; a-1 failed with exit code 1: Traceback | ValueError: no route"
+    assert failed.message == "driver lost; a-1 failed with exit code 1: ValueError: no route (before: Traceback)"
     assert status.finished(Outcome(OutcomeKind.COMPLETE, "done"), "d", None, pods).message == "done"
 
 

@@ -98,11 +98,14 @@ COMPLETE = Outcome(OutcomeKind.COMPLETE)
 NOTHING_FLOWN = Outcome(OutcomeKind.FAILED, "no part of the path was flown: no leg of the driver was completed")
 
 
+_ANOTHER_FLIGHT = "another flight needs a Grant with another uid"
+
+
 def ended_refusal(outcome: Outcome) -> tuple[str, str]:
     """Return the code and reason for refusing a mission that has ended."""
     if outcome.kind is OutcomeKind.COMPLETE:
-        return "MissionComplete", "the mission is complete"
-    return "MissionEnded", f"the mission has ended ({outcome}); another flight needs a Grant with another uid"
+        return "MissionComplete", f"the mission is complete; {_ANOTHER_FLIGHT}"
+    return "MissionEnded", f"the mission has ended ({outcome}); {_ANOTHER_FLIGHT}"
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime, timedelta
-from typing import Literal
+from typing import Literal, TypeVar
 
 import click
 from cryptography import x509
-from fractus_core.api import KINDS
+from fractus_core.api import KINDS, Application, Depot, InvalidObject, Policy, Resource, Zone
 from fractus_core.api.crd import crd
 from fractus_core.api.names import CLASS_LABEL as CLASS
 from fractus_core.api.names import CLOUD_LABEL
+from fractus_core.plausibility import policy_notes, zone_notes
 
 from fractus_cli.cluster_reader import (
     EXIT_PROBLEM,
@@ -27,6 +29,8 @@ from fractus_cli.cluster_reader import (
     open_cluster,
 )
 from fractus_cli.output import output_option, printable
+
+R = TypeVar("R", bound=Resource)
 
 MIN_VERSION = (1, 32)
 """Minimum Kubernetes version that the charts require."""
@@ -399,5 +403,23 @@ def _policies(cluster: ClusterReader) -> Iterator[Finding]:
                 yield Finding(
                     "error", "policies", f"{name}: {ready.get('message')}", f"correct it: kubectl edit {name}"
                 )
+    for note in _notes(cluster):
+        yield Finding("warning", "policies", note, "correct the object if this is a mistake")
     if not cluster.list(f"{GROUP}/depots"):
         yield Finding("warning", "depots", "there is no Depot", "apply a Depot, the base of drones (see examples)")
+
+
+def _notes(cluster: ClusterReader) -> Iterator[str]:
+    depots = list(_valid(cluster, Depot))
+    applications = list(_valid(cluster, Application))
+    for zone in _valid(cluster, Zone):
+        yield from zone_notes(zone, depots)
+    for policy in _valid(cluster, Policy):
+        yield from policy_notes(policy, applications)
+
+
+def _valid(cluster: ClusterReader, kind: type[R]) -> Iterator[R]:
+    """Yield the valid objects of a kind. Another finding reports the invalid ones."""
+    for body in cluster.list(f"{GROUP}/{kind.PLURAL}"):
+        with contextlib.suppress(InvalidObject):
+            yield kind.from_body(body)

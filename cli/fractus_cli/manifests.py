@@ -31,6 +31,7 @@ from fractus_core.api.nodes import DroneStatus
 from fractus_core.documents import MAX_BYTES, BadDocument, Documents, parse_documents
 from fractus_core.planning import Host, Inventory
 from fractus_core.planning.inventory import amount_of
+from fractus_core.plausibility import policy_notes, zone_notes
 from fractus_core.validation import check_policy, check_zone
 from fractus_runtime import files
 
@@ -106,6 +107,15 @@ class Manifests:
         """Return the Applications in planning order: first those with a driver (passengers may share its drone), then by name."""
         applications = [f.resource for f in self.objects.values() if isinstance(f.resource, Application)]
         return sorted(applications, key=lambda a: (a.spec.driver is None, a.key))
+
+    def notes(self) -> Iterator[str]:
+        """Yield notes about valid objects that are probably mistakes."""
+        depots = self.of(Depot).values()
+        applications = self.applications()
+        for zone in self.of(Zone).values():
+            yield from zone_notes(zone, depots)
+        for policy in self.of(Policy).values():
+            yield from policy_notes(policy, applications)
 
     def previous(self, application: Application) -> DeploymentPlan | None:
         """Return the current plan of an Application if the manifests contain it."""

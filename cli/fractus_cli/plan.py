@@ -106,6 +106,8 @@ def plan(
         raise click.ClickException(str(error)) from None
     text = _FORMATS[output](results) if output in _FORMATS else _as_geojson(results, manifests.inventory(), settings)
     click.echo(text, nl=False)
+    for note in manifests.notes():
+        click.echo(f"note: {note}", err=True)
     for result in results:
         if result.refusal is not None and output != "table":
             click.echo(f"{'/'.join(result.application.key)}: {result.refusal.reason}: {result.refusal}", err=True)

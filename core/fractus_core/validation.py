@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 
 from fractus_core.api import Application, Depot, InvalidObject, Policy, Zone
-from fractus_core.api.geometry import Area
+from fractus_core.api.components import ControlPoint
+from fractus_core.api.geometry import Area, Point
 from fractus_core.geo import LocalFrame, area_center, area_polygon, check_extent
 from fractus_core.planning.operation_area import check_crossings, route_of
+from fractus_core.plausibility import exchanged_coordinates
 from fractus_core.policy.selectors import is_attribute
 
 MAX_WAYPOINTS = 2000
@@ -59,7 +61,7 @@ def check_policy(policy: Policy, zones: Collection[str]) -> None:
 
 
 def check_application(application: Application, depots: Mapping[str, Depot]) -> None:
-    """Refuse an application with unknown depots, invalid regions, or paths that cross too often.
+    """Refuse an application with unknown depots, invalid regions, exchanged coordinates, or paths that cross too often.
 
     Raises:
         InvalidObject: The application is invalid. The error names the field.
@@ -74,9 +76,19 @@ def check_application(application: Application, depots: Mapping[str, Depot]) -> 
                 f"{count} waypoints in all, more than {MAX_WAYPOINTS}; split the mission",
             )
         for i, point in enumerate(driver.control_points):
+            field = "path[0]" if point.path else "region"
+            if note := exchanged_coordinates(_first_place(point), depots.values()):
+                raise InvalidObject(f"spec.components[{index}].controlPoints[{i}].{field}", note)
             if point.region is not None:
                 check_area(point.region, f"spec.components[{index}].controlPoints[{i}].region")
     try:
         check_crossings(application.spec, route_of(application.spec, depots))
     except InvalidObject as error:
         raise InvalidObject(f"spec.{error.field}", error.problem) from None
+
+
+def _first_place(point: ControlPoint) -> Point:
+    if point.path:
+        return point.path[0]
+    assert point.region is not None  # the model requires a path or a region
+    return area_center(point.region)

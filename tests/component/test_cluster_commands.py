@@ -264,6 +264,7 @@ UNREGISTERED = [node("drone-1", "drone"), node("drone-9", "drone"), node("cloud-
 MISTYPED = [*UNREGISTERED[::2], node("b", "boat")]
 AUTHORITY = "/api/v1/namespaces/fractus-system/configmaps/fractus-ca"
 ADMISSION = "/apis/admissionregistration.k8s.io/v1"
+LIMIT = {"type": "LimitControl", "kind": "speed", "upperLimit": 5, "action": "enforce"}
 PROBLEMS: list[tuple[str, Any, str, str]] = [
     ("/version", {"major": "1", "minor": "31"}, "error", "upgrade Kubernetes to 1.32"),
     ("/apis/apiextensions.k8s.io/v1/customresourcedefinitions", [], "error", "--install fractus-crds"),
@@ -311,6 +312,12 @@ PROBLEMS: list[tuple[str, Any, str, str]] = [
         [named("p", status={"conditions": [condition("Ready", "False", "ZoneMissing", "no zone z")]})],
         "error",
         "policies/p: no zone z",
+    ),
+    (
+        f"{V1}/policies",
+        [named("slow", spec=LIMIT | {"selector": {"applications": {"names": ["nobody"]}}})],
+        "warning",
+        "Policy slow: spec.selector.applications: no Application is selected",
     ),
     (f"{V1}/depots", [], "warning", "apply a Depot"),
 ]

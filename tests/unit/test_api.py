@@ -114,7 +114,7 @@ def test_unknown_depot_error_names_field():
 
 def test_self_crossing_region_error_names_ring():
     cross = [{"lat": 0, "lon": 0}, {"lat": 1e-3, "lon": 1e-3}, {"lat": 0, "lon": 1e-3}, {"lat": 1e-3, "lon": 0}]
-    point = {"navigation": "regionBased", "region": {"polygon": {"exterior": cross}}}
+    point = {"navigation": "regionBased", "region": {"polygon": {"exterior": cross}}, "duration": 1}
     app = application(navigator(PATH) | {"controlPoints": [point]})
     with pytest.raises(InvalidObject, match=r"controlPoints\[0\]\.region\.polygon\.exterior: the ring crosses itself"):
         check_application(app, {})
@@ -133,7 +133,7 @@ def test_regions_with_too_many_crossings_are_refused_before_union():
     """
 
     def flown(*regions):
-        points = [{"navigation": "regionBased", "region": {"polygon": {"exterior": r}}} for r in regions]
+        points = [{"navigation": "regionBased", "region": {"polygon": {"exterior": r}}, "duration": 1} for r in regions]
         return application(navigator(PATH) | {"control": "partial", "controlPoints": points})
 
     check_application(flown(star(0, 600), star(1000, 600), star(5, 600)), {})

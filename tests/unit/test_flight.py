@@ -92,7 +92,12 @@ def test_flight_of_driver_is_interrupted_by_regions():
     square = [at(400, 0), at(500, 0), at(500, 100), at(400, 100)]
     points = [
         {"navigation": "pathBased", "path": [at(100, 0), at(200, 0)]},
-        {"navigation": "regionBased", "region": {"polygon": {"exterior": square}}, "point": {"position": at(400, 0)}},
+        {
+            "navigation": "regionBased",
+            "region": {"polygon": {"exterior": square}},
+            "duration": 1,
+            "point": {"position": at(400, 0)},
+        },
         {"navigation": "pathBased", "path": [at(600, 0)]},
     ]
     app = application(navigator(PATH) | {"control": "partial", "controlPoints": points})

@@ -338,7 +338,9 @@ def random_components(rng, place):
         circle = {"circle": {"center": place(), "radius": rng.choice([1, 50, 5000])}}
         ring = {"polygon": {"exterior": [place() for _ in range(rng.randint(3, 5))]}}
         region = circle if kind == "circle" else ring
-        driver["controlPoints"] = [{"point": {"position": path[0]}, "navigation": "regionBased", "region": region}]
+        driver["controlPoints"] = [
+            {"point": {"position": path[0]}, "navigation": "regionBased", "region": region, "duration": 1}
+        ]
     return [driver, VIEWER, CHECKER]
 
 

@@ -120,7 +120,7 @@ def test_link_path_is_waypoints_of_driver() -> None:
 
 
 def test_link_path_is_unknown_for_region_navigation() -> None:
-    region = "{navigation: regionBased, region: {circle: {center: {lat: 39.36, lon: 22.93}, radius: 50}}}"
+    region = "{navigation: regionBased, region: {circle: {center: {lat: 39.36, lon: 22.93}, radius: 50}}, duration: 1}"
     path = "{navigation: pathBased, path: [{lat: 39.36, lon: 22.93}]}"
     roaming = application(f"{{control: partial, controlPoints: [{path}, {region}]}}", "Navigator")
     assert flown_path(roaming.spec, DEPOTS) == ()

@@ -14,6 +14,8 @@ from fractus_core.api.model import InvalidObject, Model, Quantity, keyed, quanti
 from fractus_core.api.names import ComponentName, HeuristicKind, Name, PortName, slug
 from fractus_core.api.rules import Violation, one_of, rule
 
+_LEAST_MEMORY = "4Mi"
+"""Least memory of a container. A smaller amount lacks its unit, because no container starts with it."""
 _RESOURCES = ("cpu", "memory", "ephemeral-storage")
 _EXTENDED = (
     r"^[a-z0-9]([-a-z0-9]*[a-z0-9])?([.][a-z0-9]([-a-z0-9]*[a-z0-9])?)*/[A-Za-z0-9]([-A-Za-z0-9_.]*[A-Za-z0-9])?$"
@@ -83,6 +85,18 @@ class Resources(Model):
             for name in amounts:
                 if name not in _RESOURCES and (len(name) > _NAME_LENGTH or not re.fullmatch(_EXTENDED, name)):
                     return field, f"not {name!r:.60}"
+        return None
+
+    @rule(
+        "[has(self.requests) ? self.requests : {}, has(self.limits) ? self.limits : {}]"
+        ".all(m, m.all(k, k != 'memory' || !isQuantity(string(m[k])) ||"
+        f" quantity(string(m[k])).compareTo(quantity('{_LEAST_MEMORY}')) >= 0))",
+        f"memory must be at least {_LEAST_MEMORY}; without a unit it is in bytes, so write for example 128Mi",
+    )
+    def _enough_memory(self) -> Violation:
+        for field, amounts in (("requests", self.requests), ("limits", self.limits)):
+            if quantity(amounts.get("memory", _LEAST_MEMORY)) < quantity(_LEAST_MEMORY):
+                return f"{field}.memory", f"not {amounts['memory']}"
         return None
 
     @rule(
@@ -318,7 +332,7 @@ class ControlPoint(Model):
         default=None,
         gt=0,
         le=1440,
-        description="Flight time in the region in minutes; the battery must suffice for it. Unset: not considered.",
+        description="Flight time in the region in minutes, for which the battery must suffice.",
     )
 
     @rule("self.navigation != 'pathBased' || has(self.path)", "pathBased navigation needs path")
@@ -332,6 +346,10 @@ class ControlPoint(Model):
     @rule("!(has(self.path) && has(self.region))", "give either path or region, and only one of them")
     def _one_way(self) -> Violation:
         return "region" if self.path is not None and self.region is not None else None
+
+    @rule("!has(self.region) || has(self.duration)", "a region needs duration: the flight time in it in minutes")
+    def _duration_given(self) -> Violation:
+        return "duration" if self.region is not None and self.duration is None else None
 
     @rule("!has(self.duration) || has(self.region)", "duration is for regionBased navigation")
     def _stay_in_region(self) -> Violation:

@@ -18,9 +18,9 @@ from fractus_sim.report.report_files import Expectation
 from fractus_sim.report.track import Place, Sample, Track
 from fractus_sim.scenarios.field.field_evidence import Evidence, read_evidence
 from fractus_sim.scenarios.field.field_expectations import RunEvaluation
-from fractus_sim.scenarios.field.field_flight import parse_link
 from fractus_sim.scenarios.field.field_report import field_results, write_field_report
 from fractus_sim.scenarios.field.field_site import FieldSite, format_position
+from fractus_sim.testbeds.vehicle_settings import parse_link
 from vehicle_world import alone
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "field"

@@ -47,10 +47,12 @@ class GuidedFlight(Flight):
         """Select the position or velocity controller.
 
         As in ArduCopter, a change of the controller discards a commanded speed, because the new controller uses the
-        speeds of the parameters. `stop` keeps the controller and the commanded speed.
+        speeds of the parameters, and restarts its trajectory from the estimate. `stop` keeps the controller and the
+        commanded speed.
         """
         if controller is not self._controller:
             self._controller = controller
+            v.control.restart(v.est)
             limits = v.control.limits
             limits.speed_mps, limits.climb_mps, limits.sink_mps = leg_speeds_mps(v.params)
 

@@ -44,7 +44,43 @@ def test_flight_performance_matches_real_vehicle_within_20_percent():
     assert distance_m(vehicle, 0.0, 0.0) < 1.0
 
 
-def test_motion_respects_limits_without_overshoot():
+def test_motion_overshoots_like_the_real_vehicle():
+    """A real ArduCopter flies at up to 1.05 times its speed, 0.11 m above its altitude, and passes its target by 0.5 m."""
+    vehicle, pilot = airborne(20.0, WPNAV_SPEED=770, SIM_WIND_SPD=4.0)
+    pilot.fly_on(6.0)
+    pilot.go_to(80.0, 0.0, 30.0)
+    fastest_mps = 0.0
+    highest_m = 0.0
+    farthest_m = 0.0
+    passing_mps = 0.0
+    for _ in range(3000):
+        pilot.step()
+        body = vehicle.body
+        fastest_mps = max(fastest_mps, math.hypot(body.vn, body.ve))
+        highest_m = max(highest_m, -body.down)
+        farthest_m = max(farthest_m, body.north)
+        if not passing_mps and body.north >= 80.5:
+            passing_mps = body.vn
+    assert 1.01 * 7.7 < fastest_mps < 1.05 * 7.7
+    assert 30.05 < highest_m < 30.15
+    assert 80.5 < farthest_m < 81.3
+    assert passing_mps > 0.3
+    assert distance_m(vehicle, 80.0, 0.0) < 0.2, "the vehicle comes back to its target"
+
+
+def test_velocity_zero_near_target_stops_beyond_it():
+    """A real ArduCopter restarts its trajectory from the measured velocity when the controller changes."""
+    vehicle, pilot = airborne(20.0)
+    pilot.fly_on(6.0)
+    pilot.go_to(60.0, 0.0, 20.0)
+    pilot.wait(lambda: vehicle.body.north > 59.5, 30.0)
+    for _ in range(500):
+        _local(pilot, 1, 0b111111000111)
+        pilot.step()
+    assert vehicle.body.north > 60.3
+
+
+def test_motion_respects_limits():
     vehicle, pilot = airborne(20.0, WPNAV_SPEED=500)
     pilot.go_to(80.0, 30.0, 20.0)
     accelerations = []

@@ -12,14 +12,14 @@ from vehicle_flights import at_random, breaches, by_hand, failing, mission, pilo
 from vehicle_pilot import Pilot
 
 FLIGHTS: tuple[tuple[Callable[[Pilot], None], int, dict[str, float], str], ...] = (
-    (mission, 2, {"SIM_WIND_SPD": 5.0, "SIM_WIND_TURB": 1.5, "WP_YAW_BEHAVIOR": 0.0}, "5ca176b649012394"),
-    (by_hand, 3, {"SIM_WIND_SPD": 4.0, "SIM_WIND_TURB": 2.0}, "76d9df1a561c563f"),
-    (smart_return, 4, {}, "d2924d3b44d5e950"),
-    (breaches, 5, {}, "1eec74dd0420bc9a"),
-    (breaches, 6, {"FENCE_ACTION": 3.0}, "2ab40d8b3ed68c7b"),
-    (failing, 7, {}, "a3c1b5babcb1b4dc"),
-    (at_random, 10, {}, "45461fb866460899"),
-    (at_random, 17, {}, "b122190511f0e0ac"),
+    (mission, 2, {"SIM_WIND_SPD": 5.0, "SIM_WIND_TURB": 1.5, "WP_YAW_BEHAVIOR": 0.0}, "ae85b51df9586d65"),
+    (by_hand, 3, {"SIM_WIND_SPD": 4.0, "SIM_WIND_TURB": 2.0}, "11af832e55a3f0db"),
+    (smart_return, 4, {}, "1ca6a0452a05003d"),
+    (breaches, 5, {}, "d9080c7c4cc3f2ba"),
+    (breaches, 6, {"FENCE_ACTION": 3.0}, "fa58da5692c7e3b1"),
+    (failing, 7, {}, "7982713408adefbe"),
+    (at_random, 10, {}, "063c2c1ed9ccf004"),
+    (at_random, 17, {}, "e029354244c33eed"),
 )
 
 

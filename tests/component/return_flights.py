@@ -117,6 +117,7 @@ class _ReturningDrones:
         self.next_leg: Any = None
         self._arrived = np.zeros(self.count, dtype=bool)
         self._legs: list[GotoArgs | None] = [None] * self.count
+        self._last = np.zeros(self.count, dtype=bool)
         self._reached = np.full(self.count, SETTINGS.reached_m)
         self._climbing = np.zeros(self.count, dtype=bool)
         self._ceilings = fleet.heights[:, 1].copy()
@@ -170,7 +171,10 @@ class _ReturningDrones:
                     and abs(z - (leg.alt or z)) <= SETTINGS.height_reached_m
                 ):
                     self._legs[i] = None
-                    fleet.send(i, BRAKE)
+                    if self._last[i]:
+                        self._arrived[i] = self.exempt[i] = True
+                    else:
+                        fleet.send(i, BRAKE)
             elif speeds[i] < AT_REST_MPS:
                 self._begin_leg(i)
 
@@ -185,6 +189,7 @@ class _ReturningDrones:
             self._arrived[i] = self.exempt[i] = True
             return
         self._legs[i] = leg.args
+        self._last[i] = leg.last
         self._reached[i] = leg.reached_m
         self._begun[i] = True
         self._tops[i] = leg.args.speed_mps
@@ -225,7 +230,10 @@ async def _search(fleet: Fleet, i: int) -> Any:
     now: Situation = fleet.situation(i, measured=True)
     place: Floats = fleet.estimated[i]
     vehicle = SimpleNamespace(
-        home=HOME, position_problem="", distance_m=lambda _lat, _lon: math.hypot(place[0], place[1])
+        home=HOME,
+        position_problem="",
+        distance_m=lambda _lat, _lon: math.hypot(place[0], place[1]),
+        speed_mps=math.hypot(now.north_mps, now.east_mps),
     )
     state = SimpleNamespace(mission=None)
     control: Any = SimpleNamespace(

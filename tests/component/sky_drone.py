@@ -40,8 +40,11 @@ async def ready(sky: Sky, directory: Path) -> AsyncGenerator[tuple[Drone, Active
 
 
 def fly(
-    work: Callable[[Sky, Path], Awaitable[None]], directory: Path, parameters: dict[str, float] | None = None
+    work: Callable[[Sky, Path], Awaitable[None]],
+    directory: Path,
+    parameters: dict[str, float] | None = None,
+    weather: Weather | None = None,
 ) -> None:
-    sky = Sky(1, Weather(uplink_s=0.02, downlink_s=0.02), parameters or {})
+    sky = Sky(1, weather or Weather(uplink_s=0.02, downlink_s=0.02), parameters or {})
     with asyncio.Runner(loop_factory=lambda: sky) as runner:
         runner.run(work(sky, directory))  # type: ignore[arg-type]

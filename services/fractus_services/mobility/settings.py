@@ -185,8 +185,8 @@ class MobilitySettings:
     heading_reached_deg: float = 8.0
     """Difference of heading within which a leg with a heading is complete."""
 
-    heading_timeout_s: float = 8.0
-    """Seconds at the target after which a leg with a heading is complete in any case."""
+    arrival_timeout_s: float = 8.0
+    """Seconds at the target after which a leg with a heading, or the last leg home, is complete in any case."""
 
     speed_timeout_s: float = 1.3
     """Seconds within which the speed of a leg must be acknowledged. The speed is sent twice in this time.
@@ -228,7 +228,10 @@ class MobilitySettings:
     """Change of altitude above which a return climbs or descends before it flies towards home."""
 
     return_last_leg_m: float = 0.5
-    """Distance from home within which the last leg ends and the drone lands."""
+    """Distance from home within which the drone has reached it. The last leg ends when the drone has also settled there."""
+
+    landing_radius_m: float = 0.15
+    """Distance from home within which a drone that is slower than `settled_mps` has settled, and lands."""
 
     max_route_attempts: int = 3
     """Number of attempts to fly around zones if the autopilot refuses.

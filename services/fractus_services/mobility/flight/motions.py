@@ -62,6 +62,7 @@ async def fly_to(
     permit: Permit,
     *,
     judged: Permit | None = None,
+    settles: bool = False,
 ) -> AsyncGenerator[Step, None]:
     """Fly straight to a point.
 
@@ -73,6 +74,8 @@ async def fly_to(
         permit: Check before each command.
         judged: Check before each transmission of the target, instead of `permit`. It judges the leg from the current position,
             because the drone moves while commands are lost.
+        settles: True if the drone lands at the target. The leg is complete when the drone has settled there, because it first
+            flies past its target.
     """
     altitude = args.alt if args.alt is not None else autopilot.vehicle.altitude_m
     motion.leg = args
@@ -104,11 +107,13 @@ async def fly_to(
         height_m = abs(altitude - vehicle.altitude_m)
         remaining_m = math.hypot(distance_m, height_m)
         complete = distance_m <= reached_m and height_m <= SETTINGS.height_reached_m
-        if complete and args.yaw_deg is not None:
+        if complete and (settles or args.yaw_deg is not None):
             reached_at = autopilot.now if reached_at is None else reached_at
-            progress_at = autopilot.now  # turning on the spot is progress
-            timed_out = autopilot.now - reached_at > SETTINGS.heading_timeout_s
-            complete = _heading_reached(vehicle, args.yaw_deg) or timed_out
+            progress_at = autopilot.now  # turning on the spot and settling are progress
+            turned = args.yaw_deg is None or _heading_reached(vehicle, args.yaw_deg)
+            settled = not settles or has_settled(vehicle, distance_m)
+            timed_out = autopilot.now - reached_at > SETTINGS.arrival_timeout_s
+            complete = (turned and settled) or timed_out
         yield Step(remaining_m, complete)
         if complete:
             return
@@ -182,6 +187,11 @@ async def come_to_rest(autopilot: Autopilot, motion: Motion, permit: Permit) -> 
     finally:
         motion.braking = False
     motion.check()
+
+
+def has_settled(vehicle: VehicleState, distance_m: float) -> bool:
+    """Return True if a drone at this distance from its place of landing may begin to land."""
+    return distance_m <= SETTINGS.landing_radius_m and vehicle.speed_mps <= SETTINGS.settled_mps
 
 
 def _heading_reached(vehicle: VehicleState, yaw_deg: float) -> bool:

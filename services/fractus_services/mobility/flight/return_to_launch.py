@@ -22,7 +22,7 @@ from fractus_services.grant_files import ActiveGrant
 from fractus_services.mobility.authority.control_store import ControlStore
 from fractus_services.mobility.authority.effects import Motion
 from fractus_services.mobility.flight.authorization import PolicyGate
-from fractus_services.mobility.flight.motions import Step
+from fractus_services.mobility.flight.motions import Step, has_settled
 from fractus_services.mobility.flight.route_following import (
     REPLAN_CODES,
     NextLeg,
@@ -217,7 +217,7 @@ class ReturnFlight:
         try:
             async with aclosing(self._routes.legs(flight, motion, lambda: self._next_leg(flight))) as steps:
                 async for step in steps:
-                    yield step
+                    yield replace(step, complete=False)  # The landing follows.
         except Refused as refusal:
             if refusal.verdict.code == "NoLegalWay" and self._control.retraces:
                 self.given_up = flight.constraints.grant
@@ -272,7 +272,10 @@ class ReturnFlight:
         return vehicle.distance_m(vehicle.home.lat, vehicle.home.lon) if vehicle.home is not None else math.inf
 
     async def _next_leg(self, flight: SystemFlight) -> NextLeg | None:
-        """Return the next leg home, or None if the drone is at home, or if position or home is unknown.
+        """Return the next leg home, or None if the drone has settled at home, or if position or home is unknown.
+
+        The last leg ends when the drone has settled, because a drone that lands while it flies past home comes down up to a
+        metre away. Within a metre of home, the drone keeps its altitude, and lands where it is if there is no legal leg.
 
         Raises:
             Refused: There is no legal route, or the position is not trusted.
@@ -282,9 +285,15 @@ class ReturnFlight:
             raise Unavailable("AutopilotUnavailable", "another station moved home; it must be set back first")
         now = self._gate.situation()
         distance_m = self._home_distance_m()
-        if now.lat is None or now.lon is None or now.home is None or distance_m <= SETTINGS.reached_m:
+        if now.lat is None or now.lon is None or now.home is None:
             return None
-        for height in return_altitudes_m(now, flight.constraints.compiled, RTL_CONE_SLOPE * distance_m):
+        if has_settled(self._control.autopilot.vehicle, distance_m):
+            return None
+        near = distance_m <= SETTINGS.reached_m
+        heights: tuple[float, ...] = (now.altitude_m,)
+        if not near:
+            heights = return_altitudes_m(now, flight.constraints.compiled, RTL_CONE_SLOPE * distance_m)
+        for height in heights:
             vertical_first = may_change_altitude(now, flight.constraints.compiled, height)
             # Normally the autopilot's straight return must be legal from each waypoint of a route. The system itself
             # flies this route home, so `retraces` disables that condition.
@@ -303,9 +312,12 @@ class ReturnFlight:
             speed_mps = limited_mps(self._control.cruise_mps, leg, now, flight.constraints.compiled)
             return NextLeg(
                 replace(leg, speed_mps=speed_mps),
-                last=False,
+                last,
                 reached_m=SETTINGS.return_last_leg_m if last else SETTINGS.reached_m,
+                settles=last,
             )
+        if near:
+            return None
         raise PreconditionFailed("NoLegalWay", "zones surround the drone or its home")
 
 

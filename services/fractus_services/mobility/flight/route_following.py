@@ -109,11 +109,13 @@ class NextLeg:
         args: Target, altitude and speed of the leg.
         last: True if the route ends with this leg.
         reached_m: Distance to the target within which the leg is complete.
+        settles: True if the drone lands at the target, see `fly_to`.
     """
 
     args: GotoArgs
     last: bool
     reached_m: float = SETTINGS.reached_m
+    settles: bool = False
 
 
 async def first_leg(
@@ -244,7 +246,8 @@ class RouteFollower:
             # Reduce the acceptance radius of a short leg, for example out of a zone's margin, so that the drone flies it.
             short = SETTINGS.at_waypoint_m < distance_m < 2 * leg.reached_m and not leg.last
             reached_m = min(leg.reached_m, max(distance_m / 3, SETTINGS.at_waypoint_m)) if short else leg.reached_m
-            async with aclosing(fly_to(autopilot, motion, leg.args, reached_m, permit)) as steps:
+            flying = fly_to(autopilot, motion, leg.args, reached_m, permit, settles=leg.settles)
+            async with aclosing(flying) as steps:
                 async for step in steps:
                     yield Step(step.distance_m, step.complete and leg.last)
             if leg.last:

@@ -28,6 +28,20 @@ FAILSAFES = {
 }  # fmt: skip
 """Failsafe parameters that permit arming, for a vehicle that records no path."""
 
+_SPELT_4_7 = {
+    "SYSID_MYGCS": ("MAV_GCS_SYSID", 1.0), "WPNAV_ACCEL": ("WP_ACC", 0.01), "PSC_POSXY_P": ("PSC_NE_POS_P", 1.0),
+    "WPNAV_ACCEL_Z": ("WP_ACC_Z", 0.01), "PSC_JERK_XY": ("PSC_NE_JERK", 1.0), "RTL_ALT": ("RTL_ALT_M", 0.01),
+    "WPNAV_SPEED": ("WP_SPD", 0.01), "RTL_SPEED": ("RTL_SPEED_MS", 0.01), "RTL_CLIMB_MIN": ("RTL_CLIMB_MIN_M", 0.01),
+    "RTL_ALT_FINAL": ("RTL_ALT_FINAL_M", 0.01), "ANGLE_MAX": ("ATC_ANGLE_MAX", 0.01),
+}  # fmt: skip
+"""Names of ArduCopter 4.7 for parameters of 4.6, with the factor of their values."""
+
+
+def as_release_4_7(values: Mapping[str, float]) -> dict[str, float]:
+    """Return parameters of ArduCopter 4.6 under the names and in the units of 4.7."""
+    renamed = {name: _SPELT_4_7.get(name, (name, 1.0)) for name in values}
+    return {name: values[old] * factor for old, (name, factor) in renamed.items()} | {"MAV_GCS_SYSID_HI": 0.0}
+
 
 def parameter_responses(
     values: dict[str, float],

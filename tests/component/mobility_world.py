@@ -77,6 +77,7 @@ class Plane(MavlinkAutopilot):
         self.disconnected = False
         self.uplink_s = self.downlink_s = 0.0
         self.fixed: tuple[str, ...] = ()
+        self.errors = False
         self.measured = False
         """True if the vehicle reports its velocity so often that the service can derive the acceleration."""
         self.parameters = MOVEMENT | FAILSAFES | {"WPNAV_SPEED": 100 * DEFAULT_MPS}
@@ -113,7 +114,7 @@ class Plane(MavlinkAutopilot):
         self._after(self.downlink_s, self.take, outgoing)
 
     def _receive(self, outgoing: Message) -> None:
-        for response in parameter_responses(self.parameters, outgoing, self.fixed):
+        for response in parameter_responses(self.parameters, outgoing, self.fixed, errors=self.errors):
             self._reply(response)
         kind = outgoing.name
         command = outgoing.values.get("command", 0)

@@ -11,6 +11,7 @@ from fractus_core.policy.decision_types import Airframe
 from fractus_core.policy.return_route import ReturnBounds, return_altitudes_m, return_bounds
 from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
 from mobility_world import World, area, end, goto, refusal, spec
+from parameter_vehicle import as_release_4_7
 from policy_world import altitude, at, box, compiled, exclusion, speed, zone
 from virtual_time import fly
 
@@ -107,6 +108,35 @@ def test_rtl_limits_are_applied_during_mission_and_restored_after(tmp_path: Path
                 await second.until(lambda: not second.plane.vehicle.armed)
                 await second.until(lambda: held(second) == OWNED, 30)
         assert not (tmp_path / "return.json").exists()
+
+    fly(flight)
+
+
+def test_vehicle_of_release_4_7_is_limited_and_restored_under_its_own_names(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            plane = world.plane
+            owned = as_release_4_7({**plane.parameters, **OWNED, "SYSID_MYGCS": 255.0, "GUID_TIMEOUT": 3.0})
+            plane.parameters = dict(owned)
+            plane.errors = True
+            world.observer.found()
+            await world.until(lambda: world.control.failsafe_status is not None)
+            grant = world.grants.put(spec(limits=LIMITS))
+            await world.up(grant, 8.0)
+            flown = {name: value for name, value in plane.parameters.items() if value != owned[name]}
+            assert flown == {
+                "MAV_GCS_SYSID": 244.0,
+                "GUID_TIMEOUT": 1.0,
+                "RTL_ALT_M": 12.0,
+                "WP_SPD": 3.5,
+                "RTL_CLIMB_MIN_M": 0.0,
+            }
+            assert plane.parameters.keys() == owned.keys()
+            plane.parameters = dict(owned)  # as after PREFLIGHT_STORAGE of another station, without a message
+            await world.until(lambda: all(plane.parameters[name] == value for name, value in flown.items()), 12)
+            await world.control.return_control(grant)
+            await world.until(lambda: not plane.vehicle.armed)
+            await world.until(lambda: plane.parameters == owned | {"MAV_GCS_SYSID": 244.0}, 30)
 
     fly(flight)
 

@@ -15,7 +15,7 @@ from fractus_services.mobility.autopilot import FailsafeStatus
 from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
 from fractus_services.mobility.mavlink.failsafes import MavlinkFailsafes, Reader
 from fractus_services.mobility.mavlink.parameters import ParameterLost
-from parameter_vehicle import BY_NAME, ParameterVehicle
+from parameter_vehicle import BY_NAME, ParameterVehicle, as_release_4_7
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from virtual_time import run
 
@@ -30,15 +30,7 @@ AS_4_6 = {
     "WPNAV_SPEED": 700.0, "RTL_SPEED": 0.0, "RTL_CLIMB_MIN": 0.0, "RTL_ALT_TYPE": 1.0, "RTL_ALT_FINAL": 500.0,
     "RALLY_LIMIT_KM": 0.25, "RTL_CONE_SLOPE": 3.0, "GUID_OPTIONS": 0.0, "ANGLE_MAX": 3000.0, "PSC_ANGLE_MAX": 0.0, "FS_EKF_THRESH": 0.8,
 }  # fmt: skip
-SPELT_4_7 = {
-    "SYSID_MYGCS": ("MAV_GCS_SYSID", 1.0), "WPNAV_ACCEL": ("WP_ACC", 0.01), "PSC_POSXY_P": ("PSC_NE_POS_P", 1.0),
-    "WPNAV_ACCEL_Z": ("WP_ACC_Z", 0.01), "PSC_JERK_XY": ("PSC_NE_JERK", 1.0), "RTL_ALT": ("RTL_ALT_M", 0.01),
-    "WPNAV_SPEED": ("WP_SPD", 0.01), "RTL_SPEED": ("RTL_SPEED_MS", 0.01), "RTL_CLIMB_MIN": ("RTL_CLIMB_MIN_M", 0.01),
-    "RTL_ALT_FINAL": ("RTL_ALT_FINAL_M", 0.01), "ANGLE_MAX": ("ATC_ANGLE_MAX", 0.01),
-}  # fmt: skip
-AS_4_7 = {
-    SPELT_4_7.get(name, (name, 1.0))[0]: value * SPELT_4_7.get(name, (name, 1.0))[1] for name, value in AS_4_6.items()
-} | {"MAV_GCS_SYSID_HI": 0.0}
+AS_4_7 = as_release_4_7(AS_4_6)
 AS_4_7_0 = {{"PSC_NE_JERK": "PSC_JERK_NE"}.get(name, name): value for name, value in AS_4_7.items()}
 FIGURES = Airframe(
     accel_mps2=1.0, position_gain=0.6, climb_accel_mps2=0.7, jerk_mps3=3.0, return_altitude_m=42.0, retraces=True

@@ -38,7 +38,9 @@ MISSING_WINDOW = 12
 _LISTS = {"fence": mavlink.MAV_MISSION_TYPE_FENCE, "rally point": mavlink.MAV_MISSION_TYPE_RALLY}
 _ITEM_FIELDS = ("command", "frame", "param1", "param2", "param3", "param4", "x", "y", "z")
 
-_MEASURED = re.compile(r"STAT_|SIM_|BARO\d*_GND_PRESS|INS\d*_GYR\w*(OFFS|CALTEMP)|COMPASS_(OFS|DEC)|MOT_THST_HOVER")
+_MEASURED = re.compile(
+    r"STAT_|SIM_|BARO\d*_GND_PRESS|INS\d*_GYR\w*(OFFS|CALTEMP)|COMPASS_(OFS|DEC)|MOT_THST_HOVER|AHRS_ORIG"
+)
 """Parameters that ArduPilot itself writes: counters, calibrations and learned values, and the parameters of a simulation."""
 
 Item = tuple[float, ...]

@@ -8,12 +8,13 @@ import json
 import logging
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from fractus_core.api.grants import ENDED, MAX_MESSAGE, Grant, GrantPhase, GrantSpec, ReportedGrant
+from fractus_core.api.grants import ENDED, MAX_MESSAGE, Grant, GrantPhase, GrantSpec, ReportedGrant, ReportedWaypoints
 from fractus_core.api.model import InvalidObject
-from fractus_core.control import Outcome, OutcomeKind
+from fractus_core.control import Outcome, OutcomeKind, WaypointCounts
 from fractus_core.policy.grant_signatures import BadSignature, UnknownAuthority, read_authorities, verify
 from fractus_runtime.files import (
     UnsuitableFile,
@@ -125,7 +126,12 @@ def grant_report(grant: Grant, missions: Mapping[str, Outcome], problem: str | N
     if problem is not None:
         phase = "Pending"
         message = problem
-    return _report(grant.metadata.model_dump(by_alias=True), phase, message)
+    report = _report(grant.metadata.model_dump(by_alias=True), phase, message)
+    outcome = missions.get(grant.spec.mission_key)
+    if phase not in ENDED or outcome is None or outcome.waypoints == WaypointCounts():
+        return report
+    counts = ReportedWaypoints.model_validate(asdict(outcome.waypoints))
+    return report.model_copy(update={"waypoints": counts})
 
 
 def keep_final_phase(report: ReportedGrant, reported: ReportedGrant | None) -> ReportedGrant:

@@ -13,7 +13,7 @@ from pathlib import Path
 import grpc
 from fractus_core.api.geometry import Reference
 from fractus_core.api.names import node_server_name
-from fractus_core.control import Outcome, OutcomeKind
+from fractus_core.control import Outcome, OutcomeKind, WaypointCounts
 from fractus_core.exhaustive import exhaustive
 from fractus_proto.v1.mobility_pb2 import MissionOutcome, SubscribeTelemetryRequest, Telemetry
 from fractus_proto.v1.mobility_pb2_grpc import MobilityServiceStub
@@ -90,7 +90,8 @@ class TelemetrySnapshot:
 
 def _parse_outcome(message: MissionOutcome) -> Outcome:
     """Convert a mission outcome. An unknown kind counts as failed."""
-    return Outcome(_OUTCOMES.get(message.kind, OutcomeKind.FAILED), message.reason)
+    counts = WaypointCounts(message.waypoints_reached, message.waypoints_skipped, message.waypoints_corrected)
+    return Outcome(_OUTCOMES.get(message.kind, OutcomeKind.FAILED), message.reason, counts)
 
 
 def parse_telemetry(message: Telemetry) -> TelemetrySnapshot:

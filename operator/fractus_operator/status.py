@@ -10,7 +10,7 @@ from typing import Any, Literal, assert_never
 from fractus_core.api import Condition, Drone, Grant
 from fractus_core.api.conditions import ConditionUpdate
 from fractus_core.api.plans import DeploymentPlanSpec
-from fractus_core.control import Outcome, OutcomeKind
+from fractus_core.control import Outcome, OutcomeKind, WaypointCounts
 
 from fractus_operator.pods import PodView
 
@@ -150,14 +150,19 @@ def mission_outcome(uid: str | None, grants: Iterable[Grant]) -> Outcome | None:
         reports_outcome = spec.class_ == "driver" or spec.tour
         if not reports_outcome or spec.application.uid != uid or status is None:
             continue
+        waypoints = WaypointCounts()
+        if status.waypoints is not None:
+            waypoints = WaypointCounts(**status.waypoints.model_dump())
         match status.phase:
             case "Complete":
-                return Outcome(OutcomeKind.COMPLETE, status.message or f"{spec.component} finished its mission")
+                message = status.message or f"{spec.component} finished its mission"
+                return Outcome(OutcomeKind.COMPLETE, message, waypoints)
             case "Failed":
-                return Outcome(OutcomeKind.FAILED, status.message or f"the mission of {spec.component} failed")
+                message = status.message or f"the mission of {spec.component} failed"
+                return Outcome(OutcomeKind.FAILED, message, waypoints)
             case "Revoked":
                 message = status.message or f"the control of {spec.component} was revoked"
-                return Outcome(OutcomeKind.REVOKED, message)
+                return Outcome(OutcomeKind.REVOKED, message, waypoints)
             case "Pending" | "Active" | None:
                 continue
             case _:
@@ -299,13 +304,19 @@ def finished(outcome: Outcome, name: str | None, drone: Drone | None, pods: Sequ
     complete = outcome.kind is OutcomeKind.COMPLETE
     reason = _REASONS[outcome.kind]
     message = outcome.reason
+    counts = str(outcome.waypoints)
+    if counts:
+        message += f"; {counts}"
     failures = "" if complete else _failures(pods)
     if failures:
         message += f"; {failures}"
-    conditions = (
+    conditions: tuple[ConditionUpdate, ...] = (
         ConditionUpdate("Ready", "False", reason, message, progress=complete),
         ConditionUpdate("MissionComplete", "True" if complete else "False", reason, message),
     )
+    if complete and outcome.waypoints.skipped:
+        text = f"{counts}: their legs were refused, or the driver omitted them; `fractus audit show` names the verdicts"
+        conditions = (*conditions, ConditionUpdate("Partial", "True", "WaypointsSkipped", text, adverse=True))
     return _mission_over(conditions, name, drone)
 
 

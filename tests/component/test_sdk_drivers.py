@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import math
 import warnings
 from collections.abc import Awaitable, Callable
@@ -44,13 +45,14 @@ class Flight:
 
 @dataclass
 class End:
-    """End of a flight: outcome of the mission, error with which the process exited, takeovers, and position of the drone."""
+    """End of a flight: outcome of the mission, error of the process, takeovers, position of the drone, waypoint counts."""
 
     outcome: str
     error: str
     takeovers: list[str]
     home: bool
     lease: bool
+    waypoints: str
 
 
 def program(stage: str, fault: Fault, flight: Callable[[Mobility, fractus.Control], Flight]) -> Any:
@@ -112,7 +114,8 @@ def fly(directory: Path, stage: str, fault: Fault, *policies: Any, **options: An
             home = not plane.vehicle.armed and math.hypot(*plane.xy) < 2.0 and plane.height < 0.2
             error = "" if running.cancelled() else running.result()
             takeovers = [entry["code"] for entry in world.kinds("takeover")]
-            ends.append(End(world.outcome(), error, takeovers, home, world.control.lease is not None))
+            counts = "".join(str(outcome.waypoints) for outcome in world.control.state.outcomes.values())
+            ends.append(End(world.outcome(), error, takeovers, home, world.control.lease is not None, counts))
 
     virtual_time.fly(flight)
     assert ends[0].home, f"the drone is not at home: {ends[0]}"
@@ -234,6 +237,22 @@ def test_motion_without_await_warns_at_once_and_fails_in_strict_mode(strict: boo
         assert end.outcome == "failed: driver lost"
     else:
         assert (end.error, end.outcome) == ("", "complete")
+
+
+@pytest.mark.parametrize("completed", ["report", "mission"])
+def test_mission_with_a_refused_waypoint_counts_it_as_skipped(completed: str, tmp_path: Path) -> None:
+    async def fault(flight: Flight) -> None:
+        points = [fractus.Position(*at(0, 20), 12.0), fractus.Position(*at(0, 70), 12.0)]
+        if completed == "mission":
+            await flight.drone.mission(points, skip_refused=True)
+            return
+        async for point in flight.control.remaining(points):
+            with contextlib.suppress(fractus.PolicyDenied):
+                await flight.drone.goto(point.lat, point.lon, point.alt)
+
+    end = fly(tmp_path, "up", fault, zone("wall", "ignore", -40, 60, 40, 80))
+    assert (end.error, end.outcome) == ("", "complete")
+    assert end.waypoints == "1 of 2 waypoints reached, 1 skipped"
 
 
 def test_interrupted_tasks_of_a_task_group_restart_the_program(tmp_path: Path) -> None:

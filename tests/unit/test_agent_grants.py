@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, Self, cast
@@ -17,8 +18,8 @@ from fractus_agent.grant_synchronizer import (
     serialize_grant,
 )
 from fractus_agent.store import GrantList, KubeError, Store
-from fractus_core.api.grants import Grant, ReportedGrant, pack
-from fractus_core.control import Outcome, OutcomeKind
+from fractus_core.api.grants import Grant, ReportedGrant, ReportedWaypoints, pack
+from fractus_core.control import Outcome, OutcomeKind, WaypointCounts
 from fractus_core.policy.grant_signatures import BadSignature, UnknownAuthority
 from fractus_runtime.backoff import Backoff
 
@@ -441,6 +442,15 @@ async def test_grants_stay_stored_while_the_api_server_is_unreachable_for_a_mont
         with pytest.raises(KubeError):
             await verifying.report_once()
     assert on_disk(tmp_path) == {"g1.json", "g2.json"}
+
+
+def test_report_of_an_ended_mission_contains_its_waypoints() -> None:
+    grant = Grant.from_body(manifest())
+    counted = replace(COMPLETE, waypoints=WaypointCounts(3, 1, 2))
+    reported = grant_report(grant, {KEY: counted}, None)
+    assert (reported.phase, reported.waypoints) == ("Complete", ReportedWaypoints(reached=3, skipped=1, corrected=2))
+    assert grant_report(grant, {KEY: COMPLETE}, None).waypoints is None
+    assert grant_report(grant, {}, None).waypoints is None
 
 
 def test_mission_outcome_gives_phase_and_reason() -> None:

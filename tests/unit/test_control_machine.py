@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import Any, get_args
 
 from depth import DEEP
-from fractus_core.control import Authority, ControlState, Mission, Outcome, OutcomeKind, events
+from fractus_core.control import Authority, ControlState, Mission, Outcome, OutcomeKind, WaypointCounts, events
 from fractus_core.control.actions import (
     Action,
     EndStream,
@@ -89,7 +89,16 @@ def normalized(state: ControlState, now: float) -> ControlState:
         mode_changes=min(state.mode_changes, 1),
         preparing=min(state.preparing, 1),
         missions={
-            key: replace(m, points_done=min(m.points_done, 1), waypoints=0, takeover="", takeovers=0)
+            key: replace(
+                m,
+                points_done=min(m.points_done, 1),
+                waypoints=0,
+                takeover="",
+                takeovers=0,
+                counts=WaypointCounts(),
+                legs=0,
+                corrected_legs=0,
+            )
             for key, m in state.missions.items()
         },
     )

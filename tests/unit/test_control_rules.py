@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
-from fractus_core.control import Authority, ControlState, Outcome, OutcomeKind, StreamState, events
+from fractus_core.control import Authority, ControlState, Outcome, OutcomeKind, StreamState, WaypointCounts, events
 from fractus_core.control.actions import (
     Action,
     RecordAudit,
@@ -198,6 +198,23 @@ def test_second_stream_of_a_driver_is_refused_while_the_first_is_open() -> None:
         events.StreamClosed(1), events.StreamOpened(3, "a", "A"), events.GrantControl(3), state=closed
     )
     assert again.drives, "the driver cannot continue after its first stream ended"
+
+
+@pytest.mark.parametrize(
+    ("flown", "counts"),
+    [
+        ((events.WaypointsDone("a", 1, leg=True), events.WaypointsDone("a", 2, leg=True)), WaypointCounts(2, 0, 0)),
+        ((events.WaypointsDone("a", 1, leg=True, corrected=True), events.WaypointsDone("a", 2)), WaypointCounts(1, 1, 1)),
+        ((events.WaypointsDone("a", 0, leg=True), events.WaypointsDone("a", 1)), WaypointCounts(1, 1, 0)),
+        ((events.WaypointsDone("a", 0, leg=True), events.WaypointsDone("a", 0, leg=True), events.WaypointsDone("a", 2)), WaypointCounts(2, 0, 0)),
+        ((events.WaypointsDone("a", 2), events.WaypointsDone("a", 1)), WaypointCounts(0, 2, 0)),
+    ],
+)  # fmt: skip
+def test_outcome_counts_waypoints_with_a_leg_as_reached(
+    flown: tuple[events.Event, ...], counts: WaypointCounts
+) -> None:
+    state, _ = apply_events(*FLY, *flown, events.ControlReturned("a", 1, waypoints=2))
+    assert state.outcomes["a"].waypoints == counts
 
 
 def test_unresponsive_driver_loses_control_and_may_come_back() -> None:

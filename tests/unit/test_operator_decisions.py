@@ -10,7 +10,7 @@ import pytest
 from fractus_core.api import Application, Drone, EdgeNode, Grant
 from fractus_core.api.conditions import ConditionUpdate, merge_conditions
 from fractus_core.api.plans import DeploymentPlanSpec, PlannedInstance
-from fractus_core.control import Outcome, OutcomeKind
+from fractus_core.control import Outcome, OutcomeKind, WaypointCounts
 from fractus_core.planning.inventory import Host, Inventory, amount_of
 from fractus_operator import status
 from fractus_operator.cache import ClusterCache
@@ -280,6 +280,26 @@ def test_mission_outcome_is_that_of_the_driver() -> None:
     assert mission_outcome("u1", [grant("Complete")]) == Outcome(OutcomeKind.COMPLETE, "because")
     assert mission_outcome("u1", [grant("Failed")]) == Outcome(OutcomeKind.FAILED, "because")
     assert mission_outcome("u1", [grant("Revoked")]) == Outcome(OutcomeKind.REVOKED, "because")
+
+
+def test_completed_status_contains_waypoint_counts_of_the_grant() -> None:
+    body = grant("Complete").to_dict()
+    body["status"]["waypoints"] = {"reached": 4, "skipped": 0, "corrected": 1}
+    outcome = mission_outcome("u1", [Grant.from_body(body)])
+    assert outcome is not None
+    update = status.finished(outcome, "d", None)
+    assert update.phase == "Completed"
+    assert update.message == "because; 4 of 4 waypoints reached (1 with corrections by policies)"
+    assert [c.type for c in update.conditions] == ["Ready", "MissionComplete"]
+
+
+def test_completed_mission_with_skipped_waypoints_is_partial() -> None:
+    outcome = Outcome(OutcomeKind.COMPLETE, "done", WaypointCounts(reached=3, skipped=1))
+    update = status.finished(outcome, "d", None)
+    assert (update.phase, update.message) == ("Completed", "done; 3 of 4 waypoints reached, 1 skipped")
+    partial = next(c for c in update.conditions if c.type == "Partial")
+    assert (partial.status, partial.reason, partial.warning) == ("True", "WaypointsSkipped", True)
+    assert "3 of 4" in partial.message
 
 
 @pytest.mark.parametrize("kind", OutcomeKind)

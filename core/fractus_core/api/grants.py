@@ -156,6 +156,17 @@ ENDED: frozenset[GrantPhase] = frozenset({"Complete", "Revoked", "Failed"})
 """Final phases. The phase of a Grant does not change after one of these phases."""
 
 
+class ReportedWaypoints(OpenModel):
+    """Numbers of waypoints of a mission that has ended, or of its points of interest."""
+
+    reached: int = Field(ge=0, description="Waypoints to which the drone flew.")
+    skipped: int = Field(ge=0, description="Waypoints whose legs were refused, or that the driver omitted.")
+    corrected: int = Field(ge=0, description="Reached waypoints whose target or speed a policy corrected.")
+
+
+_WAYPOINTS = "Waypoints of the mission, after its end. Missing if none were counted."
+
+
 class GrantStatus(OpenModel):
     """State of the Grant on its node."""
 
@@ -164,6 +175,7 @@ class GrantStatus(OpenModel):
         description="Pending until the node has stored the Grant; then the state of its mission.",
     )
     message: str | None = Field(default=None, description="Human-readable explanation.")
+    waypoints: ReportedWaypoints | None = Field(default=None, description=_WAYPOINTS)
     observed_generation: ObservedGeneration = None
     conditions: Conditions = ()
 
@@ -221,6 +233,7 @@ class ReportedGrant(OpenModel):
     name: str = Field(max_length=253, description="Name of the Grant.")
     phase: GrantPhase = Field(description="Pending until the node has stored the Grant; then the state of its mission.")
     message: str = Field(default="", max_length=MAX_MESSAGE, description="Human-readable explanation.")
+    waypoints: ReportedWaypoints | None = Field(default=None, description=_WAYPOINTS)
     observed_generation: Annotated[
         int, Field(ge=0, description="metadata.generation of the Grant that this state describes.")
     ]

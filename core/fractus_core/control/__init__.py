@@ -12,6 +12,7 @@ from fractus_core.control.state import (
     Outcome,
     OutcomeKind,
     StreamState,
+    WaypointCounts,
 )
 
 __all__ = [
@@ -22,4 +23,5 @@ __all__ = [
     "Outcome",
     "OutcomeKind",
     "StreamState",
+    "WaypointCounts",
 ]

@@ -64,11 +64,13 @@ class ControlReturned:
         key: Key of the mission.
         control_points: Number of control points in the driver's grant.
         paths: True if at least one of the control points has a path.
+        waypoints: Number of waypoints in the path of the control point that is returned.
     """
 
     key: str
     control_points: int
     paths: bool = False
+    waypoints: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,11 +81,13 @@ class WaypointsDone:
         key: Key of the mission.
         waypoints: Number of waypoints of the control point that were reached or skipped so far.
         leg: True if a leg of the driver ended. The end of the leg need not be a waypoint.
+        corrected: True if a policy corrected this leg.
     """
 
     key: str
     waypoints: int
     leg: bool = False
+    corrected: bool = False
 
 
 @dataclass(frozen=True, slots=True)

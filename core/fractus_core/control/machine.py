@@ -72,6 +72,7 @@ from fractus_core.control.state import (
     StreamState,
     SystemTask,
     TaskKind,
+    WaypointCounts,
     ended_refusal,
 )
 from fractus_core.control.state_update import DRIVER_LOST, GRANT_REMOVED, StateUpdate
@@ -180,18 +181,44 @@ def _on_driver(update: StateUpdate, event: DriverEvent) -> None:
             _grant_control(update, lease_id)
         case ControlReturned():
             _return_control(update, event)
-        case WaypointsDone(key):
-            mission = update.state.missions.get(key)
-            if mission is not None and (event.waypoints > mission.waypoints or (event.leg and not mission.leg_flown)):
-                waypoints = max(event.waypoints, mission.waypoints)
-                takeovers = mission.takeovers if waypoints == mission.waypoints else 0
-                leg_flown = mission.leg_flown or event.leg
-                update.update_mission(mission, waypoints=waypoints, leg_flown=leg_flown, takeovers=takeovers)
-                update.act(SaveJournal())
+        case WaypointsDone():
+            _count_waypoints(update, event)
         case CruiseSpeedSet(speed_mps):
             update.set(speed_mps=speed_mps)
         case _:
             assert_never(event)
+
+
+def _count_waypoints(update: StateUpdate, event: WaypointsDone) -> None:
+    """Count a leg of the driver, and the waypoints that are complete with it or by the driver's report.
+
+    A completed waypoint counts as reached if a leg ended since the waypoint before. Otherwise the driver skipped it.
+    """
+    mission = update.state.missions.get(event.key)
+    if mission is None or not (event.leg or event.waypoints > mission.waypoints):
+        return
+    legs = mission.legs + event.leg
+    corrected_legs = mission.corrected_legs + (event.leg and event.corrected)
+    completed = max(event.waypoints - mission.waypoints, 0)
+    if not completed:
+        update.update_mission(mission, leg_flown=True, legs=legs, corrected_legs=corrected_legs)
+    else:
+        reached = min(completed, legs)
+        counts = WaypointCounts(
+            mission.counts.reached + reached,
+            mission.counts.skipped + completed - reached,
+            mission.counts.corrected + min(reached, corrected_legs),
+        )
+        update.update_mission(
+            mission,
+            waypoints=event.waypoints,
+            leg_flown=mission.leg_flown or event.leg,
+            takeovers=0,
+            counts=counts,
+            legs=0,
+            corrected_legs=0,
+        )
+    update.act(SaveJournal())
 
 
 def _open_stream(update: StateUpdate, event: StreamOpened) -> None:
@@ -246,7 +273,17 @@ def _return_control(update: StateUpdate, event: ControlReturned) -> None:
     if lease is None or lease.key != event.key or not update.state.drives:
         return
     mission = update.mission(lease.key, lease.identity)
-    mission = update.update_mission(mission, points_done=mission.points_done + 1, waypoints=0, takeovers=0)
+    skipped = max(event.waypoints - mission.waypoints, 0)
+    counts = replace(mission.counts, skipped=mission.counts.skipped + skipped)
+    mission = update.update_mission(
+        mission,
+        points_done=mission.points_done + 1,
+        waypoints=0,
+        takeovers=0,
+        counts=counts,
+        legs=0,
+        corrected_legs=0,
+    )
     last = mission.points_done >= event.control_points
     update.set(lease=None, authority=Authority.SYSTEM)
     update.stop_motion(StopKind.ABORTED, "ControlReturned", "control was returned")
@@ -475,7 +512,7 @@ def _on_system(update: StateUpdate, event: SystemEvent) -> None:
         case TourPointVisited(key, visited):
             mission = update.state.missions.get(key)
             if mission is not None:
-                update.update_mission(mission, waypoints=visited)
+                update.update_mission(mission, waypoints=visited, counts=WaypointCounts(reached=visited))
             update.act(SaveJournal())
             update.act(WakeWaiters())
         case PassengerBoarded(key, identity):

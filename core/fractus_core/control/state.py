@@ -84,11 +84,40 @@ class OutcomeKind(Enum):
 
 
 @dataclass(frozen=True, slots=True)
+class WaypointCounts:
+    """Numbers of waypoints of a mission over all its control points, or of its points of interest.
+
+    Attributes:
+        reached: Waypoints to which the vehicle flew.
+        skipped: Waypoints to which the vehicle did not fly, because their legs were refused or the driver omitted them.
+        corrected: Reached waypoints whose target or speed a policy corrected.
+    """
+
+    reached: int = 0
+    skipped: int = 0
+    corrected: int = 0
+
+    def __str__(self) -> str:
+        if not self.reached and not self.skipped:
+            return ""
+        corrected = f" ({self.corrected} with corrections by policies)" if self.corrected else ""
+        skipped = f", {self.skipped} skipped" if self.skipped else ""
+        return f"{self.reached} of {self.reached + self.skipped} waypoints reached{corrected}{skipped}"
+
+
+@dataclass(frozen=True, slots=True)
 class Outcome:
-    """Outcome of a mission with its reason. The string form is shown to users."""
+    """Outcome of a mission with its reason. The string form is shown to users.
+
+    Attributes:
+        kind: Way in which the mission ended.
+        reason: Reason in plain text; empty if the mission is complete.
+        waypoints: Counts of waypoints, if they were reported.
+    """
 
     kind: OutcomeKind
     reason: str = ""
+    waypoints: WaypointCounts = WaypointCounts()
 
     def __str__(self) -> str:
         return f"{self.kind.value}: {self.reason}" if self.reason else self.kind.value
@@ -124,6 +153,9 @@ class Mission:
         takeover: Code and policies of the last takeover after which the driver may continue.
         takeovers: Number of these takeovers in succession. A further waypoint, or a takeover for another reason, starts
             the count again.
+        counts: Waypoints of all control points so far.
+        legs: Legs that ended since the last completed waypoint.
+        corrected_legs: Number of these legs that a policy corrected.
     """
 
     key: str
@@ -136,6 +168,9 @@ class Mission:
     leg_flown: bool = False
     takeover: str = ""
     takeovers: int = 0
+    counts: WaypointCounts = WaypointCounts()
+    legs: int = 0
+    corrected_legs: int = 0
 
 
 class StreamState(Enum):
@@ -339,8 +374,12 @@ class ControlState:
 
     @property
     def outcomes(self) -> dict[str, Outcome]:
-        """Outcomes of the missions that have ended, by key."""
-        return {mission.key: mission.outcome for mission in self.missions.values() if mission.outcome is not None}
+        """Outcomes of the missions that have ended, with the counts of their waypoints, by key."""
+        return {
+            mission.key: replace(mission.outcome, waypoints=mission.counts)
+            for mission in self.missions.values()
+            if mission.outcome is not None
+        }
 
     @property
     def controller(self) -> str:

@@ -280,7 +280,7 @@ class SubscribeTelemetryRequest(_message.Message):
     def __init__(self, interval_s: _Optional[float] = ...) -> None: ...
 
 class MissionOutcome(_message.Message):
-    __slots__ = ("kind", "reason")
+    __slots__ = ("kind", "reason", "waypoints_reached", "waypoints_skipped", "waypoints_corrected")
     class Kind(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
         __slots__ = ()
         KIND_UNSPECIFIED: _ClassVar[MissionOutcome.Kind]
@@ -293,9 +293,15 @@ class MissionOutcome(_message.Message):
     KIND_FAILED: MissionOutcome.Kind
     KIND_FIELD_NUMBER: _ClassVar[int]
     REASON_FIELD_NUMBER: _ClassVar[int]
+    WAYPOINTS_REACHED_FIELD_NUMBER: _ClassVar[int]
+    WAYPOINTS_SKIPPED_FIELD_NUMBER: _ClassVar[int]
+    WAYPOINTS_CORRECTED_FIELD_NUMBER: _ClassVar[int]
     kind: MissionOutcome.Kind
     reason: str
-    def __init__(self, kind: _Optional[_Union[MissionOutcome.Kind, str]] = ..., reason: _Optional[str] = ...) -> None: ...
+    waypoints_reached: int
+    waypoints_skipped: int
+    waypoints_corrected: int
+    def __init__(self, kind: _Optional[_Union[MissionOutcome.Kind, str]] = ..., reason: _Optional[str] = ..., waypoints_reached: _Optional[int] = ..., waypoints_skipped: _Optional[int] = ..., waypoints_corrected: _Optional[int] = ...) -> None: ...
 
 class Gps(_message.Message):
     __slots__ = ("fix_type", "satellites")

@@ -380,7 +380,9 @@ class ControlStore:
         self.require_control(grant)
         points = len(grant.spec.control_points)
         paths = any(point.path for point in grant.spec.control_points)
-        self.dispatch(ControlReturned(grant.key, points, paths))
+        done = self.mission(grant).points_done
+        path = grant.spec.control_points[done].path if done < points else None
+        self.dispatch(ControlReturned(grant.key, points, paths, len(path or ())))
         last = self.mission(grant).points_done >= points
         await self.save()
         return last
@@ -395,8 +397,15 @@ class ControlStore:
         self.dispatch(WaypointsDone(grant.key, waypoints))
         await self.save()
 
-    def count_leg(self, grant: ActiveGrant, lat: float, lon: float) -> None:
-        """Record the end of a driver's leg, and the next waypoint of the path if the leg ended near it."""
+    def count_leg(self, grant: ActiveGrant, lat: float, lon: float, *, corrected: bool) -> None:
+        """Record the end of a driver's leg, and the next waypoint of the path if the leg ended near it.
+
+        Args:
+            grant: Grant of the driver.
+            lat: Latitude of the target.
+            lon: Longitude of the target.
+            corrected: True if a policy corrected the leg.
+        """
         mission = self.mission(grant)
         points = grant.spec.control_points
         path = points[mission.points_done].path if mission.points_done < len(points) else None
@@ -404,13 +413,12 @@ class ControlStore:
         near = any(
             math.hypot(*LocalFrame(lat, lon).xy(point.lat, point.lon)) <= SETTINGS.waypoint_radius_m for point in ahead
         )
-        if near or not mission.leg_flown:
-            self.dispatch(WaypointsDone(grant.key, mission.waypoints + near, leg=True))
+        self.dispatch(WaypointsDone(grant.key, mission.waypoints + near, leg=True, corrected=corrected))
 
     def count_velocity_flight(self, grant: ActiveGrant) -> None:
         """Record a velocity setpoint of a driver. It counts as a completed leg, because a velocity flight has no target."""
         mission = self.mission(grant)
-        if not mission.leg_flown:
+        if not mission.legs:
             self.dispatch(WaypointsDone(grant.key, mission.waypoints, leg=True))
 
     # Home: the position where the mission armed for its first takeoff. Altitudes are measured from it, and return flights lead there.

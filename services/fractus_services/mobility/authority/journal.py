@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
-from fractus_core.control import ControlState, Mission, Outcome, OutcomeKind
+from fractus_core.control import ControlState, Mission, Outcome, OutcomeKind, WaypointCounts
 from fractus_runtime.files import read_json, remove_temporary, write_file
 
 log = logging.getLogger(__name__)
@@ -54,6 +54,8 @@ def _mission(stored: dict[str, Any]) -> Mission:
         known["outcome"] = _outcome(known["outcome"])
     else:
         known["outcome"] = None
+    # Earlier releases did not count waypoints.
+    known["counts"] = WaypointCounts(**(known.get("counts") or {}))
     if known.get("home") is not None:
         lat, lon, amsl_m = known["home"]
         known["home"] = (float(lat), float(lon), float(amsl_m))

@@ -197,7 +197,8 @@ class MobilityService:
                     ) as flying:
                         async for step in flying:
                             if step.complete:
-                                self._control.count_leg(grant, args.lat, args.lon)
+                                corrected = final.action == "correct"
+                                self._control.count_leg(grant, args.lat, args.lon, corrected=corrected)
                             yield Progress(final, step)
                 except _Outdated as outdated:
                     final = outdated.verdict

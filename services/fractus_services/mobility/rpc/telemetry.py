@@ -49,7 +49,14 @@ _KINDS = {
 
 
 def _outcome_message(outcome: Outcome) -> mobility_pb2.MissionOutcome:
-    return mobility_pb2.MissionOutcome(kind=_KINDS[outcome.kind], reason=outcome.reason)
+    counts = outcome.waypoints
+    return mobility_pb2.MissionOutcome(
+        kind=_KINDS[outcome.kind],
+        reason=outcome.reason,
+        waypoints_reached=counts.reached,
+        waypoints_skipped=counts.skipped,
+        waypoints_corrected=counts.corrected,
+    )
 
 
 def telemetry_of(

@@ -75,6 +75,7 @@ COMMANDS: dict[str, Entry] = {
     "mobility": Entry("fractus_services.commands:mobility", "Run the mobility service of a drone.", "services"),
     "plan": Entry("fractus_cli.plan:plan", "Plan Applications from manifests, without a cluster.", "geometry"),
     "policy": Entry("fractus_cli.policy:policy", "Judge a call with the policy engine, without a cluster.", "geometry"),
+    "report": Entry("fractus_sim.report_command:report", "Write the report of an Application's last flight.", "sim"),
     "schema": Entry("fractus_cli.schema:schema", "Print the JSON schema of manifests.", "model"),
     "status": Entry("fractus_cli.status:status", "Show the drones and applications of a cluster.", "kube"),
     "telemetry": Entry("fractus_cli.telemetry:telemetry", "Print the state of a drone until interrupted."),

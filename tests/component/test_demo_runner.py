@@ -21,7 +21,7 @@ from fractus_sim.demo.demo_run import live_view, replay_command
 from fractus_sim.demo.mission_data import extract_pictures, fetch_audit_logs, fetch_recordings, select_pictures
 from fractus_sim.errors import ExperimentError
 from fractus_sim.progress import Progress
-from fractus_sim.report.flight_record import FlightRecord, is_of_mission, picture_time_s
+from fractus_sim.report.flight_record import FlightRecord, TimeWindow, picture_time_s
 from fractus_sim.testbeds.embedded_cluster import ROOT
 from fractus_sim.testbeds.kube_commands import Kube
 from fractus_sim.testbeds.mission_watch import Mission, follow_mission, report_driver_lines
@@ -135,9 +135,9 @@ def test_missing_node_is_reported_with_a_remedy() -> None:
 
 def test_only_audit_entries_of_the_mission_are_kept() -> None:
     before, after = ({"time": demo_flight.stamp(time_s)} for time_s in (99.0, 101.0))
-    assert is_of_mission(after, 100.0)
-    assert not is_of_mission(before, 100.0)
-    assert not is_of_mission({"kind": "state"}, 100.0)
+    assert TimeWindow(100.0).contains(after)
+    assert not TimeWindow(100.0).contains(before)
+    assert not TimeWindow(100.0).contains({"kind": "state"})
 
 
 class RotatingNode:

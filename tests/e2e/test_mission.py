@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import json
+import os
 import re
+import subprocess
+import sys
 import time
+from pathlib import Path
 
 from conftest import DRONE, NODES, SYSTEM, example, flight_state, short_flight
 from disclosure import readable, secrets
@@ -49,7 +53,7 @@ def children(kube: Kube, namespace: str = "default", pods: str = "") -> list[str
     return [f"{o['kind']}/{o['metadata']['name']}" for o in (*objects, *grants)]
 
 
-def test_traffic_monitoring_flies_under_policies(grounded: Kube) -> None:
+def test_traffic_monitoring_flies_under_policies(grounded: Kube, tmp_path: Path) -> None:
     kube = grounded
     app = example("application.yaml")[0]
     started = time.monotonic()
@@ -103,6 +107,15 @@ def test_traffic_monitoring_flies_under_policies(grounded: Kube) -> None:
     assert "run: mission complete" in logs
     events = {e["reason"] for e in kube.all("events", "default")}
     assert {"Planned", "MissionComplete"} <= events
+
+    options = ["--kubeconfig", str(kube.kubeconfig), "--out", str(tmp_path / "report")]
+    path = f"{kube.kubectl.parent}:{os.environ['PATH']}"
+    subprocess.run(
+        [sys.executable, "-m", "fractus_cli", "report", "traffic-monitoring", *options],
+        check=True, timeout=120, env={**os.environ, "PATH": path},
+    )  # fmt: skip
+    assert f"**Completed.** {DRONE} flew" in (tmp_path / "report" / "summary.md").read_text()
+    assert (tmp_path / "report" / "map.png").stat().st_size > 10_000
 
     assert {f"{SYSTEM}/fractus-ca/tls.key", f"key of {DRONE}"} <= secret_values.keys()
     assert any(re.fullmatch(r"default/traffic-monitoring-navigator\b.*-tls/tls\.key", name) for name in secret_values)

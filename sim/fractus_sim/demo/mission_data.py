@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import re
 from base64 import b64decode
 from collections.abc import Iterable, Iterator
@@ -16,8 +17,8 @@ from mcap.reader import NonSeekingReader
 
 from fractus_sim.errors import ExperimentError
 from fractus_sim.report.audit_log_reader import read_audit_logs
-from fractus_sim.report.flight_record import AUDIT, OBJECTS, PICTURES, FlightRecord, is_of_mission, picture_time_s
-from fractus_sim.testbeds.kube_commands import NAMESPACE, SYSTEM, Kube, Object
+from fractus_sim.report.flight_record import AUDIT, OBJECTS, PICTURES, FlightRecord, TimeWindow, picture_time_s
+from fractus_sim.testbeds.kube_commands import SYSTEM, Kube, Object
 from fractus_sim.testbeds.mission_watch import Mission
 
 RECORDINGS = "recordings"
@@ -46,9 +47,11 @@ def collect_mission_data(kube: Kube, mission: Mission, folder: Path, logs: Path)
     Raises:
         ExperimentError: The API server did not respond.
     """
-    objects = [body for body in kube.objects(_KINDS) if _belongs_to(body, mission.application)]
+    objects = [body for body in kube.objects(_KINDS, mission.namespace) if _belongs_to(body, mission)]
     events = [
-        event for event in kube.objects("events") if mission.application in event["involvedObject"].get("name", "")
+        event
+        for event in kube.objects("events", mission.namespace)
+        if mission.application in event["involvedObject"].get("name", "")
     ]
     content = {
         "objects": objects,
@@ -62,12 +65,12 @@ def collect_mission_data(kube: Kube, mission: Mission, folder: Path, logs: Path)
     (folder / "events.json").write_text(json.dumps([_event(event) for event in events], indent=1) + "\n")
 
 
-def _belongs_to(body: Object, application: str) -> bool:
+def _belongs_to(body: Object, mission: Mission) -> bool:
     """Return True for the mission's Application and its plan, and for objects that belong to no application."""
     if body["kind"] not in {"Application", "DeploymentPlan"}:
         return True
     metadata = body["metadata"]
-    return bool(metadata["name"] == application and metadata.get("namespace") == NAMESPACE)
+    return bool(metadata["name"] == mission.application and metadata.get("namespace") == mission.namespace)
 
 
 def _fetch_audit_logs(kube: Kube, mission: Mission, folder: Path) -> dict[str, Any]:
@@ -79,9 +82,10 @@ def _fetch_audit_logs(kube: Kube, mission: Mission, folder: Path) -> dict[str, A
         fetch_audit_logs(kube, mobility_pod(kube, mission.drone), folder)
     except ExperimentError as error:
         return {**result, "problem": f"cannot be fetched: {error}"}
+    window = TimeWindow(mission.times["applied"], mission.times.get("over", math.inf))
     for log in read_audit_logs([folder]):
         result["entries"] += log.length
-        result["kept"] += sum(is_of_mission(entry, mission.times["applied"]) for entry in log.entries)
+        result["kept"] += sum(map(window.contains, log.entries))
         if log.problem and not result["problem"]:
             result["problem"] = f"{log.path.name}: {log.problem}"
     return result

@@ -23,6 +23,8 @@ AUDIT = "audit"
 PICTURES = "pictures"
 _CHANGING_ACTIONS = frozenset({"correct", "deny", "takeover"})
 _FLIGHT_MARGIN_S = 3.0
+_IDENTITIES = ("identity", "caller", "controller")
+"""Fields of audit log entries with the identity of an instance."""
 _MERGE_S = 60.0
 """Maximum time between identical calls that are merged into one."""
 
@@ -126,11 +128,12 @@ class FlightRecord:
             ValueError: The content of a file is invalid.
         """
         content = json.loads((folder / OBJECTS).read_text())
-        applied_s = content.get("times", {}).get("applied", 0.0)
+        times = content.get("times", {})
+        window = TimeWindow(times.get("applied", 0.0), times.get("over", math.inf))
         audit: list[dict[str, Any]] = []
         for path in sorted((folder / AUDIT).glob("*.jsonl")):
             with path.open("rb") as file:
-                audit += [entry for entry in entries(file) if is_of_mission(entry, applied_s)]
+                audit += [entry for entry in entries(file) if window.contains(entry)]
         pictures = tuple(sorted(path.name for path in (folder / PICTURES).glob("*.jpg")))
         return replace(cls.of(content, audit), pictures=pictures)
 
@@ -148,12 +151,15 @@ class FlightRecord:
             if body["kind"] in parsers:
                 objects[body["kind"]].append(parsers[body["kind"]].from_body(body))
         plans = objects["DeploymentPlan"]
-        drone_name = plans[0].spec.drone.node if plans and plans[0].spec.drone else None
+        drones = objects["Drone"]
+        if plans:
+            drone_name = plans[0].spec.drone.node if plans[0].spec.drone else None
+            drones = [drone for drone in drones if drone.name == drone_name]
         ordered = sorted(audit, key=lambda e: str(e.get("time", "")))
         return cls(
             application=objects["Application"][0],
             plan=plans[0] if plans else None,
-            drone=next((d for d in objects["Drone"] if d.name == drone_name), None),
+            drone=drones[0] if len(drones) == 1 else None,
             depots=tuple(objects["Depot"]),
             edge_nodes=tuple(sorted(objects["EdgeNode"], key=lambda n: n.name)),
             policies=tuple(sorted(objects["Policy"], key=lambda p: p.name)),
@@ -196,15 +202,55 @@ class FlightRecord:
         return LocalFrame.at(self.depots[0].spec.location if self.depots else Point(lat=0, lon=0))
 
 
-def is_of_mission(entry: Mapping[str, Any], applied_s: float) -> bool:
-    """Return True if an audit log entry was written after the application was applied.
+@dataclass(frozen=True, slots=True)
+class TimeWindow:
+    """Time of a mission in the audit log of its drone. Times are Unix seconds."""
 
-    False for an entry without time.
+    begin_s: float
+    end_s: float = math.inf
+
+    def contains(self, entry: Mapping[str, Any]) -> bool:
+        """Return True if an audit log entry was written in this time. False for an entry without time."""
+        try:
+            return self.begin_s <= _time_s(entry["time"]) <= self.end_s
+        except (ValueError, KeyError, TypeError):
+            return False
+
+
+def last_mission(audit: Iterable[Mapping[str, Any]], namespace: str, application: str) -> TimeWindow | None:
+    """Return the time of the last mission of an application on a drone, or None if there was none.
+
+    A mission begins when its Grants are added. It ends with the landing after its driver had control, because calls of its
+    other components may follow the landing. Without a landing, it ends when another driver gets control.
+
+    Args:
+        audit: Entries of the audit log of the drone's mobility service, in order.
+        namespace: Namespace of the application.
+        application: Name of the application.
     """
-    try:
-        return _time_s(entry["time"]) >= applied_s
-    except (ValueError, KeyError, TypeError):
-        return False
+    log = list(audit)
+    marker = f"/ns/{namespace}/app/{application}/"
+    own = [entry for entry in log if any(marker in str(entry.get(key, "")) for key in _IDENTITIES)]
+    grants = [entry for entry in own if entry.get("kind") == "grant" and entry.get("change") == "added"]
+    if not grants:
+        return None
+    # A service that restarts adds the Grants of the mission again.
+    mission = _mission_uid(grants[-1])
+    begin_s = min(_time_s(entry["time"]) for entry in grants if _mission_uid(entry) == mission)
+    controlled_s = max((_time_s(entry["time"]) for entry in own if entry.get("kind") == "control"), default=begin_s)
+    for entry in log:
+        if entry.get("kind") != "control" or _time_s(entry["time"]) <= controlled_s:
+            continue
+        if entry.get("action") == "landed":
+            last_s = max(_time_s(each["time"]) for each in own)
+            return TimeWindow(begin_s, max(_time_s(entry["time"]), last_s) + _FLIGHT_MARGIN_S)
+        if entry.get("action") == "granted":
+            return TimeWindow(begin_s, _time_s(entry["time"]))
+    return TimeWindow(begin_s)
+
+
+def _mission_uid(grant: Mapping[str, Any]) -> str:
+    return str(grant.get("key", "")).rpartition("#")[2]
 
 
 def picture_time_s(picture: str) -> float:

@@ -87,10 +87,11 @@ def _headline(record: FlightRecord) -> str:
     flight_s = _difference(record.track.takeoff_s, record.track.landing_s)
     duration = f" in {format_duration(flight_s)}" if flight_s is not None else ""
     corrected, refused = _decision_counts(record)
+    kept = f" {record.results} pictures were checked and kept." if record.results else ""
     return (
         f"**{phase}.** {drone} flew {record.track.distance_m:.0f} m{duration}, up to {record.track.max_altitude_m:.1f} m"
         f" high and {record.track.max_speed_mps:.1f} m/s fast, and {end}. Of {record.calls} calls, policies corrected"
-        f" {corrected} and refused {refused}. {record.results} pictures were checked and kept."
+        f" {corrected} and refused {refused}.{kept}"
     )
 
 

@@ -38,6 +38,7 @@ class Mission:
         message: Message of the Application.
         drone: Name of the drone. Empty until one is selected.
         flight_state: Flight state of the drone that its agent reported.
+        namespace: Namespace of the Application.
     """
 
     application: str
@@ -48,6 +49,7 @@ class Mission:
     message: str = ""
     drone: str = ""
     flight_state: str = ""
+    namespace: str = NAMESPACE
     _running_pods: int = 0
 
     def update(self, objects: list[Object], now_s: float, report: Report) -> None:

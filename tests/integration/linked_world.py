@@ -248,12 +248,10 @@ class Agent:
         self._process.kill()
         self._end()
 
-    def stop(self) -> None:
-        """Stop the agent gracefully, like an upgrade."""
-        assert self._process is not None
-        assert self._process.stdin is not None
-        self._process.stdin.close()
-        self._end()
+    def request_stop(self) -> None:
+        """Ask the agent to stop gracefully, like an upgrade."""
+        if self._process is not None and self._process.stdin is not None:
+            self._process.stdin.close()
 
     def _end(self) -> None:
         assert self._process is not None
@@ -265,8 +263,10 @@ class Agent:
         self._process = None
 
     def clear(self) -> None:
+        """Stop the agent gracefully if it is running."""
         if self._process is not None:
-            self.stop()
+            self.request_stop()
+            self._end()
 
     def log(self) -> str:
         path = self.folder / "agent.log"
@@ -464,6 +464,8 @@ class World:
             process.wait()
             if process.stdout is not None:
                 process.stdout.close()
+        for agent in self.agents.values():
+            agent.request_stop()  # all agents stop at the same time
         for agent in self.agents.values():
             agent.clear()
         self._closed.set()

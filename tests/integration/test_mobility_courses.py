@@ -35,7 +35,7 @@ from mobility_rig import (
     xy,
 )
 
-WALL = (-40.0, 25.0, 40.0, 40.0)
+WALL = (-20.0, 15.0, 20.0, 25.0)
 """Zone across the straight line from home to the control point in the north, as offsets in metres (x, y)."""
 
 
@@ -78,14 +78,14 @@ def partial(*policies: dict[str, Any], at: tuple[float, float]) -> dict[str, Any
 
 
 async def test_transit_flies_around_zone_to_control_point_and_home(rig: Rig) -> None:
-    rig.write_grant(partial(fence("wall", "exclusion", "ignore", *WALL), at=(0, 70)))
+    rig.write_grant(partial(fence("wall", "exclusion", "ignore", *WALL), at=(0, 45)))
     rig.start_service()
     rig.start_vehicle(3.0)
     trace = Trace(rig)
     driver = Driver(rig)
     await driver.take(120)
-    assert math.dist(xy((await rig.telemetry()).position), (0, 70)) < 2.0
-    assert max(abs(x) for x, _ in trace.points) > 41.0, "the drone flew through the zone"
+    assert math.dist(xy((await rig.telemetry()).position), (0, 45)) < 2.0
+    assert max(abs(x) for x, _ in trace.points) > 21.0, "the drone flew through the zone"
     reply = await driver.stub.ReturnControl(pb.ReturnControlRequest(), timeout=5)
     assert reply.mission_complete
     landed = await rig.until(lambda t: not t.armed, 120, "landing")
@@ -99,7 +99,7 @@ async def test_transit_flies_around_zone_to_control_point_and_home(rig: Rig) -> 
 
 
 async def test_poi_mission_visits_points_of_passenger_without_driver(rig: Rig) -> None:
-    tour = positions((30, 30), (-30, 30))
+    tour = positions((15, 15), (-15, 15))
     everywhere = [{"service": "mobility", "methods": ["GetControl", "GetPosition"]}]
     poi = {"points": tour, "serviceAccess": "path"}
     rig.write_grant(passenger_grant(tour=tour, pointsOfInterest=poi, services=everywhere))
@@ -114,10 +114,10 @@ async def test_poi_mission_visits_points_of_passenger_without_driver(rig: Rig) -
         return [e async for e in stub.GetControl(pb.GetControlRequest(), timeout=150)]
 
     riding = asyncio.create_task(ride())
-    await rig.until(lambda t: math.dist(xy(t.position), (30, 30)) < 1.5, 60, "first point")
+    await rig.until(lambda t: math.dist(xy(t.position), (15, 15)) < 1.5, 60, "first point")
     code, why = await denied(stub.Hover(pb.HoverRequest(), timeout=5))
     assert (code, why.code) == (grpc.StatusCode.PERMISSION_DENIED, "NotADriver")
-    await rig.until(lambda t: math.dist(xy(t.position), (-30, 30)) < 1.5, 60, "second point")
+    await rig.until(lambda t: math.dist(xy(t.position), (-15, 15)) < 1.5, 60, "second point")
     events = await riding
     assert events[-1].state == pb.ControlEvent.STATE_COMPLETE
     assert events[-1].waypoints_reached == 2
@@ -201,7 +201,7 @@ async def parameter(autopilot: MavlinkAutopilot, name: str) -> float:
 
 
 async def test_vehicle_fence_returns_drone_without_service(rig: Rig) -> None:
-    rig.write_grant(grant(corridor=[area(-20, -20, 20, 20)]))
+    rig.write_grant(grant(corridor=[area(-20, -20, 20, 20)], operationArea=[area(-50, -50, 50, 50)]))
     rig.start_service()
     rig.start_vehicle(2.0)
     driver = Driver(rig)
@@ -215,16 +215,16 @@ async def test_vehicle_fence_returns_drone_without_service(rig: Rig) -> None:
     assert await parameter(pilot, "FENCE_ENABLE") == 1.0
     assert await parameter(pilot, "FENCE_ALT_MAX") == 65.0
     rig.kill("service")
-    lat, lon = FRAME.latlon(0, 95)
+    lat, lon = FRAME.latlon(0, 45)
     await pilot.set_rates(flying=True)
     await pilot.go_to(lat, lon, 10.0, None)
     async with asyncio.timeout(60):
         while pilot.vehicle.mode != ARDUCOPTER.return_retracing:
             await pilot.update(0.2)
-            if pilot.vehicle.lat is not None and FRAME.xy(pilot.vehicle.lat, pilot.vehicle.lon or 0)[1] > 80:
+            if pilot.vehicle.lat is not None and FRAME.xy(pilot.vehicle.lat, pilot.vehicle.lon or 0)[1] > 30:
                 pilot.fly(8.0, 0.0, 0.0)
     north = FRAME.xy(pilot.vehicle.lat or 0, pilot.vehicle.lon or 0)[1]
-    assert 105 < north < 125, "the autopilot did not stop at its fence, about 10 m outside the operation area"
+    assert 55 < north < 75, "the autopilot did not stop at its fence, about 10 m outside the operation area"
     assert pilot.vehicle.failsafe_text == "Polygon fence breached"
     task.cancel()
 

@@ -47,7 +47,7 @@ class Killed(Exception):
 async def test_plan_and_orbit_mission_survives_pause_and_restart(rig: Rig) -> None:
     rig.write_grant(grant())
     rig.start_service("--driver-grace", "30")
-    rig.start_vehicle(2.0)
+    rig.start_vehicle()
     middle = fractus.Position(*MIDDLE, ALTITUDE_M)
     around = fractus.orbit(middle, RADIUS_M, points=8, speed_mps=6.0)
     waypoints = (*fractus.read_plan(saved_plan(rig.directory / "survey.plan")), *around)

@@ -41,7 +41,7 @@ async def start_flight(rig: Rig, speedup: float) -> None:
     rig.write_grant(grant())
     rig.start_service()
     rig.start_vehicle(speedup)
-    await Driver(rig).up()
+    await Driver(rig).up(4.0)
 
 
 async def test_second_service_takes_over_drone_after_first_dies(rig: Rig) -> None:

@@ -212,7 +212,7 @@ async def test_flight_continues_while_the_collector_is_unreachable(
     monkeypatch.setenv("OTEL_EXPORTER_OTLP_TIMEOUT", "1")
     rig.write_grant(grant())
     rig.start_service()
-    rig.start_vehicle(1.0)
+    rig.start_vehicle()
     async with Mobility(endpoint(rig)) as drone, drone.control():
         await drone.arm()
         await drone.takeoff(6)

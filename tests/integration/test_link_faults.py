@@ -95,7 +95,11 @@ asyncio.run(main())
 """
 
 
-@pytest.mark.parametrize("fault", ["silent", "no routes", "no probes"])
+@pytest.mark.parametrize(
+    "fault",
+    # The component tests contain the other faults (test_link_controllers.py).
+    ["no probes", *(pytest.param(fault, marks=pytest.mark.slow) for fault in ("silent", "no routes"))],
+)
 def test_drone_leaves_peer_that_stops_after_pairing(world: World, fault: str) -> None:
     bad = world.edge("e1", 5.0)
     other = world.edge("e2", 30.0)

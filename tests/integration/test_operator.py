@@ -541,7 +541,15 @@ def test_deleted_application_leaves_no_objects(world: World, operator: OperatorP
     assert not world.grants(namespace)
 
 
-@pytest.mark.parametrize("noted", ['{"success":true}', '{"delayed":"9999-12-31T00:00:00+00:00"}', "no JSON"])
+@pytest.mark.parametrize(
+    "noted",
+    # The unit tests contain more annotations (test_operator_handlers.py).
+    [
+        '{"success":true}',
+        pytest.param('{"delayed":"9999-12-31T00:00:00+00:00"}', marks=pytest.mark.slow),
+        pytest.param("no JSON", marks=pytest.mark.slow),
+    ],
+)
 def test_editor_of_application_cannot_keep_its_drone(
     world: World, operator: OperatorProcess, namespace: str, noted: str
 ) -> None:

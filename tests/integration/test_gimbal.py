@@ -7,7 +7,6 @@ import io
 import signal
 import socket
 from collections.abc import AsyncIterator
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -72,7 +71,10 @@ class Stage:
         self.camera = camera
 
     async def take_picture(self) -> tuple[Any, bytes]:
-        """Return the decision on a picture and the picture. Retry until the camera is ready and the position is known."""
+        """Return the decision on a picture and the picture. Retry until the camera is ready and the position is known.
+
+        The decision is that of the capture if the capture changed the picture, and otherwise that of the retrieval.
+        """
         async with asyncio.timeout(TIMEOUT_S):
             while True:
                 try:
@@ -92,7 +94,8 @@ class Stage:
                     await asyncio.sleep(PACE_S)
                     continue
                 await self.camera.DeleteImage(camera_pb2.DeleteImageRequest(name=capture.image.name), timeout=5)
-                return chunks[0].decision, b"".join(chunk.data for chunk in chunks)
+                decision = capture.decision if capture.decision.action == CORRECT else chunks[0].decision
+                return decision, b"".join(chunk.data for chunk in chunks)
 
     async def take_until(self, action: int) -> tuple[Any, bytes]:
         """Take pictures until a decision has this action.
@@ -117,8 +120,7 @@ class Stage:
 
 
 async def take_off(driver: Driver) -> None:
-    """Acquire control, arm and take off. Retry if the position is unknown for a moment on a busy machine."""
-    await driver.take()
+    """Arm and take off. Retry if the position is unknown for a moment on a busy machine."""
     await driver.arm()
     async with asyncio.timeout(TIMEOUT_S):
         while True:
@@ -132,11 +134,16 @@ async def take_off(driver: Driver) -> None:
 
 
 @pytest.fixture
-async def stage(tmp_path: Path) -> AsyncIterator[Stage]:
-    rig = Rig(tmp_path)
+def ports() -> list[int]:
+    """Ports of the vehicle for the camera world and the ground station, and the port of the camera world."""
+    return [free_port() for _ in range(3)]
+
+
+@pytest.fixture
+async def driver(rig: Rig, ports: list[int]) -> Driver:
+    """Driver in control of a drone on the ground, which has a camera on a gimbal."""
     rig.write_grant(grant())
     rig.write_grant(passenger_grant(NORTH, services=[{"service": "camera", "methods": METHODS}]))
-    ports = [free_port() for _ in range(3)]
     camera = {
         "connection": f"http://127.0.0.1:{ports[2]}/snapshot.jpg", "resolution": "320x240", "methods": METHODS,
         "horizontalFieldOfView": 30, "lens": {"model": "pinhole"}, "mount": {"gimbal": True},
@@ -151,20 +158,22 @@ async def stage(tmp_path: Path) -> AsyncIterator[Stage]:
     links = [part for port in ports[:2] for part in ("--listen", f"tcp:127.0.0.1:{port}")]
     rig.start_vehicle(1.0, *links, "--param", f"MNT1_TYPE={SIYI}")
     driver = Driver(rig)
-    station = None
-    try:
-        await take_off(driver)
-        station = Station(ports[1])
-        rig.start(
-            "world", "-m", "fractus_world", "--listen", f"127.0.0.1:{ports[2]}", "--vehicle",
-            f"tcp:127.0.0.1:{ports[0]}", "--origin", f"{HOME[0]},{HOME[1]}", "--resolution", "320x240", "--fov", "30",
-        )  # fmt: skip
-        address = rig.start_camera()
-        yield Stage(rig, station, driver, camera_pb2_grpc.CameraServiceStub(rig.channel(PASSENGER, address=address)))
-    finally:
-        if station is not None:
-            station.close()
-        await rig.close()
+    await driver.take()
+    return driver
+
+
+@pytest.fixture
+async def stage(driver: Driver, ports: list[int]) -> AsyncIterator[Stage]:
+    rig = driver.rig
+    rig.start(
+        "world", "-m", "fractus_world", "--listen", f"127.0.0.1:{ports[2]}", "--vehicle",
+        f"tcp:127.0.0.1:{ports[0]}", "--origin", f"{HOME[0]},{HOME[1]}", "--resolution", "320x240", "--fov", "30",
+    )  # fmt: skip
+    address = rig.start_camera()
+    await take_off(driver)
+    station = Station(ports[1])
+    yield Stage(rig, station, driver, camera_pb2_grpc.CameraServiceStub(rig.channel(PASSENGER, address=address)))
+    station.close()
 
 
 def brightness(data: bytes) -> float:
@@ -215,11 +224,11 @@ async def test_gimbal_picture_is_judged_by_measured_attitude(stage: Stage) -> No
     assert brightness(hidden) < 1
 
 
-async def test_point_gimbal_is_refused_for_passenger_or_invalid_angle(stage: Stage) -> None:
+async def test_point_gimbal_is_refused_for_passenger_or_invalid_angle(rig: Rig, driver: Driver) -> None:
     refused = [
-        (stage.driver.stub, 45.0, grpc.StatusCode.FAILED_PRECONDITION, "AutopilotRefused"),
-        (stage.driver.stub, 95.0, grpc.StatusCode.INVALID_ARGUMENT, "InvalidArgument"),
-        (stage.rig.stub(PASSENGER), -45.0, grpc.StatusCode.PERMISSION_DENIED, "NotADriver"),
+        (driver.stub, 45.0, grpc.StatusCode.FAILED_PRECONDITION, "AutopilotRefused"),
+        (driver.stub, 95.0, grpc.StatusCode.INVALID_ARGUMENT, "InvalidArgument"),
+        (rig.stub(PASSENGER), -45.0, grpc.StatusCode.PERMISSION_DENIED, "NotADriver"),
     ]
     for stub, pitch_deg, status, code in refused:
         refused_status, decision = await denied(
@@ -227,19 +236,19 @@ async def test_point_gimbal_is_refused_for_passenger_or_invalid_angle(stage: Sta
         )
         assert (refused_status, decision.code) == (status, code)
     # The audit log is written in batches, at the latest when the service ends.
-    stage.rig.kill("service", signal.SIGTERM)
-    calls = [entry for entry in stage.rig.entries("call") if "PointGimbal" in str(entry)]
+    rig.kill("service", signal.SIGTERM)
+    calls = [entry for entry in rig.entries("call") if "PointGimbal" in str(entry)]
     assert len(calls) >= len(refused), "the audit log lacks a refused call"
 
 
-async def test_point_gimbal_is_refused_for_fixed_camera(stage: Stage) -> None:
+async def test_point_gimbal_is_refused_for_fixed_camera(rig: Rig, driver: Driver) -> None:
     """Replace the gimbal in the node description by a fixed mount. The service then refuses PointGimbal."""
-    assert (await point(stage.driver, -45.0)).decision.action == ALLOW
-    path = stage.rig.directory / "node.yaml"
+    assert (await point(driver, -45.0)).decision.action == ALLOW
+    path = rig.directory / "node.yaml"
     described = yaml.safe_load(path.read_text())
     described["spec"]["services"]["camera"]["mount"] = {"pitch": -90, "stabilised": True}
     path.write_text(yaml.safe_dump(described))
-    await stage.rig.until_logged("service", "description: changed")
-    code, decision = await denied(point(stage.driver, -90.0))
+    await rig.until_logged("service", "description: changed")
+    code, decision = await denied(point(driver, -90.0))
     assert (code, decision.code) == (grpc.StatusCode.FAILED_PRECONDITION, "CameraFixed")
     assert "services.camera.mount.gimbal" in decision.reason

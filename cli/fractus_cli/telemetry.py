@@ -70,7 +70,10 @@ def _line(sample: Telemetry) -> str:
     speed = "speed unknown"
     if sample.velocity is not None:
         speed = f"{math.hypot(sample.velocity.north, sample.velocity.east):4.1f} m/s"
+    controller = sample.controller.rpartition("/component/")[2].partition("/")[
+        0
+    ]  # system, pilot, or the driver's component
     return (
         f"{sample.time:%H:%M:%S}  {sample.flight_state:<9}  {sample.mode:<9}  {sample.position or 'position unknown'}  {speed}"
-        f"  battery {sample.battery_remaining:.0%}  controller {sample.controller or 'none'}"
+        f"  battery {sample.battery_remaining:.0%}  controller {controller or 'none'}"
     )

@@ -17,7 +17,6 @@ from fractus_core.api.nodes import DRONE_REPORT_S
 
 from fractus_operator.cache import ClusterCache
 from fractus_operator.kinds import APPLICATION, DRONE, Body, Key
-from fractus_operator.status import controller_name
 from fractus_operator.store import Store
 from fractus_operator.work_queue import WorkQueue
 
@@ -107,7 +106,7 @@ def flight_events(
             posted = replace(posted, missions=tuple(m for m in posted.missions if m != application))
             yield "MissionOver", message, posted
     if current.in_air and not posted.in_air:
-        flown_by = f", flown by {controller_name(current.controller)}" if current.controller else ""
+        flown_by = f", flown by {current.controller}" if current.controller else ""
         posted = replace(posted, in_air=True, controller=current.controller)
         yield "TookOff", f"{name} took off{flown_by}{current.interval}", posted
     for application in current.missions:
@@ -125,8 +124,8 @@ def flight_events(
 def _control_event(name: str, before: str, current: FlightReport) -> tuple[str, str]:
     """Return reason and message of the Event about a change of the control authority."""
     if current.controller not in {"system", "pilot"}:
-        return "ControlGranted", f"{controller_name(current.controller)} has control of {name}"
-    instead = f" instead of {controller_name(before)}" if before else ""
+        return "ControlGranted", f"{current.controller} has control of {name}"
+    instead = f" instead of {before}" if before else ""
     because = f": {current.reason}" if current.reason else ""
     if current.controller == "pilot":
         return "PilotTookControl", f"a pilot has control of {name}{instead}{because}"

@@ -125,17 +125,10 @@ def flight(name: str, drone: Drone | None, reported: Mapping[str, Any]) -> Fligh
         if begun:
             return FlightStatus("Landed", f"{name} has landed", None, begun)
         return FlightStatus("Waiting", f"{name} is on the ground, its mission has not begun", None, begun)
-    controller = controller_name(status.controller)
+    controller = status.controller
     flown_by = f", flown by {controller}" if controller else ""
     phase: FlightPhase = "TakingOff" if status.flight_state == "takingOff" else "Flying"
     return FlightStatus(phase, f"{name} is {_ACTIVITY[status.flight_state]}{flown_by}", controller, begun)
-
-
-def controller_name(controller: str | None) -> str | None:
-    """Return the short name of a drone's controller: system, pilot, or the component of an identity."""
-    if not controller:
-        return None
-    return controller.partition("/component/")[2].partition("/")[0] or controller
 
 
 def mission_outcome(uid: str | None, grants: Iterable[Grant]) -> Outcome | None:
@@ -352,7 +345,7 @@ def _mission_over(conditions: tuple[ConditionUpdate, ...], name: str | None, dro
             message += f"; {name} was returning at its last report"
         else:
             message += f"; {name} is returning"
-        controller = controller_name(drone.status.controller)
+        controller = drone.status.controller
     return StatusUpdate(phase, message, conditions, drone=name, controller=controller)
 
 

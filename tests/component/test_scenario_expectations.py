@@ -76,7 +76,7 @@ def test_evidence_times_use_the_clock_of_the_autopilot(tmp_path: Path):
         pilot.fly_on(8.0)
     moment = datetime.fromtimestamp((vehicle.config.epoch_us / 1e6) + 12.5, UTC)
     entry = {
-        "kind": "call", "time": moment.isoformat(), "caller": "spiffe://x/ns/d/app/f/component/Navigator/instance/n",
+        "kind": "call", "time": moment.isoformat(), "caller": "spiffe://fractus.dev/ns/d/app/f/component/Navigator/instance/n",
         "method": "Goto", "action": "correct", "code": "AltitudeAboveLimit", "policies": ["low-flight"], "reason": "r",
         "args": {"lat": 48.2, "lon": 16.37, "alt": 20.0}, "result": {"lat": 48.2, "lon": 16.37, "alt": 15.0},
         "lat": 48.2, "lon": 16.37, "alt": 8.0,

@@ -71,7 +71,7 @@ def test_telemetry_is_converted_to_a_valid_drone_status() -> None:
     )
     parsed = DroneStatus.model_validate(status)
     assert parsed.flight_state == "flying"
-    assert parsed.controller == "spiffe://fractus.dev/ns/a/app/b/component/c/instance/d"
+    assert parsed.controller == "c"
     assert parsed.position is not None
     assert parsed.position.to_dict() == {"lat": 39.36, "lon": 22.94, "alt": 20.0, "altitudeReference": "amsl"}
     assert parsed.battery is not None

@@ -19,7 +19,7 @@ from fractus_operator.store import KubeError
 
 NOW = datetime(2026, 6, 1, 12, 0, tzinfo=UTC)
 KEY = ("", "drone-1")
-DRIVER = "spiffe://fractus.dev/ns/city/app/traffic/component/Navigator/instance/a"
+DRIVER = "Navigator"
 APPLICATION = "city/traffic"
 
 

@@ -12,7 +12,7 @@ from typing import Any, get_args
 
 from fractus_core.api.conditions import ConditionUpdate, merge_conditions
 from fractus_core.api.model import Condition, timestamp
-from fractus_core.api.names import CONTROL_TAKEN
+from fractus_core.api.names import CONTROL_TAKEN, component_name
 from fractus_core.api.nodes import (
     DRONE_REPORT_S,
     EDGE_REPORT_S,
@@ -176,7 +176,7 @@ def _flight_status(snapshot: TelemetrySnapshot) -> dict[str, Any]:
     if snapshot.connected and snapshot.flight_state in _FLIGHT_STATES:
         flight["flightState"] = snapshot.flight_state
     if snapshot.controller:
-        flight["controller"] = snapshot.controller
+        flight["controller"] = component_name(snapshot.controller)
     if snapshot.position is not None:
         lat, lon, alt, reference = snapshot.position
         flight["position"] = {

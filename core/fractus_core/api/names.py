@@ -156,6 +156,12 @@ class ComponentIdentity:
         return parsed if parsed is not None and str(parsed) == identity else None
 
 
+def component_name(identity: str) -> str:
+    """Return the component of a component instance's SPIFFE ID. Return any other text unchanged."""
+    parsed = ComponentIdentity.parse(identity)
+    return parsed.component if parsed is not None else identity
+
+
 _PARTS = str(ComponentIdentity("", "", "", "")).count("/") + 1
 
 

@@ -305,7 +305,7 @@ class DroneStatus(OpenModel):
     position: Position | None = None
     battery: Battery | None = None
     controller: str | None = Field(
-        default=None, description="Control authority: system, pilot, or the SPIFFE ID of the driver."
+        default=None, description="Control authority: system, pilot, or the component of the driver."
     )
     last_seen: datetime | None = Field(default=None, description="Time of the last report of the agent.")
     audit: tuple[str, ...] = _AUDIT

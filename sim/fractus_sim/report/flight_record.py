@@ -12,6 +12,7 @@ from typing import Any
 
 from fractus_core.api import Application, DeploymentPlan, Depot, Drone, EdgeNode, Policy, Resource, Zone
 from fractus_core.api.geometry import Point
+from fractus_core.api.names import component_name
 from fractus_core.geo import LocalFrame
 from fractus_core.policy.selectors import node_attributes, policy_selects
 from fractus_runtime.audit_chain import entries
@@ -322,12 +323,6 @@ def _policy_decision(entry: Mapping[str, Any]) -> JudgedCall | None:
         position=position,
         arguments=_format_arguments(args),
     )
-
-
-def component_name(identity: str) -> str:
-    """Return the component name in the identity of an instance. Return the whole identity if it has no such name."""
-    parts = identity.split("/")
-    return parts[parts.index("component") + 1] if "component" in parts[:-1] else identity
 
 
 def _place(value: Mapping[str, Any] | None, base: Place | None) -> Place | None:

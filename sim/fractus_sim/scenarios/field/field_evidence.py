@@ -9,11 +9,12 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
+from fractus_core.api.names import component_name
 from fractus_runtime.audit_chain import entries
 from fractus_runtime.mavlink_codec import Message, Parser, enum_names
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from fractus_sim.report.flight_record import JudgedCall, component_name
+from fractus_sim.report.flight_record import JudgedCall
 from fractus_sim.report.track import Place, Sample, Track
 from fractus_sim.testbeds.ground_station import FLYING_STATES
 from fractus_sim.testbeds.tlog import read_tlog

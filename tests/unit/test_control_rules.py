@@ -267,6 +267,23 @@ def test_takeovers_are_not_repeated_after_a_waypoint_or_for_another_reason(betwe
     assert state.missions["a"].outcome is None
 
 
+@pytest.mark.parametrize(("error", "times"), [("hangs", 3), ("crashes", 10)])
+def test_driver_that_repeats_its_error_without_a_waypoint_ends_its_mission(error: str, times: int) -> None:
+    state, _ = apply_events(*FLY)
+    for attempt in range(1, times + 1):
+        assert state.drives
+        lost: events.Event = events.StreamClosed(attempt)
+        if error == "hangs":
+            lost = events.DriverUnresponsive(attempt, 5.0)
+        again = (events.StreamOpened(attempt + 1, "a", "A"), events.GrantControl(attempt + 1))
+        lost_state, _ = apply_events(lost, state=state)
+        state, _ = apply_events(*again, state=lost_state)
+    outcome = state.missions["a"].outcome
+    assert outcome is not None
+    assert outcome.reason.endswith(f", {times} times without a further waypoint")
+    assert (state.returning, state.grace, state.drives) == (True, None, False)
+
+
 def test_takeovers_on_the_ground_are_not_counted() -> None:
     state, _ = apply_events(events.GrantChanged(None, DRIVER))
     for attempt in range(5):

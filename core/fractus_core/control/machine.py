@@ -67,7 +67,6 @@ from fractus_core.control.state import (
     ControlEvent,
     ControlLease,
     ControlState,
-    Mission,
     OutcomeKind,
     StreamState,
     SystemTask,
@@ -107,8 +106,14 @@ the heartbeats, and the autopilot's own failsafe brings the vehicle home.
 MAX_REPEATED_TAKEOVERS = 3
 """Number of takeovers in flight for one reason, without a further waypoint, at which the mission ends.
 
-After a takeover with the action `hover`, the driver gets control again when it requests control. A driver that then
-repeats the forbidden call would otherwise keep the vehicle in the air until its battery is empty.
+After a takeover with the action `hover`, or of a driver that hangs, the driver gets control again when it requests
+control. A driver that then repeats its error would otherwise keep the vehicle in the air until its battery is empty.
+"""
+
+MAX_REPEATED_LOSSES = 10
+"""Number of broken streams in flight, without a further waypoint, at which the mission ends.
+
+It is higher than `MAX_REPEATED_TAKEOVERS`, because a driver may lose its connection without an error of its own.
 """
 
 CANCELLED_DESCENT_S = 0.3
@@ -316,7 +321,12 @@ def _close_stream(update: StateUpdate, event: StreamClosed) -> None:
     if mission is None or not (lease.granted or lease.transit):
         return
     update.audit("control", DRIVER_LOST, lease.identity, "its stream broke")
-    _leave_driver(update, mission, "the driver's stream broke", DRIVER_LOST)
+    losses = _count_takeover(update, lease.key, DRIVER_LOST) if lease.granted else 0
+    reason = DRIVER_LOST
+    if losses >= MAX_REPEATED_LOSSES:
+        reason = f"{DRIVER_LOST}, {losses} times without a further waypoint"
+        update.audit("takeover", TaskKind.RETURN.value, "system", reason, "DriverLost")
+    _leave_driver(update, lease.key, "the driver's stream broke", reason, ends=losses >= MAX_REPEATED_LOSSES)
 
 
 def _drop_unresponsive_driver(update: StateUpdate, event: DriverUnresponsive) -> None:
@@ -324,32 +334,62 @@ def _drop_unresponsive_driver(update: StateUpdate, event: DriverUnresponsive) ->
     lease = update.state.lease
     if lease is None or lease.lease_id != event.lease_id or not update.state.drives:
         return
-    mission = update.mission(lease.key, lease.identity)
+    update.mission(lease.key, lease.identity)
     reason = f"the driver's program did not respond for {event.waited_s:g} s"
-    update.audit("takeover", TaskKind.HOVER.value, "system", reason, "DriverUnresponsive")
+    takeovers = _count_takeover(update, lease.key, "DriverUnresponsive")
+    ends = takeovers >= MAX_REPEATED_TAKEOVERS
+    if ends:
+        reason = f"{reason}, {takeovers} times without a further waypoint"
+    kind = TaskKind.RETURN if ends else TaskKind.HOVER
+    update.audit("takeover", kind.value, "system", reason, "DriverUnresponsive")
     update.drop_lease()
     remedy = "do not block its event loop: use asyncio.sleep and asyncio.to_thread"
     update.act(SendEvent(lease.lease_id, ControlEvent(StreamState.LOST, reason=f"{reason}; {remedy}")))
-    _leave_driver(update, mission, reason, reason)
+    _leave_driver(update, lease.key, reason, reason, ends=ends)
 
 
-def _leave_driver(update: StateUpdate, mission: Mission, stopped: str, reason: str) -> None:
-    """Hover without the driver, and start its grace period.
+def _count_takeover(update: StateUpdate, key: str, cause: str) -> int:
+    """Count a takeover in flight, or the loss of a driver.
+
+    Args:
+        update: State before the takeover.
+        key: Key of the mission.
+        cause: Text that is equal for equal causes.
+
+    Returns:
+        Number of takeovers for this cause without a further waypoint; 0 on the ground.
+    """
+    mission = update.state.missions.get(key)
+    if mission is None or not update.state.vehicle.armed:
+        return 0
+    takeovers = mission.takeovers + 1 if mission.takeover == cause else 1
+    update.update_mission(mission, takeover=cause, takeovers=takeovers)
+    update.act(SaveJournal())
+    return takeovers
+
+
+def _leave_driver(update: StateUpdate, key: str, stopped: str, reason: str, *, ends: bool) -> None:
+    """Hover without the driver and start its grace period, or return home.
 
     Args:
         update: State whose lease was dropped.
-        mission: Mission of the driver.
+        key: Key of the driver's mission.
         stopped: Reason for the caller of the current motion.
-        reason: Reason with which the mission fails at the end of the grace period.
+        reason: Reason with which the mission fails, at once or at the end of the grace period.
+        ends: True if the mission ends at once.
     """
+    mission = update.state.missions[key]
+    if ends:
+        update.end_mission(mission, OutcomeKind.FAILED, reason)
     motion = update.state.motion
     update.set(authority=Authority.SYSTEM)
     returns = motion is not None and motion.kind == "ReturnToLaunch"
     lands = motion is not None and motion.kind == "Land" and update.state.vehicle.mode.comes_down
     update.stop_motion(StopKind.LOST, "ControlLost", stopped)
     if update.state.vehicle.armed and not lands:
-        update.start(TaskKind.RETURN if returns else TaskKind.HOVER)
-    update.begin_grace(mission, reason)
+        update.start(TaskKind.RETURN if returns or ends else TaskKind.HOVER)
+    if not ends:
+        update.begin_grace(mission, reason)
 
 
 def _fail_transit(update: StateUpdate, event: TransitFailed) -> None:
@@ -431,11 +471,8 @@ def _take_over(update: StateUpdate, event: TakeoverDemanded) -> None:
     kind, outcome = TAKEOVERS[event.takeover]
     reason = event.reason
     mission = update.state.mission
-    if outcome is None and mission is not None and update.state.drives and update.state.vehicle.armed:
-        cause = " ".join((event.code, *event.policies))
-        takeovers = mission.takeovers + 1 if mission.takeover == cause else 1
-        update.update_mission(mission, takeover=cause, takeovers=takeovers)
-        update.act(SaveJournal())
+    if outcome is None and mission is not None and update.state.drives:
+        takeovers = _count_takeover(update, mission.key, " ".join((event.code, *event.policies)))
         if takeovers >= MAX_REPEATED_TAKEOVERS:
             kind = TaskKind.RETURN
             outcome = OutcomeKind.FAILED

@@ -150,7 +150,7 @@ class Mission:
         flown: True if the vehicle has been airborne for this mission.
         home: Latitude, longitude and altitude above sea level at which the vehicle armed for its first takeoff.
         leg_flown: True if a leg of the driver was completed, or the driver flew by velocity setpoints.
-        takeover: Code and policies of the last takeover after which the driver may continue.
+        takeover: Cause of the last takeover in flight after which the driver may continue: code and policies.
         takeovers: Number of these takeovers in succession. A further waypoint, or a takeover for another reason, starts
             the count again.
         counts: Waypoints of all control points so far.

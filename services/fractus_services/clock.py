@@ -26,7 +26,8 @@ class Clock:
     """Unix time in seconds.
 
     A clock step must neither revive an expired permission nor end a restriction early. Until the step is confirmed, the time is
-    an `UncertainTime`: its value is the later reading, and the policy engine applies the more restrictive of both readings.
+    an `UncertainTime` from the earliest to the latest reading: the reading before the first step, and the readings after each
+    step since then. The policy engine applies every restriction that is in force at any time between them.
     Callers that were authenticated before the step stay authenticated by steady time (`auth.Callers`).
 
     Args:
@@ -38,6 +39,7 @@ class Clock:
         self._stepped = stepped
         self._offset_s = time.time() - steady_s()
         self._new_offset_s = self._offset_s
+        self._offsets_s = (self._offset_s, self._offset_s)
         self._uncertain_since_s: float | None = None
 
     def __call__(self) -> float:
@@ -51,16 +53,20 @@ class Clock:
                 log.warning("clock: step reversed")
                 self._stepped(0.0, True)
             self._offset_s = offset_s
+            self._offsets_s = (offset_s, offset_s)
             return now_s + offset_s
+        self._offsets_s = min(offset_s, self._offsets_s[0]), max(offset_s, self._offsets_s[1])
         if self._uncertain_since_s is None or abs(offset_s - self._new_offset_s) > MAX_SLEW_S:
             self._uncertain_since_s = now_s
             self._new_offset_s = offset_s
-            log.warning("clock: stepped, both readings apply for now (seconds=%.0f for_s=%.0f)", step_s, TRUST_AFTER_S)
+            log.warning(
+                "clock: stepped, all times between the readings apply for now (seconds=%.0f for_s=%.0f)", step_s, TRUST_AFTER_S
+            )
             self._stepped(step_s, False)
         if now_s - self._uncertain_since_s < TRUST_AFTER_S:
-            readings = now_s + self._offset_s, now_s + offset_s
-            return UncertainTime(max(readings), min(readings))
+            return UncertainTime(now_s + self._offsets_s[1], now_s + self._offsets_s[0])
         self._offset_s = offset_s
+        self._offsets_s = (offset_s, offset_s)
         self._uncertain_since_s = None
         log.warning("clock: step confirmed, the new reading applies (seconds=%.0f)", step_s)
         self._stepped(step_s, True)

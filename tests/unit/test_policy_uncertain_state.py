@@ -11,7 +11,7 @@ import pytest
 from fractus_core.policy.decision_types import Airframe, Call, CaptureArgs, Home, Lens, Situation, UncertainTime
 from fractus_core.policy.engine import judge
 from fractus_core.policy.monitoring import monitor
-from policy_world import HOME, NOW, altitude, ask, at, box, compiled, exclusion, goto, inclusion, policy, zone
+from policy_world import HOME, NOW, altitude, ask, at, box, compiled, exclusion, goto, inclusion, policy, speed, zone
 
 CAPTURE = Call("CaptureImage", CaptureArgs())
 ODD: tuple[dict[str, Any], ...] = (
@@ -86,6 +86,87 @@ def test_inclusion_zone_must_be_active_at_both_readings_of_uncertain_time() -> N
     assert ask(grant, goto(0, 50)).action == "allow"
     assert ask(grant, goto(0, 50), replace(at(), time_s=UncertainTime(NOW, NOW - 6 * 3600))).action == "deny"
     assert ask(grant, goto(0, 50), replace(at(), time_s=UncertainTime(NOW + 6 * 3600, NOW))).action == "deny"
+
+
+def _hours(body: dict[str, Any], *spans: str) -> dict[str, Any]:
+    body["zones"][0]["schedule"] = [dict(zip(("start", "end"), span.split("-"), strict=True)) for span in spans]
+    return body
+
+
+_SIX_HOURS_S = 6 * 3600.0
+BETWEEN = replace(at(), time_s=UncertainTime(NOW + _SIX_HOURS_S, NOW - _SIX_HOURS_S))
+"""Situation with a clock that was stepped from 06:00 to 18:00, or back."""
+
+
+@pytest.mark.parametrize("active", ["11:00-13:00", "17:00-23:00", "01:00-07:00", "18:00-19:00", "22:00-07:00"])
+@pytest.mark.parametrize(
+    ("body", "call"),
+    [
+        (exclusion(box(-20, 20, 20, 60)), goto(0, 40)),
+        (altitude(zones=[zone("z", box(-20, 20, 20, 60))], upperLimit=5, action="refuse"), goto(0, 40)),
+        (speed(zones=[zone("z", box(-20, 20, 20, 60))], upperLimit=1, action="refuse"), goto(0, 40, speed_mps=3)),
+        (policy("d", "AccessControl", "denial", [zone("z", box(-20, -20, 20, 20))], methods=["Goto"]), goto(0, 40)),
+        (policy("p", "PrivacyControl", "camera", [zone("z", box(-20, -20, 20, 20))], action="refuse"), CAPTURE),
+    ],
+)
+def test_uncertain_time_applies_zones_active_at_any_time_between_the_readings(
+    body: dict[str, Any], call: Call, active: str
+) -> None:
+    assert ask(compiled(_hours(body, active)), call, BETWEEN).action == "deny"
+    assert ask(compiled(_hours(body, "18:30-05:30")), call, BETWEEN).action == "allow", "the zone is active at no reading"
+    assert ask(compiled(_hours(body, "18:01-06:00")), call, BETWEEN).action == "allow", "the end is exclusive"
+
+
+def test_uncertain_time_stops_drone_in_zone_active_between_the_readings() -> None:
+    grant = compiled(_hours(exclusion(box(-20, -20, 20, 20), "land"), "11:00-13:00"))
+    verdict = monitor(BETWEEN, grant)
+    assert verdict is not None
+    assert verdict.takeover == "land"
+
+
+@pytest.mark.parametrize(
+    ("spans", "permits"),
+    [
+        (["05:00-19:00"], True),
+        (["05:00-12:00", "12:00-19:00"], True),
+        (["00:00-00:00"], True),
+        (["12:30-11:30"], False),
+        (["05:00-12:00", "12:01-19:00"], False),
+        (["05:00-18:00"], False),
+    ],
+)
+def test_uncertain_time_permits_what_is_active_at_all_times_between_the_readings(
+    spans: list[str], permits: bool
+) -> None:
+    fence = compiled(_hours(inclusion(box(-80, -80, 80, 80)), *spans))
+    assert ask(fence, goto(0, 50), BETWEEN).permits == permits
+    allowance = policy("a", "AccessControl", "grant", [zone("z", box(-20, -20, 20, 20))], methods=["Hover"])
+    assert ask(compiled(_hours(allowance, *spans)), Call("Hover"), BETWEEN).permits == permits
+
+
+def test_uncertain_time_considers_weekdays_between_the_readings() -> None:
+    """NOW is a Monday."""
+    day = 86_400.0
+    body = exclusion(box(-20, 20, 20, 60))
+    body["zones"][0]["schedule"] = [{"days": ["Wed"], "start": "23:00", "end": "01:00"}]
+    grant = compiled(body)
+    for first_s, last_s, denied in (
+        (0.0, 1.4 * day, False), (0.0, 2.5 * day, True), (2.53 * day, 2.6 * day, True), (2.55 * day, 9.4 * day, False),
+        (2.55 * day, 9.5 * day, True), (0.0, 20_000 * day, True),
+    ):  # fmt: skip
+        now = replace(at(), time_s=UncertainTime(NOW + last_s, NOW + first_s))
+        assert (ask(grant, goto(0, 40), now).action == "deny") == denied, (first_s, last_s)
+
+
+def test_uncertain_time_ignores_zone_active_outside_the_validity_of_its_policy() -> None:
+    body = _hours(_with(exclusion(box(-20, 20, 20, 60)), **_until(NOW - 3600.0)), "12:00-13:00")
+    assert ask(compiled(body), goto(0, 40), BETWEEN).action == "allow"
+
+
+def test_method_is_not_granted_by_zone_with_altitudes_of_unknown_datum() -> None:
+    allowance = policy("a", "AccessControl", "grant", [zone("z", box(-9, -9, 9, 9), upper=30, reference="terrain")], methods=["Hover"])
+    assert ask(compiled(allowance), Call("Hover"), at()).code == "MethodNotGrantedHere"
+    assert ask(compiled(allowance, flat_terrain=True), Call("Hover"), at()).action == "allow"
 
 
 @pytest.mark.parametrize(

@@ -103,6 +103,18 @@ def test_clock_uncertainty_restarts_with_each_step(machine: Machine) -> None:
     assert machine.clock() == BEGIN_S + 3 * 3600.0 + 3 * (TRUST_AFTER_S - 10) + 20
 
 
+def test_uncertain_time_spans_all_readings_since_the_first_step(machine: Machine) -> None:
+    """The reading between two steps may be the right one."""
+    for step_s in (7200.0, -3600.0, -7200.0, 1800.0):
+        machine.offset_s += step_s
+        now = machine.clock()
+    assert (earliest_time(now), now) == (BEGIN_S - 3600.0, BEGIN_S + 7200.0)
+    machine.wait(TRUST_AFTER_S + 1)
+    machine.offset_s += 60.0
+    now = machine.clock()
+    assert now - earliest_time(now) == pytest.approx(60.0), "a confirmed reading ends the doubt about the readings before"
+
+
 def test_clock_is_certain_during_small_corrections(machine: Machine) -> None:
     for slew_s in (0.5, -0.9, 0.9, 0.9, 0.9):
         machine.offset_s += slew_s

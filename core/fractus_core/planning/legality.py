@@ -137,7 +137,7 @@ class RouteJudge:
         if key not in self._known and not held:
             self._known[key] = MissionRoute((), mission.distance_m, mission.needed_min)
         elif key not in self._known:
-            # A policy that applies at the start or the end of the mission may apply at any time between start and end.
+            # The time of each leg is unknown, so a policy counts if it applies at any time of the mission.
             during = UncertainTime(time_s + mission.needed_min * 60, time_s)
             cruise_mps = min(self._settings.cruise_speed_mps, mobility.max_speed)
             now = Situation(

@@ -15,9 +15,9 @@ from fractus_core.api.geometry import AltitudeBand, Area, Point, Reference
 from fractus_core.api.grants import GrantedPolicy, GrantSpec
 from fractus_core.api.methods import METHODS_OF, MOBILITY_METHODS
 from fractus_core.api.policies import PolicySpec
-from fractus_core.api.schedules import ActiveTime, active_at
+from fractus_core.api.schedules import ActiveTime, active_between, active_throughout
 from fractus_core.geo import LocalFrame, area_center, area_polygon, check_extent
-from fractus_core.policy.decision_types import Home, Situation, UncertainTime, earliest_time
+from fractus_core.policy.decision_types import Home, Situation, earliest_time
 
 MAX_FRAME_REACH_M = 500_000.0
 """Zones farther than this from the origin are left out of the frame, because no drone reaches them."""
@@ -47,13 +47,12 @@ class Rule:
         return math.isfinite(self.valid_from_s) or math.isfinite(self.valid_until_s)
 
     def in_force(self, time_s: float) -> bool:
-        """Return True if the policy is valid at a time.
+        """Return True if the policy is valid at a time, or at any time between the readings of an uncertain time."""
+        return self.valid_from_s <= time_s and earliest_time(time_s) < self.valid_until_s
 
-        At an uncertain time, the policy is valid if it is valid at any time between the two readings.
-        """
-        if isinstance(time_s, UncertainTime):
-            return self.valid_from_s <= time_s and time_s.earliest < self.valid_until_s
-        return self.valid_from_s <= time_s < self.valid_until_s
+    def surely_in_force(self, time_s: float) -> bool:
+        """Return True if the policy is valid at a time, or at all times between the readings of an uncertain time."""
+        return self.valid_from_s <= earliest_time(time_s) and time_s < self.valid_until_s
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,12 +66,19 @@ class PolicyZone:
     schedule: tuple[ActiveTime, ...] = ()
 
     def in_force(self, time_s: float) -> bool:
-        """Return True if policy and zone are active at a time, or at one of the readings of an uncertain time."""
+        """Return True if policy and zone are active at a time, or at any time between the readings of an uncertain time."""
         if not self.rule.in_force(time_s):
             return False
-        return active_at(self.schedule, time_s) or (
-            isinstance(time_s, UncertainTime) and active_at(self.schedule, time_s.earliest)
-        )
+        first_s = max(earliest_time(time_s), self.rule.valid_from_s)
+        return active_between(self.schedule, first_s, min(time_s, self.rule.valid_until_s))
+
+    def surely_in_force(self, time_s: float) -> bool:
+        """Return True if policy and zone are active at a time, or at all times between the readings of an uncertain time."""
+        return self.rule.surely_in_force(time_s) and self.surely_active(time_s)
+
+    def surely_active(self, time_s: float) -> bool:
+        """Return True if the zone is active at a time, or at all times between the readings of an uncertain time."""
+        return active_throughout(self.schedule, earliest_time(time_s), time_s)
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,6 +89,10 @@ class AirVolume:
     margin_m: float
     lower_m: float
     upper_m: float
+
+    def extended(self, height_m: float) -> AirVolume:
+        """Return the volume extended upward and downward."""
+        return replace(self, lower_m=self.lower_m - height_m, upper_m=self.upper_m + height_m)
 
 
 class PolicyIndex:
@@ -114,10 +124,6 @@ class PolicyIndex:
                 yield zone
 
 
-def _surely_active(zone: PolicyZone, time_s: float) -> bool:
-    return active_at(zone.schedule, time_s) and active_at(zone.schedule, earliest_time(time_s))
-
-
 @dataclass(frozen=True, slots=True)
 class Inclusion:
     """A policy that keeps the drone inside the union of its zones."""
@@ -135,10 +141,20 @@ class Inclusion:
         kept = [
             p.shape
             for p in self.zones
-            if band_surely_contains(p.band, lower_m, upper_m, now.home, flat) and _surely_active(p, now.time_s)
+            if band_surely_contains(p.band, lower_m, upper_m, now.home, flat) and p.surely_active(now.time_s)
         ]
         shape = shapely.union_all(kept) if kept else shapely.Polygon()
         return shape, shape.boundary
+
+    def near_altitudes(self, lower_m: float, upper_m: float, now: Situation, flat: bool) -> BaseGeometry:
+        """Return the ground of all zones that a drone may be inside at any altitude of a range above home."""
+        return shapely.union_all(
+            [
+                p.shape
+                for p in self.zones
+                if band_may_overlap(p.band, lower_m, upper_m, now.home, flat) and p.surely_active(now.time_s)
+            ]
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,9 +195,9 @@ class CompiledGrant:
     flat_terrain: bool
     timed_zones: tuple[PolicyZone, ...]
 
-    def fences_in_force(self, time_s: float) -> tuple[bool, ...]:
-        """Return one value per time-limited fence: True if the fence is in force at a Unix time."""
-        return tuple(zone.in_force(time_s) for zone in self.timed_zones)
+    def fences_in_force(self, time_s: float) -> tuple[tuple[bool, bool], ...]:
+        """Return for each time-limited fence if it may be in force at a Unix time, and if it surely is."""
+        return tuple((zone.in_force(time_s), zone.surely_in_force(time_s)) for zone in self.timed_zones)
 
     def locate(self, now: Situation) -> tuple[float, float] | None:
         """Return the drone's position in metres of the frame, or None while the position is unknown."""

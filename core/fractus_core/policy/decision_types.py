@@ -100,23 +100,23 @@ class CaptureArgs:
 
 
 class UncertainTime(float):
-    """Unix time of a clock that was set back. Either the reading before or the reading after the step may be right.
+    """Unix time of a clock that was stepped. The true time may be any time between the earliest and the latest reading.
 
-    The value of the number is the later reading. A restriction applies if it is in force at any time between the
-    readings. A permission applies only if it is in force at both readings.
+    The value of the number is the latest reading. A restriction applies if it is in force at any time between the
+    readings. A permission applies only if it is in force at all times between them.
     """
 
     earliest: float
 
     def __new__(cls, latest: float, earliest: float) -> UncertainTime:
-        """Create the time between two readings."""
+        """Create the time between the latest and the earliest reading."""
         time_s = super().__new__(cls, latest)
         time_s.earliest = min(earliest, latest)
         return time_s
 
 
 def earliest_time(time_s: float) -> float:
-    """Return the earlier reading of an uncertain time, or the time itself."""
+    """Return the earliest reading of an uncertain time, or the time itself."""
     return time_s.earliest if isinstance(time_s, UncertainTime) else time_s
 
 

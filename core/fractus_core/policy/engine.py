@@ -14,7 +14,14 @@ import shapely
 
 from fractus_core.api.methods import CONTROL_METHODS, Method
 from fractus_core.exhaustive import exhaustive
-from fractus_core.policy.compiled_grant import OPERATION_AREA, AirVolume, CompiledGrant, PolicyIndex, Rule
+from fractus_core.policy.compiled_grant import (
+    OPERATION_AREA,
+    AirVolume,
+    CompiledGrant,
+    PolicyIndex,
+    Rule,
+    band_surely_contains,
+)
 from fractus_core.policy.decision_types import (
     Call,
     CaptureArgs,
@@ -26,7 +33,6 @@ from fractus_core.policy.decision_types import (
     VelocityArgs,
     Verdict,
     deny,
-    earliest_time,
     format_distance,
 )
 from fractus_core.policy.goto_rules import judge_goto
@@ -138,7 +144,7 @@ def judge_denials(method: str, now: Situation, grant: CompiledGrant) -> Verdict 
     forbidding = (
         rules_in_view(denials, now, grant)
         if method in PICTURE_METHODS
-        else _rules_here(denials, now, grant, now.position_error_m)
+        else _rules_here(denials, now, grant)
     )
     if not forbidding:
         return None
@@ -160,38 +166,38 @@ def _outside_operation_area(method: str, now: Situation, grant: CompiledGrant) -
 
 
 def _is_allowed(index: PolicyIndex, now: Situation, grant: CompiledGrant) -> bool:
-    """Return True if at least one policy of an index certainly applies.
+    """Return True if at least one policy of an index permits its methods at the present position.
 
-    At an uncertain time, at least one policy must apply at each of the two readings.
+    A zone whose altitudes have an unknown datum permits nothing. At an uncertain time, one policy and one of its zones
+    must be in force at all times between the readings.
     """
-    readings = {float(now.time_s), earliest_time(now.time_s)}
-    return all(_rules_here(index, replace(now, time_s=t), grant, 0.0, certain=True) for t in readings)
+    if any(rule.surely_in_force(now.time_s) for rule in index.everywhere):
+        return True
+    position = grant.locate(now)
+    if position is None:
+        return False
+    air = AirVolume(shapely.points(position), 0.0, now.altitude_m, now.altitude_m)
+    return any(
+        zone.surely_in_force(now.time_s)
+        and band_surely_contains(zone.band, now.altitude_m, now.altitude_m, now.home, grant.flat_terrain)
+        for zone in index.near(air, now, grant.flat_terrain)
+    )
 
 
-def _rules_here(
-    index: PolicyIndex,
-    now: Situation,
-    grant: CompiledGrant,
-    distance_m: float,
-    *,
-    certain: bool = False,
-) -> list[Rule]:
-    """Return the policies of an index that apply at the present position, by priority.
+def _rules_here(index: PolicyIndex, now: Situation, grant: CompiledGrant) -> list[Rule]:
+    """Return the policies of an index that may apply at the present position, by priority.
 
-    While the position is unknown, the result contains every policy in force, or, with `certain`, every policy in force
-    that has no zones.
+    While the position is unknown, the result contains every policy in force.
     """
     rules = {rule.name: rule for rule in index.everywhere if rule.in_force(now.time_s)}
-    if now.lat is None or now.lon is None:
-        if not certain:
-            rules |= {p.rule.name: p.rule for p in index.zones if p.in_force(now.time_s)}
-        return by_priority(rules)
-    if index.zones:
-        position = shapely.points(grant.frame.xy(now.lat, now.lon))
-        slack_m = 0.0 if certain else now.altitude_error_m
-        air = AirVolume(position, distance_m, now.altitude_m - slack_m, now.altitude_m + slack_m)
-        for zone in index.near(air, now, grant.flat_terrain):
-            rules[zone.rule.name] = zone.rule
+    position = grant.locate(now)
+    if position is None:
+        return by_priority(rules | {p.rule.name: p.rule for p in index.zones if p.in_force(now.time_s)})
+    lower_m = now.altitude_m - now.altitude_error_m
+    upper_m = now.altitude_m + now.altitude_error_m
+    air = AirVolume(shapely.points(position), now.position_error_m, lower_m, upper_m)
+    for zone in index.near(air, now, grant.flat_terrain):
+        rules[zone.rule.name] = zone.rule
     return by_priority(rules)
 
 

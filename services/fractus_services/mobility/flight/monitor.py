@@ -64,7 +64,7 @@ class MotionMonitor:
         self._alarm = ""
         self._alarm_at = 0.0
         self._grant: ActiveGrant | None = None
-        self._in_force: tuple[bool, ...] = ()
+        self._in_force: tuple[tuple[bool, bool], ...] = ()
         self._changed_at = -math.inf
 
     async def run(self) -> None:
@@ -211,7 +211,7 @@ class MotionMonitor:
 
         control.tasks.spawn(control.tasks.attempt(control.modes.hold, permit))
 
-    def _has_changed(self, in_force: tuple[bool, ...]) -> bool:
+    def _has_changed(self, in_force: tuple[tuple[bool, bool], ...]) -> bool:
         """Return True if the current leg may have been judged under other constraints, because a Grant or a schedule changed."""
         control = self._control
         grant = self._flown_grant

@@ -11,8 +11,18 @@ import pytest
 from fractus_core.api import InvalidObject
 from fractus_core.api.grants import GrantSpec
 from fractus_core.geo import LocalFrame
-from fractus_core.policy.compiled_grant import compile_grant
-from fractus_core.policy.decision_types import Airframe, Call, GotoArgs, Home, Situation, UncertainTime, VelocityArgs
+from fractus_core.policy.compiled_grant import CompiledGrant, compile_grant
+from fractus_core.policy.decision_types import (
+    Airframe,
+    Call,
+    GotoArgs,
+    Home,
+    SetSpeedArgs,
+    Situation,
+    TakeoffArgs,
+    UncertainTime,
+    VelocityArgs,
+)
 from fractus_core.policy.engine import judge
 from fractus_core.policy.limits import limit_forbids_altitudes
 from fractus_core.policy.monitoring import monitor
@@ -32,6 +42,7 @@ from policy_world import (
     policy,
     ring,
     spec,
+    speed,
     zone,
 )
 
@@ -247,6 +258,105 @@ def test_leg_out_of_zone_may_not_climb_into_it() -> None:
     assert ask(above, goto(60, 0, 12.1), replace(lower, altitude_m=11.9)).action == "deny"
     inside = at(25, 0, alt=20)
     assert ask(above, goto(60, 0, 30), replace(inside, airframe=RETRACING)).action == "allow"
+
+
+@pytest.mark.parametrize("kind", ["altitude", "speed"])
+@pytest.mark.parametrize(
+    ("band", "near_m", "clear_m"),
+    [
+        ({"upper": 25}, 25.1, 27.1),
+        ({"upper": 25}, 26.9, 27.1),
+        ({"lower": 40, "upper": 60}, 39.9, 37.9),
+        ({"lower": 40, "upper": 60}, 38.1, 37.9),
+        ({"lower": 140, "upper": 160, "reference": "amsl"}, 38.1, 37.9),
+    ],
+)
+def test_limit_of_zone_applies_within_the_height_margin_of_its_altitudes(
+    kind: str, band: dict[str, Any], near_m: float, clear_m: float
+) -> None:
+    """An altitude error of 1 m and a control deviation of 1 m may carry the drone into the zone."""
+    small = {"upperLimit": 5.0, "action": "refuse"}
+    limit = {"altitude": altitude, "speed": speed}[kind](zones=[zone("z", box(20, -30, 60, 30), **band)], **small)
+    grant = compiled(limit, operationArea=[], services=SERVICES)
+    velocity = Call("SetVelocity", VelocityArgs(0, 7))
+    for height_m, permitted in ((near_m, False), (clear_m, True)):
+        beside = at(-20, 0, alt=height_m, speed_setpoint_mps=7.0)
+        assert ask(grant, goto(80, 0, height_m), beside).permits == permitted, height_m
+        velocity_m = height_m + 1.0 if near_m < clear_m else height_m - 1.0
+        border = at(15, 0, alt=velocity_m, speed_setpoint_mps=7.0)
+        assert ask(grant, velocity, border).permits == permitted, "a velocity keeps the control deviation twice"
+        if kind == "speed":
+            assert ask(grant, Call("SetSpeed", SetSpeedArgs(7.0)), at(30, 0, alt=height_m)).permits == permitted
+            continue
+        ground = at(40, 0, alt=0.0, in_air=False)
+        if "lower" in band:
+            assert ask(grant, Call("Takeoff", TakeoffArgs(height_m)), ground).permits == permitted
+
+
+def test_drone_enters_zone_of_limit_from_above_only_at_permitted_altitude() -> None:
+    def grant(upper_m: float) -> CompiledGrant:
+        limit = altitude(zones=[zone("z", box(-30, -30, 30, 30), upper=25)], upperLimit=upper_m)
+        return compiled(limit, operationArea=[], services=SERVICES)
+
+    above = at(0, 0, alt=40)
+    assert ask(grant(15), goto(0, 0, 10), above).code == "AltitudeAboveLimit"
+    assert ask(grant(15), goto(100, 0, 10), above).code == "AltitudeAboveLimit"
+    assert ask(grant(25), goto(0, 0, 10), above).action == "allow"
+    assert ask(grant(15), goto(0, 0, 10), at(0, 0, alt=20)).action == "allow", "the drone returns below the limit"
+
+
+@pytest.mark.parametrize("height_m", [26.9, 25.1])
+def test_drone_too_close_above_zone_of_limit_may_continue_or_climb(height_m: float) -> None:
+    limit = altitude(zones=[zone("z", box(-30, -30, 30, 30), upper=25)], upperLimit=15)
+    grant = compiled(limit, operationArea=[], services=SERVICES)
+    close = at(0, 0, alt=height_m)
+    assert ask(grant, goto(10, 0, height_m), close).action == "allow"
+    assert ask(grant, goto(0, 0, 40), close).action == "allow"
+    assert ask(grant, Call("SetVelocity", VelocityArgs(1.0, 0.0, -1.0)), close).action == "allow"
+    assert not ask(grant, goto(0, 0, 24), close).permits
+    assert ask(grant, goto(60, 0, 24), at(-60, 0, alt=height_m)).action != "allow"
+
+
+@pytest.mark.parametrize(
+    ("start", "height_m"),
+    [
+        pytest.param((20.05, 0.0), 30.0, id="beside-and-climbing"),
+        pytest.param((20.05, 0.0), 60.0, id="beside-and-climbing-high"),
+        pytest.param((0.0, 0.0), 20.05, id="above"),
+        pytest.param((0.0, 0.0), 21.9, id="within-the-margin-above"),
+    ],
+)
+def test_drone_just_outside_inclusion_zone_does_not_fly_through_uncovered_air_to_another_zone(
+    start: tuple[float, float], height_m: float
+) -> None:
+    zones = [zone("low", box(-20, -20, 20, 20), upper=20), zone("tall", box(56, -20, 100, 20), upper=80)]
+    grant = compiled(policy("in", "GeofenceControl", "inclusion", zones), operationArea=[])
+    present_m = height_m if start == (0.0, 0.0) else 10.0
+    beside = at(*start, alt=present_m)
+    verdict = ask(grant, goto(70, 0, height_m), beside)
+    assert (verdict.action, verdict.code) == ("deny", "LegOutsideInclusionZone")
+    back = goto(10, 0, 10.0) if start != (0.0, 0.0) else goto(0, 0, 10.0)
+    assert ask(grant, back, beside).action == "allow", "the drone may return into the zone that it left"
+    assert ask(grant, goto(70, 0, height_m), at(45, 0, alt=height_m)).action == "allow", "the other zone is nearest"
+
+
+def test_drone_sinks_only_into_the_inclusion_zone_below_it() -> None:
+    def grant(*zones: dict[str, Any]) -> CompiledGrant:
+        return compiled(policy("in", "GeofenceControl", "inclusion", list(zones)), operationArea=[])
+
+    low = zone("low", box(-20, -20, 20, 20), upper=20)
+    high = zone("high", box(-20, -20, 20, 20), lower=30)
+    assert ask(grant(low), goto(0, 0, 10), at(0, 0, alt=25)).action == "allow"
+    assert ask(grant(low), goto(0, 0, 10), at(0, 0, alt=19)).action == "allow", "too close to the ceiling"
+    assert ask(grant(low), goto(0, 0, 19), at(0, 0, alt=25)).action == "deny", "the end is too close to the ceiling"
+    assert ask(grant(low), goto(5, 0, 10), at(0, 0, alt=25)).action == "deny", "the drone may fly ahead before it sinks"
+    assert ask(grant(low), goto(19, 0, 10), at(19, 0, alt=25)).action == "deny", "the border is too close"
+    assert ask(grant(high), goto(0, 0, 35), at(0, 0, alt=25)).action == "allow"
+    assert ask(grant(low, high), goto(0, 0, 10), at(0, 0, alt=40)).action == "deny"
+    assert ask(grant(low, high), goto(0, 0, 10), at(0, 0, alt=29.9)).action == "deny", "the upper zone is nearer"
+    assert ask(grant(low, high), goto(0, 0, 10), at(0, 0, alt=22)).action == "allow"
+    above_sea = zone("low", box(-20, -20, 20, 20), upper=120, reference="amsl")
+    assert ask(grant(above_sea), goto(0, 0, 10), at(0, 0, alt=25, home=None)).action == "deny"
 
 
 def test_leg_may_not_sink_out_of_inclusion_zone() -> None:

@@ -14,7 +14,7 @@ from fractus_core.policy.compiled_grant import AirVolume, CompiledGrant, PolicyZ
 from fractus_core.policy.decision_types import Situation
 from fractus_core.policy.geofences import check_straight_return, find_breaches
 from fractus_core.policy.kinematics import XY, Leg
-from fractus_core.policy.limits import limit_forbids_altitudes
+from fractus_core.policy.limits import limit_forbids_altitudes, limiting_zones
 
 Floats = NDArray[np.float64]
 
@@ -57,9 +57,8 @@ class FreeSpace:
 
     def blockers(self, line: BaseGeometry) -> list[PolicyZone | int]:
         """Return the obstacles of a line: zones to keep out of, and indexes of areas to stay in."""
-        slack = self.height_margin_m
         flat = self.grant.flat_terrain
-        air = AirVolume(line, self.margin_m, self.lower_m - slack, self.upper_m + slack)
+        air = AirVolume(line, self.margin_m, self.lower_m, self.upper_m).extended(self.height_margin_m)
         obstacles: list[PolicyZone | int] = list(self.grant.exclusions.near(air, self.now, flat))
         if self.grant.altitude_limits.zones:
             low = self.lower_m
@@ -80,7 +79,8 @@ class FreeSpace:
         if find_breaches(leg, self.now, self.grant, self.margin_m, self.height_margin_m):
             return False
         air = AirVolume(leg.ground, self.margin_m, self.lower_m, self.upper_m)
-        limiting = self.grant.altitude_limits.near(air, self.now, self.grant.flat_terrain)
+        limits = self.grant.altitude_limits
+        limiting = limiting_zones(limits, self.grant, self.now, air, self.height_margin_m)
         return not any(
             limit_forbids_altitudes(zone, self.lower_m, self.upper_m, self.now, self.grant.flat_terrain)
             for zone in limiting

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import shapely
 from shapely.geometry.base import BaseGeometry
 
+from fractus_core.api.geometry import AltitudeBand
 from fractus_core.api.policies import GeofenceAction
 from fractus_core.exhaustive import exhaustive
 from fractus_core.policy.compiled_grant import (
@@ -19,6 +20,7 @@ from fractus_core.policy.compiled_grant import (
     PolicyZone,
     band_gap_m,
     band_may_overlap,
+    band_surely_contains,
 )
 from fractus_core.policy.decision_types import Situation, Takeover, Verdict, deny, distinct, format_distance
 from fractus_core.policy.kinematics import XY, Leg, altitude_range_to_stop_m, vertical_leg
@@ -194,7 +196,17 @@ def _check_exclusion(
         if not level and _leaves_height(zone, leg, now, grant, height_margin_m):
             return
         if (
-            (level or not _comes_level(zone, leg, now, grant, height_margin_m))
+            (
+                level
+                or not comes_level(
+                    zone.band,
+                    leg.lower_m,
+                    leg.upper_m,
+                    now,
+                    height_margin_m=height_margin_m,
+                    flat=grant.flat_terrain,
+                )
+            )
             and _leads_out(shape, leg, margin_m, clearance_m)
             and _leads_away(shape, leg, certain)
         ):
@@ -221,14 +233,24 @@ def _is_level_with(zone: PolicyZone, now: Situation, grant: CompiledGrant) -> bo
     return band_may_overlap(zone.band, *altitude_range_to_stop_m(now), now.home, grant.flat_terrain)
 
 
-def _comes_level(zone: PolicyZone, leg: Leg, now: Situation, grant: CompiledGrant, height_margin_m: float) -> bool:
+def comes_level(
+    band: AltitudeBand | None, lower_m: float, upper_m: float, now: Situation, *, height_margin_m: float, flat: bool
+) -> bool:
     """Return True if a leg of a drone below or above a zone comes between the zone's altitudes, or too close to them.
 
     A drone that is already too close may continue at its altitude. Because altitudes are inaccurate, a leg may come
     closer by at most ALTITUDE_TOLERANCE_M. No number of legs may lead into the nearer half of the margin.
+
+    Args:
+        band: Altitudes of the zone.
+        lower_m: Lowest altitude of the leg above home.
+        upper_m: Highest altitude of the leg above home.
+        now: State of the drone.
+        height_margin_m: Distance to keep from the zone's altitudes.
+        flat: True if the ground is taken as level with home.
     """
-    gap_m = band_gap_m(zone.band, leg.lower_m, leg.upper_m, now.home, grant.flat_terrain)
-    present_m = band_gap_m(zone.band, *altitude_range_to_stop_m(now), now.home, grant.flat_terrain)
+    gap_m = band_gap_m(band, lower_m, upper_m, now.home, flat)
+    present_m = band_gap_m(band, *altitude_range_to_stop_m(now), now.home, flat)
     kept_m = height_margin_m
     if present_m < height_margin_m:
         kept_m = min(present_m, max(present_m - ALTITUDE_TOLERANCE_M, height_margin_m / 2))
@@ -295,21 +317,83 @@ def _check_inclusion(
     fence: Inclusion, leg: Leg, now: Situation, grant: CompiledGrant, air: AirVolume
 ) -> Iterator[Breach]:
     shape, border = fence.at(air.lower_m, air.upper_m, now, grant.flat_terrain)
+    if fence.banded and _returns_by_height(fence, leg, now, grant, air):
+        return
     if not _stays_inside(shape, border, leg, now, air.margin_m) or (
-        fence.banded and _leaves_by_height(fence, shape, leg, now, grant)
+        fence.banded and _leaves_by_height(fence, (shape, border), leg, now, grant, air=air)
     ):
         yield _inclusion_breach(fence, shape, border, leg, air.margin_m)
 
 
-def _leaves_by_height(fence: Inclusion, shape: BaseGeometry, leg: Leg, now: Situation, grant: CompiledGrant) -> bool:
-    """Return True if a drone is inside the zones at its present altitude, but not at all altitudes of a leg.
+def _leaves_by_height(
+    fence: Inclusion,
+    permitted: tuple[BaseGeometry, BaseGeometry],
+    leg: Leg,
+    now: Situation,
+    grant: CompiledGrant,
+    *,
+    air: AirVolume,
+) -> bool:
+    """Return True if a leg leads away from zones around the drone that do not permit all altitudes of the leg.
 
-    Such a leg leaves the zones because of its altitude, even if it leads into them in the horizontal plane.
+    A drone inside such a zone leaves it because of its altitude, even if the leg leads into another zone in the
+    horizontal plane. A drone outside such a zone, beside it or within the height margin above or below it, must return
+    into it and not fly through uncovered air to another zone.
+
+    Args:
+        fence: Zones to stay in.
+        permitted: Ground on which the zones permit all altitudes of the leg, and its border.
+        leg: Leg to check.
+        now: State of the drone.
+        grant: Permissions and restrictions that apply.
+        air: Volume of the leg with its margins.
     """
+    shape, border = permitted
     if shape.covers(leg.ground):
         return False
-    present, _ = fence.at(*altitude_range_to_stop_m(now), now, grant.flat_terrain)
-    return bool(present.covers(leg.braking_path))
+    lower_m, upper_m = altitude_range_to_stop_m(now)
+    present, _ = fence.at(lower_m, upper_m, now, grant.flat_terrain)
+    if present.covers(leg.braking_path):
+        return True
+    height_margin_m = leg.lower_m - air.lower_m
+    near = fence.near_altitudes(lower_m - height_margin_m, upper_m + height_margin_m, now, grant.flat_terrain)
+    near_border = near.boundary
+
+    def keeps(part: BaseGeometry) -> bool:
+        return bool(shape.covers(part) and not border.dwithin(part, air.margin_m))
+
+    return not _only_gains_distance(leg, keeps, lambda point: signed_depth_m(near, near_border, point))
+
+
+def _returns_by_height(fence: Inclusion, leg: Leg, now: Situation, grant: CompiledGrant, air: AirVolume) -> bool:
+    """Return True if a drone above or below the nearest zone, or too close to its limits, sinks or climbs into it.
+
+    Only a motion on the spot counts, because autopilots control the axes independently.
+    """
+    west, south, east, north = shapely.bounds(leg.ground)
+    if max(east - west, north - south) > STATIONARY_LEG_M:
+        return False
+    lower_m, upper_m = altitude_range_to_stop_m(now)
+    flat = grant.flat_terrain
+    around = [
+        (band_gap_m(zone.band, lower_m, upper_m, now.home, flat), zone)
+        for zone in fence.zones
+        if zone.shape.covers(leg.ground) and zone.surely_active(now.time_s)
+    ]
+    least_m = min((gap_m for gap_m, _ in around), default=math.inf)
+    height_margin_m = leg.lower_m - air.lower_m
+    ends_m = []
+    if leg.upper_m <= upper_m + 1e-6:
+        ends_m.append(leg.lower_m)
+    if leg.lower_m >= lower_m - 1e-6:
+        ends_m.append(leg.upper_m)
+    return any(
+        gap_m <= least_m
+        and not zone.shape.boundary.dwithin(leg.ground, air.margin_m)
+        and band_surely_contains(zone.band, end_m - height_margin_m, end_m + height_margin_m, now.home, flat)
+        for gap_m, zone in around
+        for end_m in ends_m
+    )
 
 
 def _inclusion_breach(fence: Inclusion, shape: BaseGeometry, border: BaseGeometry, leg: Leg, margin_m: float) -> Breach:

@@ -93,9 +93,8 @@ def _judge_after_stop(request: _Request, target: XY) -> Verdict | None:
     if find_breaches(braking, now, transit_grant, now.margin_m, now.height_margin_m):
         return None
     # The leg begins where the drone comes to rest, so a zone entered while braking would count as already entered.
-    bounds, unknown = altitude_bounds(
-        grant, now, AirVolume(braking.ground, now.margin_m, braking.lower_m, braking.upper_m)
-    )
+    air = AirVolume(braking.ground, now.margin_m, braking.lower_m, braking.upper_m)
+    bounds, unknown = altitude_bounds(grant, now, air, now.height_margin_m)
     reach = braking.lower_m, braking.upper_m
     if unknown or check_altitude_on_entry(shapely.points(position), reach, bounds, now.height_margin_m) is not None:
         return None
@@ -201,7 +200,7 @@ def _within_limits(request: _Request, leg: Leg, aim: _Aim, notes: list[Correctio
     now = request.now
     grant = request.grant
     air = AirVolume(leg.ground, now.margin_m, leg.lower_m, leg.upper_m)
-    bounds, unknown = altitude_bounds(grant, now, air)
+    bounds, unknown = altitude_bounds(grant, now, air, now.height_margin_m)
     if unknown:
         return deny_unknown_datum(unknown[0])
     height = clamp("Altitude", "m above home", aim.altitude_m, bounds)
@@ -217,7 +216,7 @@ def _within_limits(request: _Request, leg: Leg, aim: _Aim, notes: list[Correctio
         "Speed",
         "m/s",
         now.speed_setpoint_mps if requested_mps is None else requested_mps,
-        speed_bounds(grant, now, air),
+        speed_bounds(grant, now, air, now.height_margin_m),
     )
     altitudes = (now.altitude_m, stop_altitude_m(now))
     problem = check_altitude_on_entry(shapely.points(request.position), altitudes, bounds, now.height_margin_m)

@@ -7,9 +7,10 @@ is needed.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
+import shapely
 from shapely.geometry.base import BaseGeometry
 
 from fractus_core.api.policies import LimitAction
@@ -21,8 +22,12 @@ from fractus_core.policy.compiled_grant import (
     PolicyZone,
     Rule,
     altitude_above_home_m,
+    band_limits_m,
+    band_may_overlap,
 )
 from fractus_core.policy.decision_types import Args, Call, Situation, Verdict, deny, distinct
+from fractus_core.policy.geofences import comes_level
+from fractus_core.policy.kinematics import altitude_range_to_stop_m
 
 ROUNDING_SLACK = 1e-6
 """Tolerance of limits. With it, a value that was corrected to a limit does not break the limit because of rounding."""
@@ -35,7 +40,12 @@ _REFUSES: dict[LimitAction, bool] = exhaustive(LimitAction, {"enforce": False, "
 
 @dataclass(frozen=True, slots=True)
 class Bound:
-    """A limit in force: altitudes above home, or speeds."""
+    """A limit in force: altitudes above home, or speeds.
+
+    Attributes:
+        shape: Ground of the zone in which the limit applies. None means everywhere.
+        band_m: Floor and ceiling of this zone above home, infinite if missing or unknown.
+    """
 
     name: str
     priority: int
@@ -43,6 +53,7 @@ class Bound:
     upper: float | None
     refuses: bool
     shape: BaseGeometry | None = None
+    band_m: tuple[float, float] = (-math.inf, math.inf)
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,8 +75,10 @@ def correction_verdict(args: Args, corrections: Sequence[Correction]) -> Verdict
     return Verdict("correct", args, steps[0].code, "; ".join(note.reason for note in steps), names)
 
 
-def altitude_bounds(grant: CompiledGrant, now: Situation, air: AirVolume) -> tuple[list[Bound], list[Rule]]:
-    """Return the altitude limits that apply in a volume.
+def altitude_bounds(
+    grant: CompiledGrant, now: Situation, air: AirVolume, height_margin_m: float = 0.0
+) -> tuple[list[Bound], list[Rule]]:
+    """Return the altitude limits that apply in a volume, or within a margin above and below it.
 
     Returns:
         The limits in metres above home, and the rules whose datum has an unknown height.
@@ -74,7 +87,8 @@ def altitude_bounds(grant: CompiledGrant, now: Situation, air: AirVolume) -> tup
     unknown = list[Rule]()
     if grant.max_altitude_m is not None:
         bounds.append(Bound("", 0, None, grant.max_altitude_m, refuses=False))
-    for rule, zone in _in_force(grant.altitude_limits, grant, now, air):
+    limits = grant.altitude_limits
+    for rule, zone in _in_force(limits, now, limiting_zones(limits, grant, now, air, height_margin_m)):
         spec = rule.spec
         edges = []
         for edge in (spec.lower_limit, spec.upper_limit):
@@ -88,8 +102,11 @@ def altitude_bounds(grant: CompiledGrant, now: Situation, air: AirVolume) -> tup
                 break
             edges.append(height)
         else:
-            shape = zone.shape if zone else None
-            bounds.append(Bound(rule.name, spec.priority, edges[0], edges[1], _REFUSES[spec.limit_action], shape))
+            bound = Bound(rule.name, spec.priority, edges[0], edges[1], _REFUSES[spec.limit_action])
+            if zone is not None:
+                band_m = band_limits_m(zone.band, now.home, grant.flat_terrain)
+                bound = replace(bound, shape=zone.shape, band_m=band_m)
+            bounds.append(bound)
     return bounds, unknown
 
 
@@ -125,25 +142,56 @@ def limit_forbids_altitudes(zone: PolicyZone, lower_m: float, upper_m: float, no
     return (highest is not None and upper_m > highest) or (lowest is not None and lower_m < lowest)
 
 
-def speed_bounds(grant: CompiledGrant, now: Situation, air: AirVolume) -> list[Bound]:
-    """Return the speed limits, in metres per second, that apply in a volume."""
+def speed_bounds(
+    grant: CompiledGrant, now: Situation, air: AirVolume, height_margin_m: float = 0.0
+) -> list[Bound]:
+    """Return the speed limits, in metres per second, that apply in a volume, or within a margin above and below it."""
     bounds = []
     if grant.max_speed_mps is not None:
         bounds.append(Bound("", 0, None, grant.max_speed_mps, refuses=False))
-    for rule, _ in _in_force(grant.speed_limits, grant, now, air):
+    # No drone is trapped by a speed limit, so the limit applies even if the drone is already too close to the zone.
+    zones = grant.speed_limits.near(air.extended(height_margin_m), now, grant.flat_terrain)
+    for rule, _ in _in_force(grant.speed_limits, now, zones):
         spec = rule.spec
         bounds.append(Bound(rule.name, spec.priority, spec.lower_limit, spec.upper_limit, _REFUSES[spec.limit_action]))
     return bounds
 
 
 def _in_force(
-    index: PolicyIndex, grant: CompiledGrant, now: Situation, air: AirVolume
+    index: PolicyIndex, now: Situation, zones: Iterable[PolicyZone]
 ) -> Iterator[tuple[Rule, PolicyZone | None]]:
     for rule in index.everywhere:
         if rule.in_force(now.time_s):
             yield rule, None
-    for zone in index.near(air, now, grant.flat_terrain):
+    for zone in zones:
         yield zone.rule, zone
+
+
+def limiting_zones(
+    limits: PolicyIndex, grant: CompiledGrant, now: Situation, air: AirVolume, height_margin_m: float
+) -> Iterator[PolicyZone]:
+    """Yield the zones of altitude limits that a leg touches or passes within its margins.
+
+    A drone that is already too close above or below a zone may continue at its altitude, or leave.
+
+    Args:
+        limits: Policies with the zones.
+        grant: Permissions and restrictions that apply.
+        now: State of the drone.
+        air: Volume of the leg, with its horizontal margin.
+        height_margin_m: Distance to keep from floors and ceilings of zones.
+    """
+    position = grant.locate(now)
+    present = None if position is None else shapely.points(position)
+    flat = grant.flat_terrain
+    for zone in limits.near(air.extended(height_margin_m), now, flat):
+        beside = present is None or not zone.shape.dwithin(present, air.margin_m)
+        if (
+            beside
+            or band_may_overlap(zone.band, *altitude_range_to_stop_m(now), now.home, flat)
+            or comes_level(zone.band, air.lower_m, air.upper_m, now, height_margin_m=height_margin_m, flat=flat)
+        ):
+            yield zone
 
 
 def clamp(quantity: str, unit: str, value: float, bounds: list[Bound]) -> Correction | Verdict:
@@ -252,17 +300,21 @@ def check_altitude_on_entry(
 ) -> Verdict | None:
     """Return the denial of a leg that would enter a zone at an altitude that the zone does not permit, or None.
 
+    A drone enters a zone from the side at its present altitude, and from above or below at the ceiling or the floor.
+
     Args:
         start: Start of the leg.
         heights_m: Present altitude, and the altitude at which a climbing or sinking drone comes to rest.
         bounds: Altitude limits along the leg.
         slack_m: Permitted deviation from the limits.
     """
-    low = min(heights_m)
-    high = max(heights_m)
     for bound in bounds:
-        if bound.shape is None or bound.shape.intersects(start):
+        floor_m, ceiling_m = bound.band_m
+        outside = min(heights_m) > ceiling_m or max(heights_m) < floor_m
+        if bound.shape is None or (bound.shape.intersects(start) and not outside):
             continue
+        low = min(max(min(heights_m), floor_m), ceiling_m)
+        high = min(max(*heights_m, floor_m), ceiling_m)
         if bound.upper is not None and high > bound.upper + slack_m:
             return deny(
                 "AltitudeAboveLimit",

@@ -27,7 +27,8 @@ def judge_takeoff(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
     if position is None or not isinstance(args, TakeoffArgs):
         return DENY_POSITION_UNKNOWN if position is None else deny("InvalidArgument", "Takeoff needs its arguments")
     lower, upper = sorted((now.altitude_m, args.altitude_m))
-    bounds, unknown = altitude_bounds(grant, now, AirVolume(shapely.points(position), now.margin_m, lower, upper))
+    air = AirVolume(shapely.points(position), now.margin_m, lower, upper)
+    bounds, unknown = altitude_bounds(grant, now, air, now.height_margin_m)
     if unknown:
         return deny_unknown_datum(unknown[0])
     clamped = clamp("Altitude", "m above home", args.altitude_m, bounds)

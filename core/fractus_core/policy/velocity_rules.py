@@ -56,7 +56,8 @@ def judge_speed(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
         return deny("InvalidArgument", "SetSpeed needs its arguments")
     if position is None:
         return DENY_POSITION_UNKNOWN
-    bounds = speed_bounds(grant, now, AirVolume(shapely.points(position), now.margin_m, now.altitude_m, now.altitude_m))
+    air = AirVolume(shapely.points(position), now.margin_m, now.altitude_m, now.altitude_m)
+    bounds = speed_bounds(grant, now, air, now.height_margin_m)
     clamped = clamp("Speed", "m/s", args.speed_mps, bounds)
     return clamped if isinstance(clamped, Verdict) else correction_verdict(SetSpeedArgs(clamped.value), [clamped])
 
@@ -130,7 +131,9 @@ def _return_problem(setpoint: _Setpoint) -> Verdict | None:
 def _correct_speed(setpoint: _Setpoint) -> Verdict | None:
     args = setpoint.args
     requested = math.hypot(args.north_mps, args.east_mps)
-    bounds = [replace(b, lower=None) for b in speed_bounds(setpoint.grant, setpoint.now, setpoint.air)]
+    now = setpoint.now
+    limits = speed_bounds(setpoint.grant, now, setpoint.air, _height_margin_m(now))
+    bounds = [replace(b, lower=None) for b in limits]
     speed = clamp("Speed", "m/s", requested, bounds)
     if isinstance(speed, Verdict):
         return speed
@@ -145,7 +148,7 @@ def _correct_altitude(setpoint: _Setpoint) -> Verdict | None:
     """Correct the vertical part to the altitude limits, or return a denial."""
     now = setpoint.now
     grant = setpoint.grant
-    bounds, unknown = altitude_bounds(grant, now, setpoint.air)
+    bounds, unknown = altitude_bounds(grant, now, setpoint.air, _height_margin_m(now))
     if unknown:
         return deny_unknown_datum(unknown[0])
     problem = check_contradiction("Altitude", "m", bounds) or check_altitude_on_entry(
@@ -270,8 +273,7 @@ def _scaled(args: VelocityArgs, share: float) -> VelocityArgs:
 
 def _setpoint_breaches(setpoint: _Setpoint, args: VelocityArgs) -> list[Breach]:
     now = setpoint.now
-    slack = now.height_margin_m + now.airframe.tracking_m
-    return find_breaches(setpoint.sweep(args), now, setpoint.grant, _margin_m(now), slack)
+    return find_breaches(setpoint.sweep(args), now, setpoint.grant, _margin_m(now), _height_margin_m(now))
 
 
 def _margin_m(now: Situation) -> float:
@@ -280,3 +282,8 @@ def _margin_m(now: Situation) -> float:
     A velocity starts at a position displaced by wind and leads to no fixed point, so the tracking error counts twice.
     """
     return now.margin_m + now.airframe.tracking_m
+
+
+def _height_margin_m(now: Situation) -> float:
+    """Return the vertical margin that a velocity keeps from floors and ceilings of zones. See `_margin_m`."""
+    return now.height_margin_m + now.airframe.tracking_m

@@ -183,7 +183,8 @@ def limited_mps(speed_mps: float, leg: GotoArgs, now: Situation, grant: Compiled
     heights = (now.altitude_m, now.altitude_m if leg.alt is None else leg.alt)
     ground = shapely.points(at) if at == target else shapely.linestrings((at, target))
     air = AirVolume(ground, now.margin_m, min(heights), max(heights))
-    return min([speed_mps, *(bound.upper for bound in speed_bounds(grant, now, air) if bound.upper is not None)])
+    bounds = speed_bounds(grant, now, air, now.height_margin_m)
+    return min([speed_mps, *(bound.upper for bound in bounds if bound.upper is not None)])
 
 
 class RouteFollower:

@@ -11,12 +11,22 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
 from typing import Any, Protocol
 
 import numpy as np
 from fractus_core.api.methods import Method
 from fractus_core.policy.compiled_grant import CompiledGrant
-from fractus_core.policy.decision_types import Airframe, Call, GotoArgs, SetSpeedArgs, Situation, VelocityArgs, Verdict
+from fractus_core.policy.decision_types import (
+    Airframe,
+    Call,
+    GotoArgs,
+    SetSpeedArgs,
+    Situation,
+    UncertainTime,
+    VelocityArgs,
+    Verdict,
+)
 from fractus_core.policy.engine import judge
 from fractus_core.policy.monitoring import monitor
 from fractus_services.mobility.mavlink.mavlink_autopilot import is_turning
@@ -35,6 +45,12 @@ CLIMB_ACCELS = (1.0, 1.0, 2.0)
 JERKS = (3.0, 5.0, 5.0, 8.0)
 GAIN = 1.0
 """Values of WPNAV_ACCEL, WPNAV_ACCEL_Z and PSC_JERK_XY, in m/s2 and m/s3, and of the position gain PSC_POSXY_P."""
+NEAR_BORDER = 0.25
+"""Fraction of drones that start at the border of an inclusion zone, if their scene has one."""
+NEAR_LIMIT = 0.4
+"""Fraction of drones that start near the floor or ceiling of a zone, and of requests to fly there."""
+NEAR_LIMIT_M = 2.5
+"""Greatest distance of these altitudes from the floor or ceiling."""
 CHANGED = 0.04
 """Fraction of vehicles whose parameters change between two requests."""
 RETURNS_M = (3.0, 15.0, 15.0, 40.0)
@@ -53,8 +69,13 @@ COURSE_S = 0.3
 RESEND_S = 0.2
 """Interval at which the service sends a velocity setpoint until its hold time ends. A zero velocity follows."""
 STILL = (0.0, 0.0, 0.0)
-HOURS = 12
-"""Hour of the day of all flights."""
+MINUTE_S = 60
+DAY_MIN = 1440
+DOUBT_MIN = 2 * DAY_MIN
+"""Greatest difference between the time of the flights, NOW, and a reading of a clock in doubt, in minutes."""
+DAYS = ("Mon", "Tue", "Wed", "Thu", "Fri", "Sat", "Sun")
+NOW_DAY = 0
+"""Index of the weekday of NOW."""
 NORTH_M = 110_998.6
 EAST_M = math.cos(math.radians(HOME.lat)) * 111_457.6
 """Metres per degree of latitude and longitude at home (WGS 84). The error within a scene is a few centimetres."""
@@ -73,16 +94,20 @@ class Scene:
     Attributes:
         rings: Corners of the zones in metres, shape (ZONES, CORNERS, 2). Rings with fewer corners repeat the last one.
         kinds: EXCLUSION, INCLUSION, LIMIT, or 0 for an empty or inactive slot, shape (ZONES,).
-        bands: Altitude range of the zone in metres above home, shape (ZONES, 2). For LIMIT, the permitted range.
+        bands: Altitude range of the zone in metres above home, shape (ZONES, 2).
+        limits: Permitted altitudes inside a zone of kind LIMIT, in metres above home, shape (ZONES, 2).
         heights: Lower and upper altitude limit that apply everywhere, in metres above home.
+        time_s: Time of the flights, in doubt for some scenes.
     """
 
     grant: CompiledGrant
     rings: Floats
     kinds: NDArray[np.int64]
     bands: Floats
+    limits: Floats
     heights: tuple[float, float]
     top_mps: float
+    time_s: float = NOW
 
     def airframe(self, rng: np.random.Generator) -> Airframe:
         """Return a random vehicle. Its return altitude respects the limits, as the service ensures before arming."""
@@ -93,37 +118,52 @@ class Scene:
         )  # fmt: skip
 
 
+    def altitude_near_edge(self, rng: np.random.Generator) -> float | None:
+        """Return an altitude near the floor or ceiling of a random zone, or None if no zone has one."""
+        edges = self.bands[self.kinds > 0].ravel()
+        edges = edges[np.isfinite(edges)]
+        if not len(edges):
+            return None
+        return max(float(rng.choice(edges) + rng.uniform(-NEAR_LIMIT_M, NEAR_LIMIT_M)), 1.0)
+
+
 def scene(rng: np.random.Generator) -> Scene:
     """Return a random set of policies."""
     rings = np.full((ZONES, CORNERS, 2), 1e6)
     kinds = np.zeros(ZONES, dtype=np.int64)
     bands = np.tile(np.array([-np.inf, np.inf]), (ZONES, 1))
+    limits = bands.copy()
+    time_s, minutes = _moments(rng)
     policies: list[dict[str, Any]] = []
     slot = 0
     for _ in range(int(rng.integers(1, 5))):
-        zone, active = _zone(rng, slot, rings, bands, rng.uniform(4, 28), rng.uniform(-70, 70, 2))
+        zone, active = _zone(rng, slot, rings, bands, rng.uniform(4, 28), rng.uniform(-70, 70, 2), minutes)
         action = rng.choice(["ignore", "adjust", "adjust", "hover", "land", "returnToLaunch", "revoke"])
-        policies.append(policy(f"out-{slot}", "GeofenceControl", "exclusion", [zone], action=str(action)))
-        kinds[slot] = EXCLUSION if active else 0
+        window, valid = _validity(rng, minutes)
+        policies.append(policy(f"out-{slot}", "GeofenceControl", "exclusion", [zone], action=str(action), **window))
+        kinds[slot] = EXCLUSION if (active & valid).any() else 0
         slot += 1
     if rng.random() < 0.3:
         zones = []
+        window, valid = _validity(rng, minutes)
         for _ in range(int(rng.integers(1, 3))):
-            zone, active = _zone(rng, slot, rings, bands, rng.uniform(60, 110), rng.uniform(-20, 20, 2))
+            size = rng.uniform(60, 110) if rng.random() < 0.7 else rng.uniform(20, 60)
+            zone, active = _zone(rng, slot, rings, bands, size, rng.uniform(-20, 20, 2), minutes)
             zones.append(zone)
-            # An inactive slot permits nothing: its band contains no altitude.
-            kinds[slot] = INCLUSION
-            if not active:
+            kinds[slot] = INCLUSION if valid.any() else 0
+            # A zone that is inactive at some time permits nothing: its band contains no altitude.
+            if not active.all():
                 bands[slot] = (np.inf, -np.inf)
             slot += 1
         action = str(rng.choice(["ignore", "adjust"]))
-        policies.append(policy("in", "GeofenceControl", "inclusion", zones, action=action))
-    if rng.random() < 0.2:
-        zone, active = _zone(rng, slot, rings, bands, rng.uniform(8, 25), rng.uniform(-60, 60, 2), banded=False)
+        policies.append(policy("in", "GeofenceControl", "inclusion", zones, action=action, **window))
+    if rng.random() < 0.4:
+        zone, active = _zone(rng, slot, rings, bands, rng.uniform(8, 40), rng.uniform(-60, 60, 2), minutes)
         low, high = sorted(rng.uniform(3, 50, 2))
-        policies.append(policy("zoned", "LimitControl", "altitude", [zone], lowerLimit=low, upperLimit=high))
-        kinds[slot] = LIMIT if active else 0
-        bands[slot] = (low, high)
+        window, valid = _validity(rng, minutes)
+        policies.append(policy("zoned", "LimitControl", "altitude", [zone], lowerLimit=low, upperLimit=high, **window))
+        kinds[slot] = LIMIT if (active & valid).any() else 0
+        limits[slot] = (low, high)
     heights = (-np.inf, 120.0)
     top = 15.0
     if rng.random() < 0.5:
@@ -135,7 +175,50 @@ def scene(rng: np.random.Generator) -> Scene:
         top = float(rng.uniform(2, 10))
         policies.append(policy("speeds", "LimitControl", "speed", upperLimit=top))
     grant = compiled(*policies, operationArea=[], services=SERVICES)
-    return Scene(grant, rings, kinds, bands, heights, top)
+    return Scene(grant, rings, kinds, bands, limits, heights, top, time_s)
+
+
+def _moments(rng: np.random.Generator) -> tuple[float, NDArray[np.int64]]:
+    """Return the time of a scene, and all its minutes since NOW: NOW, or any minute between readings of a clock in doubt."""
+    if rng.random() < 0.6:
+        return NOW, np.zeros(1, dtype=np.int64)
+    reach = int(rng.choice([5, 240, DOUBT_MIN]))
+    first, last = -int(rng.integers(0, reach)), int(rng.integers(1, reach))
+    return UncertainTime(NOW + last * MINUTE_S, NOW + first * MINUTE_S), np.arange(first, last + 1)
+
+
+def _validity(rng: np.random.Generator, minutes: NDArray[np.int64]) -> tuple[dict[str, Any], Flags]:
+    """Return a random validity of a policy as fields of its spec, and whether it includes each minute."""
+    if rng.random() < 0.8:
+        return {}, np.ones(len(minutes), dtype=bool)
+    begin, end = sorted(int(m) for m in rng.choice(DOUBT_MIN, 2, replace=False) - DOUBT_MIN // 2)
+    fields = {"validFrom": begin, "validUntil": end}
+    if rng.random() < 0.3:
+        del fields["validUntil"]
+        end = DOUBT_MIN
+    texts = {k: datetime.fromtimestamp(NOW + m * MINUTE_S, UTC).isoformat() for k, m in fields.items()}
+    return texts, (begin <= minutes) & (minutes < end)
+
+
+def _schedule(rng: np.random.Generator, minutes: NDArray[np.int64]) -> tuple[list[dict[str, Any]], Flags]:
+    """Return a random schedule of a zone, and whether it includes each minute."""
+    times = []
+    active = np.zeros(len(minutes), dtype=bool)
+    noon = NOW % (DAY_MIN * MINUTE_S) / MINUTE_S
+    for _ in range(int(rng.integers(1, 3))):
+        begin, end = (int(m) for m in rng.choice(DAY_MIN, 2, replace=False))
+        time: dict[str, Any] = {"start": f"{begin // 60:02}:{begin % 60:02}", "end": f"{end // 60:02}:{end % 60:02}"}
+        days = sorted(int(d) for d in rng.choice(7, 3, replace=False)) if rng.random() < 0.4 else list(range(7))
+        if len(days) < 7:
+            time["days"] = [DAYS[d] for d in days]
+        times.append(time)
+        # Minutes since the midnight before NOW.
+        since = minutes + int(noon)
+        for day in range(-4, 4):
+            if (NOW_DAY + day) % 7 in days:
+                lasts = (end - begin) % DAY_MIN
+                active |= (since >= day * DAY_MIN + begin) & (since < day * DAY_MIN + begin + lasts)
+    return times, active
 
 
 def _zone(
@@ -145,10 +228,9 @@ def _zone(
     bands: Floats,
     size: float,
     middle: Floats,
-    *,
-    banded: bool = True,
-) -> tuple[dict[str, Any], bool]:
-    """Add a random star-shaped zone to a slot of the scene. Return the zone, and True if it is active at HOURS."""
+    minutes: NDArray[np.int64],
+) -> tuple[dict[str, Any], Flags]:
+    """Add a random star-shaped zone to a slot of the scene. Return the zone, and whether it is active at each minute."""
     count = int(rng.integers(3, CORNERS + 1))
     turn = rng.uniform(0, 2 * math.pi) + 2 * math.pi * np.arange(count) / count
     radii = size * rng.uniform(0.45, 1.0, count)
@@ -156,17 +238,15 @@ def _zone(
     rings[slot, :count] = corners
     rings[slot, count:] = corners[-1]
     zone: dict[str, Any] = {"name": f"z{slot}", "area": ring([tuple(c) for c in corners.tolist()])}
-    if banded and rng.random() < 0.35:
+    if rng.random() < 0.35:
         low, high = sorted(rng.uniform(0, 70, 2))
         amsl = rng.random() < 0.4
         shift = HOME.amsl_m if amsl else 0.0
         zone["altitude"] = {"lower": low + shift, "upper": high + shift + 1.0, "reference": "amsl" if amsl else "home"}
         bands[slot] = (low, high + 1.0)
-    active = True
-    if rng.random() < 0.2:
-        begin, end = (int(h) for h in rng.integers(0, 24, 2))
-        zone["schedule"] = [{"start": f"{begin:02}:00", "end": f"{end:02}:00"}]
-        active = begin <= HOURS < end if begin < end else begin <= HOURS or end > HOURS
+    active = np.ones(len(minutes), dtype=bool)
+    if rng.random() < 0.3:
+        zone["schedule"], active = _schedule(rng, minutes)
     return zone, active
 
 
@@ -241,9 +321,14 @@ class Fleet:
         climb = rng.uniform(-1.5, 2.0, count) * (rng.random(count) < 0.4)
         self.speed = np.column_stack((fast * np.cos(angle), fast * np.sin(angle), climb))
         self.accel = np.zeros((count, 3))
+        for i in np.flatnonzero(generator.random(count) < NEAR_LIMIT).tolist():
+            self.place[i, 2] = self.scenes[i].altitude_near_edge(generator) or self.place[i, 2]
+        for i in np.flatnonzero(generator.random(count) < NEAR_BORDER).tolist():
+            self._start_at_border(i, generator)
         self.walls = Walls.of(np.stack([s.rings for s in self.scenes]))
         self.kinds = np.stack([s.kinds for s in self.scenes])
         self.bands = np.stack([s.bands for s in self.scenes])
+        self.limits = np.stack([s.limits for s in self.scenes])
         self.heights = np.array([s.heights for s in self.scenes])
         self.error = np.column_stack(
             (_disc(rng, count, POSITION_ERROR_M), rng.uniform(-HEIGHT_ERROR_M, HEIGHT_ERROR_M, count))
@@ -274,6 +359,20 @@ class Fleet:
         self.learn()
         # A drone without a command stops.
         self.stop(np.arange(count))
+
+    def _start_at_border(self, i: int, rng: np.random.Generator) -> None:
+        """Let a drone hover beside the border of an inclusion zone, if its scene has one."""
+        place = self.scenes[i]
+        slots = np.flatnonzero((place.kinds == INCLUSION) & (place.bands[:, 0] < place.bands[:, 1]))
+        if not len(slots):
+            return
+        slot = rng.choice(slots)
+        low, high = np.clip(place.bands[slot], 3.0, 45.0)
+        edge = rng.integers(0, CORNERS)
+        first, second = place.rings[slot, edge], place.rings[slot, (edge + 1) % CORNERS]
+        border = first + (second - first) * rng.random()
+        self.place[i] = (*(border + rng.uniform(-JUST_M, JUST_M, 2)), rng.uniform(low - JUST_M, high + JUST_M))
+        self.speed[i] = 0.0
 
     def learn(self) -> None:
         """Copy the controller limits from `airframes` to arrays."""
@@ -375,7 +474,7 @@ class Fleet:
         tends = float(np.linalg.norm(self.velocity_setpoint[i, :2]))
         forward = float(self.accel[i, 0] * east + self.accel[i, 1] * north) / max(ground, 0.05) if measured else None
         return Situation(
-            time_s=NOW, lat=float(HOME.lat + y / NORTH_M), lon=float(HOME.lon + x / EAST_M), altitude_m=float(z), north_mps=north, east_mps=east,
+            time_s=self.scenes[i].time_s, lat=float(HOME.lat + y / NORTH_M), lon=float(HOME.lon + x / EAST_M), altitude_m=float(z), north_mps=north, east_mps=east,
             down_mps=-up, home=HOME, armed=True, in_air=True, position_error_m=POSITION_ERROR_M,
             altitude_error_m=HEIGHT_ERROR_M, latency_s=float(self.latency[i]), pending=self._pending(i), speed_setpoint_mps=max(float(self.setpoint[i]), tends), forward_mps2=forward,
             airframe=self.airframes[i],
@@ -454,25 +553,27 @@ class Fleet:
         true = self.true
         fast = np.abs(self.speed).max(axis=1) > STANDING_MPS
         if fast.mean() > 0.5:
-            return trespasses(true[:, :2], true[:, 2], self.walls, self.kinds, self.bands)
+            return trespasses(true[:, :2], true[:, 2], self.walls, self.kinds, self.bands, self.limits)
         # A hovering drone moves slowly, so its position is checked only every tenth step.
         fast |= round(self.time_s / STEP_S) % 10 == 0
         broken = np.zeros((len(true), ZONES + 1), dtype=bool)
         rows = np.flatnonzero(fast)
         broken[rows] = trespasses(
-            true[rows, :2], true[rows, 2], self.walls.of_some(rows), self.kinds[rows], self.bands[rows]
+            true[rows, :2], true[rows, 2], self.walls.of_some(rows), self.kinds[rows], self.bands[rows], self.limits[rows]
         )
         return broken
 
 
-def trespasses(points: Floats, heights: Floats, walls: Walls, kinds: NDArray[np.int64], bands: Floats) -> Flags:
+def trespasses(
+    points: Floats, heights: Floats, walls: Walls, kinds: NDArray[np.int64], bands: Floats, limits: Floats
+) -> Flags:
     """Return the zones violated at the given points. The last column is True outside all inclusion zones."""
     inside = walls.around(points)
     up = heights[:, None]
     within = (bands[..., 0] <= up) & (up <= bands[..., 1])
     slack = HEIGHT_ERROR_M + TRACKING_M + JUST_M
-    allowed = (bands[..., 0] - slack <= up) & (up <= bands[..., 1] + slack)
-    broken = (inside & within & (kinds == EXCLUSION)) | (inside & ~allowed & (kinds == LIMIT))
+    allowed = (limits[..., 0] - slack <= up) & (up <= limits[..., 1] + slack)
+    broken = inside & within & ((kinds == EXCLUSION) | (~allowed & (kinds == LIMIT)))
     inclusion = kinds == INCLUSION
     outside = inclusion.any(axis=1) & ~(inside & within & inclusion).any(axis=1)
     return np.column_stack((broken, outside))
@@ -642,7 +743,7 @@ def _request_all(fleet: Fleet, tally: Tally, permitted: list[str], rng: np.rando
     legs: list[tuple[int, GotoArgs]] = []
     near = vicinity(fleet).any(axis=1)
     for i, place in enumerate(fleet.scenes):
-        call = fleet.last_calls[i] = _repeated(rng, fleet.last_calls[i]) or _request(rng)
+        call = fleet.last_calls[i] = _repeated(rng, fleet.last_calls[i]) or _request(rng, place)
         measured = bool(rng.random() < 0.5)
         now = fleet.situation(i, measured=measured)
         verdict = judge(call, now, place.grant)
@@ -654,6 +755,8 @@ def _request_all(fleet: Fleet, tally: Tally, permitted: list[str], rng: np.rando
         if verdict.permits and not _flies_faster(fleet, i, verdict, now):
             text = f"{call} in {now} -> {verdict}"
             tally.wrong += [f"{defect}: {text}" for defect in _defects(verdict, now, place)]
+            if _strays(verdict, now, place):
+                tally.wrong.append(f"leads from one inclusion zone through uncovered air to another: {text}")
             # SetSpeed does not start a motion.
             moves = not isinstance(verdict.args, SetSpeedArgs)
             permitted[i] = text if moves else permitted[i] and f"{permitted[i]}, then {text}"
@@ -691,7 +794,9 @@ def _too_near(fleet: Fleet, legs: list[tuple[int, GotoArgs]]) -> Iterator[int]:
     heights = np.array([leg.alt for _, leg in legs for _ in _CIRCLE])
     ends = [[(leg.lon - HOME.lon) * EAST_M, (leg.lat - HOME.lat) * NORTH_M] for _, leg in legs]
     around = (np.array(ends).reshape(-1, 1, 2) + _CIRCLE * (POSITION_ERROR_M + TRACKING_M - 0.05)).reshape(-1, 2)
-    broken = trespasses(around, heights, fleet.walls.of_some(rows), fleet.kinds[rows], fleet.bands[rows])
+    broken = trespasses(
+        around, heights, fleet.walls.of_some(rows), fleet.kinds[rows], fleet.bands[rows], fleet.limits[rows]
+    )
     yield from sorted(set(rows[broken.any(axis=1)].tolist()))
 
 
@@ -707,17 +812,56 @@ def _repeated(rng: np.random.Generator, last: Call | None) -> Call | None:
     return Call("SetVelocity", replace(args, north_mps=args.north_mps * faster, east_mps=args.east_mps * faster))
 
 
-def _request(rng: np.random.Generator) -> Call:
+def _request(rng: np.random.Generator, place: Scene) -> Call:
     if rng.random() < 0.05:
         return Call("SetSpeed", SetSpeedArgs(float(rng.uniform(0.5, 14))))
     if rng.random() < 0.65:
         x, y = rng.uniform(-85, 85, 2)
         alt = None if rng.random() < 0.3 else float(rng.uniform(1, 60))
+        if rng.random() < NEAR_LIMIT:
+            alt = place.altitude_near_edge(rng) or alt
         speed = float(rng.uniform(1, 12)) if rng.random() < 0.4 else None
         return Call("Goto", GotoArgs(float(HOME.lat + y / NORTH_M), float(HOME.lon + x / EAST_M), alt, speed_mps=speed))
     north, east = rng.uniform(-9, 9, 2)
     down = float(rng.uniform(-2.5, 2.0)) if rng.random() < 0.5 else 0.0
     return Call("SetVelocity", VelocityArgs(float(north), float(east), down, hold_s=float(rng.uniform(0.1, 2.0))))
+
+
+def _strays(verdict: Verdict, now: Situation, place: Scene) -> bool:
+    """Return True if the leg of a hovering drone outside all inclusion zones leads away from the zones at its altitude.
+
+    The distance to these zones may not grow before the drone is inside a zone that permits all altitudes of the leg.
+    """
+    args = verdict.args
+    included = place.kinds == INCLUSION
+    if not included.any() or not isinstance(args, GotoArgs) or now.is_moving or now.lat is None or now.lon is None:
+        return False
+    shares = np.linspace(0, 1, 60)[:, None]
+    start = np.array([(now.lon - HOME.lon) * EAST_M, (now.lat - HOME.lat) * NORTH_M])
+    end = np.array([(args.lon - HOME.lon) * EAST_M, (args.lat - HOME.lat) * NORTH_M])
+    points = start + (end - start) * shares
+    low, high = sorted((now.altitude_m, now.altitude_m if args.alt is None else args.alt))
+    floors, ceilings = place.bands.T
+    inside = Walls.of(np.tile(place.rings, (len(points), 1, 1, 1))).around(points) & included
+    if (inside[0] & (floors <= now.altitude_m) & (now.altitude_m <= ceilings)).any():
+        return False
+    beside = included & (floors <= now.altitude_m + HEIGHT_ERROR_M) & (now.altitude_m - HEIGHT_ERROR_M <= ceilings)
+    if not beside.any():
+        return False
+    arrived: Flags = np.logical_or.reduce(inside & (floors <= low) & (high <= ceilings), axis=1)
+    away = np.where(inside, 0.0, _distances(points, place.rings))[:, beside].min(axis=1)
+    until = int(np.argmax(arrived)) if arrived.any() else len(points)
+    return bool((away[1:until] > np.minimum.accumulate(away)[: until - 1] + 0.05).any()) if until > 1 else False
+
+
+def _distances(points: Floats, rings: Floats) -> Floats:
+    """Return the distance of each point to the edges of each ring, shape (points, rings)."""
+    edges = np.roll(rings, -1, axis=1) - rings
+    off = points[:, None, None] - rings
+    along = (off * edges).sum(axis=-1) / np.maximum((edges * edges).sum(axis=-1), 1e-12)
+    nearest = off - np.clip(along, 0.0, 1.0)[..., None] * edges
+    distances: Floats = np.linalg.norm(nearest, axis=-1).min(axis=-1)
+    return distances
 
 
 def _defects(verdict: Verdict, now: Situation, place: Scene) -> Iterator[str]:
@@ -766,10 +910,11 @@ def excused(fleet: Fleet) -> Flags:
 def vicinity(fleet: Fleet) -> Flags:
     """Return the fences that each drone violates, or whose margin it violates, shape (drones, ZONES + 1)."""
     tall = HEIGHT_ERROR_M + TRACKING_M + 0.1
-    around = np.where((fleet.kinds == EXCLUSION)[..., None], [-tall, tall], [tall, -tall])
+    around = np.where((fleet.kinds == INCLUSION)[..., None], [tall, -tall], [-tall, tall])
     broken = np.zeros((len(fleet.scenes), ZONES + 1), dtype=bool)
     for dx in (*_CIRCLE * (POSITION_ERROR_M + TRACKING_M + 0.1), np.zeros(2)):
         broken |= trespasses(
-            fleet.estimated[:, :2] + dx, fleet.estimated[:, 2], fleet.walls, fleet.kinds, fleet.bands + around
-        )
+            fleet.estimated[:, :2] + dx, fleet.estimated[:, 2], fleet.walls, fleet.kinds, fleet.bands + around,
+            fleet.limits + np.array([tall, -tall]),
+        )  # fmt: skip
     return broken

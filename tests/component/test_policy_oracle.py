@@ -286,9 +286,10 @@ def test_oracle_detects_assumed_parameters(monkeypatch: pytest.MonkeyPatch) -> N
 def test_oracle_accepts_drones_that_start_beyond_an_altitude_limit() -> None:
     rings = np.full((ZONES, CORNERS, 2), 1e6)
     rings[0] = [(-20, -20)] * 5 + [(20, -20), (20, 20), (-20, 20)]
-    limits = np.tile([-np.inf, np.inf], (ZONES, 1))
+    bands = np.tile([-np.inf, np.inf], (ZONES, 1))
+    limits = bands.copy()
     limits[0] = 21, 40
-    scene = Scene(compiled(), rings, np.array([LIMIT] + [0] * (ZONES - 1)), limits, (-np.inf, 120.0), 15.0)
+    scene = Scene(compiled(), rings, np.array([LIMIT] + [0] * (ZONES - 1)), bands, limits, (-np.inf, 120.0), 15.0)
     fleet = Fleet(np.random.default_rng(1), [scene] * 4)
     fleet.place[:] = (0, 0, 19)
     fleet.speed[:] = 0
@@ -305,7 +306,7 @@ def shortening(monkeypatch: pytest.MonkeyPatch) -> None:
     def shortens(name: str, *args: Any, **more: Any) -> dict[str, Any]:
         return made(name, *args, **more | ({"action": "adjust"} if args[0] == "GeofenceControl" else {}))
 
-    def far(rng: np.random.Generator) -> Call:
+    def far(rng: np.random.Generator, _place: Scene) -> Call:
         x, y = rng.uniform(-85, 85, 2)
         away = GotoArgs(
             float(HOME.lat + y / NORTH_M), float(HOME.lon + x / EAST_M), speed_mps=float(rng.uniform(2, 14))

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import io
+import math
 import os
+import re
 import struct
 import sys
 import types
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -15,7 +18,9 @@ import cv2
 import numpy as np
 import pytest
 from depth import examples
+from fractus_core.api.nodes import EdgeNodeSpec
 from fractus_core.policy.decision_types import Attitude, Filter, Home, Lens
+from fractus_core.policy.footprint import camera_axes
 from fractus_services.camera.drivers.connection import create_driver
 from fractus_services.camera.drivers.driver import CameraFailed, CaptureRequest, InvalidCameraConnection
 from fractus_services.camera.face_detection import CascadeDetector, InvalidFaceModel, ModelDetector, smallest_face_px
@@ -32,10 +37,11 @@ from fractus_services.camera.image_metadata import with_metadata
 from fractus_services.camera.image_store import ImageRecord
 from fractus_services.camera.motion_detection import detect_motion
 from fractus_services.camera.pixels import InvalidImage, Pixels, crop_and_resize, decode_image, encode_jpeg, source_size
-from fractus_services.camera.pose import Pose, is_upright
+from fractus_services.camera.pose import FixedPose, Pose, is_upright
 from fractus_world.billboards import photograph
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 from PIL import Image
 from policy_world import HOME, NOW, at
 
@@ -327,21 +333,115 @@ def test_image_metadata_contains_position_and_camera(photo: Pixels) -> None:
         assert (gps[1], gps[3]) == ("N", "E")
         assert float(gps[6]) == pytest.approx(HOME.amsl_m + 12.5)
         assert float(gps[17]) == pytest.approx(90.0)
+        assert more[0x9000] == b"0232", "OffsetTime needs version 2.31"
+        assert (more[0x9010], more[0x9011]) == ("+00:00", "+00:00")
+        assert more[0xA405] == round(18 / math.tan(math.radians(30)) * 512 / photo.shape[1])
         assert exif[0x0110] == "Pi Camera ?"
         assert more[0x9003] == "2026:06:01 12:00:00"
         assert more[0x9291] == "250"
         xmp = str(picture.getxmp())
     for name, value in (
-        ("Pitch", "-30.0000"),
+        ("Pitch", "60.0000"),
         ("Yaw", "90.0000"),
         ("Roll", "0.0000"),
-        ("AboveGroundAltitude", "12.5000"),
-        ("PerspectiveFocalLength", "443.4050"),
     ):
-        assert name in xmp
-        assert value in xmp
+        assert f"'{name}': '{value}'" in xmp
+    assert "AboveGroundAltitude" not in xmp, "the ground below the drone is unknown"
+    assert "FocalLength" not in xmp, "the focal length in millimetres is unknown"
     with pytest.raises(ValueError, match="JPEG"):
         with_metadata(b"PNG", pose, time_s=NOW, camera="", view_width_px=512)
+
+
+def xmp_angles(data: bytes) -> dict[str, float]:
+    return {name: float(value) for name, value in re.findall(r'Camera:(Yaw|Pitch|Roll)="(.*?)"', data.decode("latin-1"))}
+
+
+@pytest.mark.parametrize(
+    ("mount", "attitude", "angles"),
+    [
+        pytest.param(-90.0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), id="down-north"),
+        pytest.param(-90.0, (0.0, 0.0, 250.0), (250.0, 0.0, 0.0), id="down"),
+        pytest.param(-90.0, (0.0, 10.0, 40.0), (40.0, 10.0, 0.0), id="down-nose-up"),
+        pytest.param(-90.0, (8.0, 0.0, 40.0), (40.0, 0.0, 8.0), id="down-right-side-down"),
+        pytest.param(-45.0, (0.0, 0.0, 120.0), (120.0, 45.0, 0.0), id="oblique"),
+        pytest.param(0.0, (0.0, 0.0, 120.0), (120.0, 90.0, 0.0), id="horizon"),
+        pytest.param(20.0, (0.0, 0.0, 120.0), (120.0, 110.0, 0.0), id="above-horizon"),
+    ],
+)
+def test_image_metadata_contains_attitude_by_the_convention_of_its_schema(
+    photo: Pixels, mount: float, attitude: tuple[float, float, float], angles: tuple[float, float, float]
+) -> None:
+    now = at(lens=Lens(60.0, 45.0, pitch_deg=mount), attitude=Attitude(*attitude))
+    data = with_metadata(encode_jpeg(photo), Pose.from_situation(now), time_s=NOW, camera="", view_width_px=None)
+    found = xmp_angles(data)
+    assert (found["Yaw"], found["Pitch"], found["Roll"]) == pytest.approx(angles, abs=1e-3)
+
+
+def rotation_deg(yaw: float, pitch: float, roll: float) -> NDArray[np.float64]:
+    """Return the rotation from the axes top, right and forward of the image to north, east and down."""
+    cy, cp, cr = (math.cos(math.radians(angle)) for angle in (yaw, pitch, roll))
+    sy, sp, sr = (math.sin(math.radians(angle)) for angle in (yaw, pitch, roll))
+    about_z = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
+    about_y = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
+    about_x = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
+    rotation: NDArray[np.float64] = about_z @ about_y @ about_x
+    return rotation
+
+
+def test_attitude_in_image_metadata_describes_the_axes_of_the_camera(photo: Pixels) -> None:
+    jpeg = encode_jpeg(photo)
+    draw = np.random.default_rng(5)
+    for _ in range(200):
+        lens = Lens(60.0, 45.0, pitch_deg=draw.uniform(-90, 60), yaw_deg=draw.uniform(-180, 180))
+        attitude = Attitude(draw.uniform(-40, 40), draw.uniform(-40, 40), draw.uniform(0, 360))
+        pose = Pose.from_situation(at(lens=lens, attitude=attitude))
+        found = xmp_angles(with_metadata(jpeg, pose, time_s=NOW, camera="", view_width_px=None))
+        axis, right, up = camera_axes(lens, attitude)
+        expected = np.array([up, right, axis]).T
+        assert rotation_deg(found["Yaw"], found["Pitch"], found["Roll"]) == pytest.approx(expected, abs=1e-4)
+        assert 0.0 <= found["Yaw"] < 360.0
+        assert abs(found["Roll"]) <= 90.0
+
+
+@pytest.mark.parametrize("yaw_deg", [359.99999, 0.0, 359.995, 180.0])
+@pytest.mark.parametrize("mount", [-90.0, -85.0, -30.0, 0.0])
+def test_directions_in_image_metadata_are_below_360_degrees(photo: Pixels, yaw_deg: float, mount: float) -> None:
+    """A camera that looks almost straight down has the direction of the top of the image."""
+    lens = Lens(60.0, 45.0, pitch_deg=mount)
+    now = at(lens=lens, attitude=Attitude(3.0 if mount <= -85 else 0.0, 0.0, yaw_deg))
+    data = with_metadata(encode_jpeg(photo), Pose.from_situation(now), time_s=NOW, camera="", view_width_px=None)
+    with Image.open(io.BytesIO(data)) as picture:
+        direction = float(picture.getexif().get_ifd(0x8825)[17])
+    assert 0.0 <= direction < 360.0
+    assert abs(math.remainder(direction - yaw_deg, 360.0)) < 1.0
+    assert 0.0 <= xmp_angles(data)["Yaw"] < 360.0
+
+
+@pytest.mark.parametrize("degrees", [30.0 - 1e-12, 29.999999999, 12.0 + 1 / 60 - 1e-13, 0.0, 89.99999999999])
+def test_seconds_of_position_in_image_metadata_are_below_60(photo: Pixels, degrees: float) -> None:
+    pose = replace(Pose.from_situation(at()), lat=degrees, lon=-degrees)
+    data = with_metadata(encode_jpeg(photo), pose, time_s=NOW, camera="", view_width_px=None)
+    with Image.open(io.BytesIO(data)) as picture:
+        gps = picture.getexif().get_ifd(0x8825)
+    for tag in (2, 4):
+        whole, minutes, seconds = (float(value) for value in gps[tag])
+        assert (minutes < 60, seconds < 60) == (True, True)
+        assert whole + minutes / 60 + seconds / 3600 == pytest.approx(degrees, abs=1e-9)
+
+
+def test_metadata_of_edge_node_omits_altitude_above_unknown_datum(photo: Pixels) -> None:
+    camera = {"methods": ["CaptureImage"], "horizontalFieldOfView": 60, "mount": {"pitch": -20, "height": 4}}
+
+    def has_altitude(**location: Any) -> bool:
+        spec = EdgeNodeSpec.model_validate({"location": {"lat": 1, "lon": 2, **location}, "services": {"camera": camera}})
+        pose = Pose.from_situation(FixedPose(spec).situation(NOW))
+        data = with_metadata(encode_jpeg(photo), pose, time_s=NOW, camera="", view_width_px=None)
+        with Image.open(io.BytesIO(data)) as picture:
+            return 6 in picture.getexif().get_ifd(0x8825)
+
+    assert has_altitude(alt=25, altitudeReference="amsl")
+    assert not has_altitude()
+    assert not has_altitude(alt=25)
 
 
 def test_image_metadata_accepts_unknown_position_and_negative_altitude(photo: Pixels) -> None:

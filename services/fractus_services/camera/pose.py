@@ -87,7 +87,13 @@ def is_upright(poses: Sequence[Pose]) -> bool:
 
 
 class PoseProvider(Protocol):
-    """Provides current and past situations of the camera."""
+    """Provides current and past situations of the camera.
+
+    Attributes:
+        fixed: True if the camera does not move. Its position is then public, as a part of the node's description.
+    """
+
+    fixed: bool
 
     def situation(self, time_s: float) -> Situation:
         """Return the current situation.
@@ -116,16 +122,20 @@ class FixedPose:
         relief_m: Maximum depth of the surrounding ground below home, in metres.
     """
 
+    fixed = True
+
     def __init__(self, spec: EdgeNodeSpec, relief_m: float = 0.0) -> None:
         camera = spec.services.camera
         location = spec.location
         height_m = camera.mount.height if camera is not None and camera.mount is not None else None
+        # Without an altitude above sea level, the altitudes of zones above sea level cannot be compared.
+        known = location.alt is not None and location.altitude_reference == "amsl"
         self._situation = Situation(
             time_s=0.0,
             lat=location.lat,
             lon=location.lon,
             altitude_m=height_m or 0.0,
-            home=Home(location.lat, location.lon, location.alt or 0.0),
+            home=Home(location.lat, location.lon, location.alt or 0.0) if known else None,
             position_error_m=SURVEY_ERROR_M,
             altitude_error_m=SURVEY_ERROR_M,
             attitude=Attitude(0.0, 0.0, 0.0, 0.0, 0.0),

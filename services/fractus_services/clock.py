@@ -60,7 +60,9 @@ class Clock:
             self._uncertain_since_s = now_s
             self._new_offset_s = offset_s
             log.warning(
-                "clock: stepped, all times between the readings apply for now (seconds=%.0f for_s=%.0f)", step_s, TRUST_AFTER_S
+                "clock: stepped, all times between the readings apply for now (seconds=%.0f for_s=%.0f)",
+                step_s,
+                TRUST_AFTER_S,
             )
             self._stepped(step_s, False)
         if now_s - self._uncertain_since_s < TRUST_AFTER_S:

@@ -117,7 +117,6 @@ class Scene:
             retraces=bool(rng.random() < 0.5),
         )  # fmt: skip
 
-
     def altitude_near_edge(self, rng: np.random.Generator) -> float | None:
         """Return an altitude near the floor or ceiling of a random zone, or None if no zone has one."""
         edges = self.bands[self.kinds > 0].ravel()
@@ -559,7 +558,12 @@ class Fleet:
         broken = np.zeros((len(true), ZONES + 1), dtype=bool)
         rows = np.flatnonzero(fast)
         broken[rows] = trespasses(
-            true[rows, :2], true[rows, 2], self.walls.of_some(rows), self.kinds[rows], self.bands[rows], self.limits[rows]
+            true[rows, :2],
+            true[rows, 2],
+            self.walls.of_some(rows),
+            self.kinds[rows],
+            self.bands[rows],
+            self.limits[rows],
         )
         return broken
 

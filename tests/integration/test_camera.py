@@ -405,7 +405,7 @@ async def test_camera_service_refuses_invalid_arguments_at_start(
 async def test_drone_camera_is_refused_over_privacy_zone(rig: Rig) -> None:
     rig.write_grant(grant())
     stripe = privacy("refuse", -50, 30, 50, 60)
-    rig.write_grant(passenger_grant(stripe, services=CAMERA))
+    rig.write_grant(passenger_grant(stripe, services=[*CAMERA, {"service": "mobility", "methods": ["GetPosition"]}]))
     rig.start_service()
     rig.start_vehicle()
     camera = stub(rig, rig.start_camera(description=DRONE))

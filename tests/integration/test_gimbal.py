@@ -143,7 +143,8 @@ def ports() -> list[int]:
 async def driver(rig: Rig, ports: list[int]) -> Driver:
     """Driver in control of a drone on the ground, which has a camera on a gimbal."""
     rig.write_grant(grant())
-    rig.write_grant(passenger_grant(NORTH, services=[{"service": "camera", "methods": METHODS}]))
+    services = [{"service": "camera", "methods": METHODS}, {"service": "mobility", "methods": ["GetPosition"]}]
+    rig.write_grant(passenger_grant(NORTH, services=services))
     camera = {
         "connection": f"http://127.0.0.1:{ports[2]}/snapshot.jpg", "resolution": "320x240", "methods": METHODS,
         "horizontalFieldOfView": 30, "lens": {"model": "pinhole"}, "mount": {"gimbal": True},

@@ -38,6 +38,8 @@ def private(action: str = "refuse", name: str = "p", **fields: Any) -> dict[str,
 class Drone:
     """Fake pose provider. A test sets the pose. All returned situations are recorded."""
 
+    fixed = False
+
     def __init__(self) -> None:
         self.x = 0.0
         self.y = 80.0
@@ -96,11 +98,17 @@ class Finder:
         return self.boxes
 
 
-def active_grant(*policies: dict[str, Any], uid: str = "u1", instance: str = "app-navigator") -> ActiveGrant:
+CAMERA_SERVICE = {"service": "camera", "methods": ["CaptureImage", "RetrieveImage", "ListImages", "DeleteImage"]}
+MOBILITY_SERVICE = {"service": "mobility", "methods": ["GetPosition"]}
+
+
+def active_grant(
+    *policies: dict[str, Any], uid: str = "u1", instance: str = "app-navigator", locates: bool = True
+) -> ActiveGrant:
     fields: dict[str, Any] = {
         "application": {"namespace": "default", "name": "app", "uid": uid},
         "instance": instance,
-        "services": [{"service": "camera", "methods": ["CaptureImage", "RetrieveImage", "ListImages", "DeleteImage"]}],
+        "services": [CAMERA_SERVICE, *([MOBILITY_SERVICE] if locates else [])],
     }
     chosen = policies or (private(),)
     return ActiveGrant(uid, "g", spec(*chosen, **fields), compiled(*chosen, **fields))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import io
 import json
 import threading
 import time
@@ -21,10 +22,12 @@ from fractus_services.camera.drivers.driver import CameraFailed, CaptureRequest
 from fractus_services.camera.face_detection import CascadeDetector
 from fractus_services.camera.fair_queue import QueueFull
 from fractus_services.camera.image_store import owner_of
+from fractus_services.camera.pixels import decode_image
 from fractus_services.camera.shutter import Shutter
 from fractus_services.errors import PolicyDenied, Refused
 from fractus_services.grant_files import ActiveGrant
 from fractus_world.billboards import photograph
+from PIL import Image
 from policy_world import FRAME, NOW, at, box, policy, zone
 
 
@@ -95,8 +98,80 @@ async def test_focal_length_is_in_metadata_only_of_pinhole_camera(tmp_path: Path
     source = (await world.stored_images.retrieve(active_grant(elsewhere), record.name))[2]
     data = source if isinstance(source, bytes) else source.read_bytes()
     assert b"GPSXYAccuracy" in data
-    assert (b"PerspectiveFocalLength" in data) == (model == "pinhole")
+    with Image.open(io.BytesIO(data)) as picture:
+        assert (0xA405 in picture.getexif().get_ifd(0x8769)) == (model == "pinhole")
     world.shutter.close()
+
+
+FAR = policy("q", "PrivacyControl", "camera", [zone("z", box(500, 500, 510, 510))], action="refuse")
+
+
+def deny_position(*zones: dict[str, Any], **spec: Any) -> dict[str, Any]:
+    return policy("hidden", "AccessControl", "denial", list(zones), methods=["GetPosition"], **spec)
+
+
+def tells_position(data: bytes) -> bool:
+    with Image.open(io.BytesIO(data)) as picture:
+        return bool(picture.getexif().get_ifd(0x8825)) or b"Camera:" in data
+
+
+@pytest.mark.parametrize(
+    "grant",
+    [
+        pytest.param(active_grant(FAR, locates=False), id="no-mobility-method"),
+        pytest.param(active_grant(FAR, deny_position()), id="denied-everywhere"),
+        pytest.param(active_grant(FAR, deny_position(zone("h", box(-9, 60, 9, 90)))), id="denied-there"),
+    ],
+)
+async def test_picture_of_component_that_may_not_get_position_contains_no_position(
+    world: World, grant: ActiveGrant
+) -> None:
+    record = await world.capture(grant)
+    data = world.store.path(owner_of(grant), record.name).read_bytes()
+    assert not tells_position(data)
+    with Image.open(io.BytesIO(data)) as picture:
+        assert picture.getexif().get_ifd(0x8769)[0x9003], "the time of the picture is not private"
+    assert not world.stored_images.locates(grant, record)
+    _, shown, source = await world.stored_images.retrieve(grant, record.name)
+    assert isinstance(source, bytes)
+    assert (shown.size_bytes, tells_position(source)) == (len(source), False)
+
+
+@pytest.mark.parametrize(
+    "denial",
+    [deny_position(), deny_position(zone("h", box(-9, 60, 9, 90))), deny_position(zone("h", box(190, -9, 200, 9)))],
+)
+async def test_retrieved_picture_loses_position_that_component_may_no_longer_get(
+    world: World, denial: dict[str, Any]
+) -> None:
+    """The denial applies to the place of the picture, and to the current position."""
+    free = active_grant(FAR)
+    record = await world.capture(free)
+    _, _, source = await world.stored_images.retrieve(free, record.name)
+    assert isinstance(source, Path)
+    assert tells_position(source.read_bytes())
+    assert world.stored_images.locates(free, record)
+    world.drone.x = 195.0
+    world.drone.y = 0.0
+    bound = active_grant(FAR, denial)
+    _, shown, data = await world.stored_images.retrieve(bound, record.name)
+    assert isinstance(data, bytes)
+    assert not tells_position(data)
+    assert shown.size_bytes == len(data)
+    assert np.array_equal(decode_image(data), decode_image(source.read_bytes())), "only the metadata is removed"
+    assert not world.stored_images.locates(bound, record)
+    owner = owner_of(free)
+    world.stored_images.authorize_transfer(bound, owner, shown)
+    with pytest.raises(PolicyDenied, match="request it again"):
+        world.stored_images.authorize_transfer(bound, owner, record, has_position=True)
+
+
+async def test_picture_of_fixed_camera_contains_position_without_mobility_method(world: World) -> None:
+    world.drone.fixed = True
+    grant = active_grant(FAR, locates=False)
+    record = await world.capture(grant)
+    assert tells_position(world.store.path(owner_of(grant), record.name).read_bytes())
+    assert world.stored_images.locates(grant, record)
 
 
 async def test_delayed_picture_is_judged_by_earlier_position(world: World) -> None:

@@ -353,7 +353,9 @@ def test_image_metadata_contains_position_and_camera(photo: Pixels) -> None:
 
 
 def xmp_angles(data: bytes) -> dict[str, float]:
-    return {name: float(value) for name, value in re.findall(r'Camera:(Yaw|Pitch|Roll)="(.*?)"', data.decode("latin-1"))}
+    return {
+        name: float(value) for name, value in re.findall(r'Camera:(Yaw|Pitch|Roll)="(.*?)"', data.decode("latin-1"))
+    }
 
 
 @pytest.mark.parametrize(
@@ -433,7 +435,9 @@ def test_metadata_of_edge_node_omits_altitude_above_unknown_datum(photo: Pixels)
     camera = {"methods": ["CaptureImage"], "horizontalFieldOfView": 60, "mount": {"pitch": -20, "height": 4}}
 
     def has_altitude(**location: Any) -> bool:
-        spec = EdgeNodeSpec.model_validate({"location": {"lat": 1, "lon": 2, **location}, "services": {"camera": camera}})
+        spec = EdgeNodeSpec.model_validate(
+            {"location": {"lat": 1, "lon": 2, **location}, "services": {"camera": camera}}
+        )
         pose = Pose.from_situation(FixedPose(spec).situation(NOW))
         data = with_metadata(encode_jpeg(photo), pose, time_s=NOW, camera="", view_width_px=None)
         with Image.open(io.BytesIO(data)) as picture:

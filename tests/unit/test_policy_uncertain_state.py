@@ -113,7 +113,9 @@ def test_uncertain_time_applies_zones_active_at_any_time_between_the_readings(
     body: dict[str, Any], call: Call, active: str
 ) -> None:
     assert ask(compiled(_hours(body, active)), call, BETWEEN).action == "deny"
-    assert ask(compiled(_hours(body, "18:30-05:30")), call, BETWEEN).action == "allow", "the zone is active at no reading"
+    assert ask(compiled(_hours(body, "18:30-05:30")), call, BETWEEN).action == "allow", (
+        "the zone is active at no reading"
+    )
     assert ask(compiled(_hours(body, "18:01-06:00")), call, BETWEEN).action == "allow", "the end is exclusive"
 
 
@@ -164,7 +166,9 @@ def test_uncertain_time_ignores_zone_active_outside_the_validity_of_its_policy()
 
 
 def test_method_is_not_granted_by_zone_with_altitudes_of_unknown_datum() -> None:
-    allowance = policy("a", "AccessControl", "grant", [zone("z", box(-9, -9, 9, 9), upper=30, reference="terrain")], methods=["Hover"])
+    allowance = policy(
+        "a", "AccessControl", "grant", [zone("z", box(-9, -9, 9, 9), upper=30, reference="terrain")], methods=["Hover"]
+    )
     assert ask(compiled(allowance), Call("Hover"), at()).code == "MethodNotGrantedHere"
     assert ask(compiled(allowance, flat_terrain=True), Call("Hover"), at()).action == "allow"
 

@@ -112,7 +112,9 @@ def test_uncertain_time_spans_all_readings_since_the_first_step(machine: Machine
     machine.wait(TRUST_AFTER_S + 1)
     machine.offset_s += 60.0
     now = machine.clock()
-    assert now - earliest_time(now) == pytest.approx(60.0), "a confirmed reading ends the doubt about the readings before"
+    assert now - earliest_time(now) == pytest.approx(60.0), (
+        "a confirmed reading ends the doubt about the readings before"
+    )
 
 
 def test_clock_is_certain_during_small_corrections(machine: Machine) -> None:

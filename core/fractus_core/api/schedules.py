@@ -95,7 +95,8 @@ class ActiveTime(Validity):
         if last_s - first_s >= _WEEK_S:
             return True
         return any(
-            open_s <= last_s and open_s < end_s and first_s < close_s for open_s, close_s in self._daily(first_s, last_s)
+            open_s <= last_s and open_s < end_s and first_s < close_s
+            for open_s, close_s in self._daily(first_s, last_s)
         )
 
     @property

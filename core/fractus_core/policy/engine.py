@@ -141,11 +141,7 @@ def judge_denials(method: str, now: Situation, grant: CompiledGrant) -> Verdict 
     denials = grant.denials.get(method)
     if denials is None:
         return None
-    forbidding = (
-        rules_in_view(denials, now, grant)
-        if method in PICTURE_METHODS
-        else _rules_here(denials, now, grant)
-    )
+    forbidding = rules_in_view(denials, now, grant) if method in PICTURE_METHODS else _rules_here(denials, now, grant)
     if not forbidding:
         return None
     return deny("MethodDenied", f"policy {forbidding[0].name} denies {method} here", rule_names(forbidding))

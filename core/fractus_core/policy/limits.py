@@ -142,9 +142,7 @@ def limit_forbids_altitudes(zone: PolicyZone, lower_m: float, upper_m: float, no
     return (highest is not None and upper_m > highest) or (lowest is not None and lower_m < lowest)
 
 
-def speed_bounds(
-    grant: CompiledGrant, now: Situation, air: AirVolume, height_margin_m: float = 0.0
-) -> list[Bound]:
+def speed_bounds(grant: CompiledGrant, now: Situation, air: AirVolume, height_margin_m: float = 0.0) -> list[Bound]:
     """Return the speed limits, in metres per second, that apply in a volume, or within a margin above and below it."""
     bounds = []
     if grant.max_speed_mps is not None:

@@ -49,7 +49,8 @@ class CameraHandlers(camera_pb2_grpc.CameraServiceServicer):
             grant = self._admission.grant_of(caller)
             args = CaptureArgs(request.width, request.height)
             verdict, record = await self._capture.capture(grant, args, lambda: self._admission.grant_of(caller))
-            return camera_pb2.CaptureImageResponse(decision=decision(verdict), image=_image_info(record))
+            located = self._stored.locates(self._admission.grant_of(caller), record)
+            return camera_pb2.CaptureImageResponse(decision=decision(verdict), image=_image_info(record, located))
 
     async def RetrieveImage(  # noqa: N802
         self, request: camera_pb2.RetrieveImageRequest, context: ServicerContext
@@ -60,11 +61,15 @@ class CameraHandlers(camera_pb2_grpc.CameraServiceServicer):
             verdict, record, source = await self._stored.retrieve(
                 grant, request.name, lambda: self._admission.grant_of(caller)
             )
-            head: dict[str, Any] = {"decision": decision(verdict), "image": _image_info(record)}
+            # Images in memory have no metadata: filters were applied now, or the position was removed.
+            located = isinstance(source, Path) and not record.filters
+            head: dict[str, Any] = {"decision": decision(verdict), "image": _image_info(record, located)}
             async for block in _read_blocks(source, request.name):
                 for start in range(0, len(block), CHUNK_BYTES):
                     # Authorize each chunk: a slow reader can extend the transfer until the image is no longer permitted.
-                    self._stored.authorize_transfer(self._admission.grant_of(caller), owner_of(grant), record)
+                    self._stored.authorize_transfer(
+                        self._admission.grant_of(caller), owner_of(grant), record, has_position=located
+                    )
                     await context.write(camera_pb2.ImageChunk(data=block[start : start + CHUNK_BYTES], **head))
                     head = {}
 
@@ -74,7 +79,8 @@ class CameraHandlers(camera_pb2_grpc.CameraServiceServicer):
         """See camera.proto."""
         async with self._call(context) as caller:
             verdict, records = await self._stored.list(self._admission.grant_of(caller))
-            images = [_image_info(record) for record in records]
+            grant = self._admission.grant_of(caller)
+            images = [_image_info(record, self._stored.locates(grant, record)) for record in records]
             return camera_pb2.ListImagesResponse(decision=decision(verdict), images=images)
 
     async def DeleteImage(  # noqa: N802
@@ -110,7 +116,8 @@ async def _read_blocks(source: bytes | Path, name: str) -> AsyncIterator[bytes]:
             yield block
 
 
-def _image_info(record: ImageRecord) -> camera_pb2.ImageInfo:
+def _image_info(record: ImageRecord, located: bool) -> camera_pb2.ImageInfo:
+    """Return the description of an image, with its position if the caller may know the position (`located`)."""
     info = camera_pb2.ImageInfo(
         name=record.name,
         width=record.width,
@@ -120,9 +127,7 @@ def _image_info(record: ImageRecord) -> camera_pb2.ImageInfo:
     )
     info.time.FromNanoseconds(int(record.time_s * 1e9))
     pose = record.poses[-1]
-    # Omit the position of a filtered image. A policy required the filter because of this position, so the position is
-    # private too.
-    if pose.lat is not None and pose.lon is not None and not record.filters:
+    if located and pose.lat is not None and pose.lon is not None:
         info.position.latitude_deg = pose.lat
         info.position.longitude_deg = pose.lon
         info.position.altitude_m = pose.altitude_m

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import asdict, replace
 
 from fractus_core.policy.decision_types import Call, Situation, Verdict
-from fractus_core.policy.engine import judge, judge_denials
+from fractus_core.policy.engine import judge, judge_access, judge_denials
 from fractus_core.policy.picture_rules import combine_filters, judge_privacy
 from fractus_runtime import tracing
 from fractus_runtime.audit import AuditLog
@@ -72,6 +72,18 @@ class ImageAuthorizer:
             Refused: No image of this view may be returned.
         """
         return combine_verdicts([verdict, self.authorize_view(call, grant, situation_of(poses, now))])
+
+    def may_locate(self, grant: ActiveGrant, poses: Sequence[Pose], now: Situation) -> bool:
+        """Return True if the caller may know where an image was taken.
+
+        The caller must be permitted to call GetPosition at the current position and at all positions of the exposure.
+        """
+        situations = [now, *(pose.apply_to(now) for pose in poses)]
+        try:
+            return all(judge_access(Call("GetPosition"), seen, grant.compiled) is None for seen in situations)
+        except Exception:
+            log.exception("policy: engine failed, position of an image omitted")
+            return False
 
     def plan_filters(
         self, call: Call, grant: ActiveGrant, verdict: Verdict, seen: Situation, *, face_px: float, recorded: Verdict

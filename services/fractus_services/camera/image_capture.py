@@ -202,6 +202,7 @@ class ImageCapture:
         )
         poses = tuple(Pose.from_situation(situation) for situation in after.exposure)
         time_s = float(after.time_s)
+        located = self._poses.fixed or self._authorizer.may_locate(grant, poses, after)
         requested_size = (args.width, args.height)
         full_size = camera.source_size(args.width, args.height)
 
@@ -217,7 +218,9 @@ class ImageCapture:
                 return data
             # For other lenses than a pinhole, the pose contains an upper bound of the field of view, which gives no focal length.
             view_px = full_size[0] if camera.pinhole else None
-            return with_metadata(data, poses[-1], time_s=time_s, camera=camera.model, view_width_px=view_px)
+            return with_metadata(
+                data, poses[-1], time_s=time_s, camera=camera.model, view_width_px=view_px, located=located
+            )
 
         with tracing.child_span("camera.filters") as span:
             span.set_attribute("fractus.filters", [planned.action for planned in plan.filters])

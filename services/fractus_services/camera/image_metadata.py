@@ -8,10 +8,9 @@ import struct
 from dataclasses import replace
 from datetime import UTC, datetime
 
+from fractus_core.policy.footprint import camera_axes
 from PIL import Image
 from PIL.ExifTags import GPS, IFD, Base
-
-from fractus_core.policy.footprint import camera_axes
 
 from fractus_services.camera.pose import Pose
 

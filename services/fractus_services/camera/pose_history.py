@@ -113,6 +113,8 @@ class PoseHistory:
         gimbal: True if the attitudes are those of a gimbal.
     """
 
+    fixed = False
+
     def __init__(
         self, now: Callable[[], float], *, lens: Lens | None = None, relief_m: float = 0.0, gimbal: bool = False
     ) -> None:

@@ -10,14 +10,15 @@ from pathlib import Path
 from fractus_core.policy.decision_types import Call, Situation, Verdict
 from fractus_core.policy.picture_rules import remaining_filters
 from fractus_runtime import tracing
-from fractus_runtime.files import read_file
+from fractus_runtime.files import UnsuitableFile, read_file
 
 from fractus_services.background import Background
 from fractus_services.camera.face_detection import FaceDetector
 from fractus_services.camera.fair_queue import FairQueue
 from fractus_services.camera.filter_pipeline import FilterPlan, apply_filters
 from fractus_services.camera.image_authorization import ImageAuthorizer, situation_of
-from fractus_services.camera.image_store import ImageRecord, ImageStore, owner_of
+from fractus_services.camera.image_metadata import without_metadata
+from fractus_services.camera.image_store import ImageRecord, ImageStore, NoSuchImage, owner_of
 from fractus_services.camera.pixels import MAX_BYTES, decode_image, encode_jpeg
 from fractus_services.camera.pose import PoseProvider, is_upright
 from fractus_services.errors import PolicyDenied
@@ -80,8 +81,11 @@ class StoredImages:
         verdict = self._authorizer.authorize_stored(call, grant, record.poses, recorded, now)
         missing = remaining_filters(verdict.filters, record.filters)
         path = self._store.path(owner, name)
-        if not missing:
+        if not missing and (record.filters or self.locates(grant, record)):
             return verdict, record, path
+        if not missing:
+            data = without_metadata(await asyncio.to_thread(_read_image, path, name))
+            return verdict, replace(record, size_bytes=len(data)), data
         # Earlier filters may have made faces undetectable, so the face size of a filtered image counts as unknown.
         face_px = 0.0 if record.filters else record.face_px
         plan, noted = self._authorizer.plan_filters(
@@ -93,16 +97,29 @@ class StoredImages:
         self.authorize_transfer(current_grant() if current_grant else grant, owner, record)
         return replace(verdict, reason=noted.reason), record, data
 
-    def authorize_transfer(self, grant: ActiveGrant, owner: str, record: ImageRecord) -> None:
+    def locates(self, grant: ActiveGrant, record: ImageRecord) -> bool:
+        """Return True if a caller may get the position of an image.
+
+        The position of a filtered image is private, because a policy required the filter because of this position. Other positions
+        of a drone need the permission to call GetPosition.
+        """
+        if record.filters:
+            return False
+        return self._poses.fixed or self._authorizer.may_locate(grant, record.poses, self._now())
+
+    def authorize_transfer(
+        self, grant: ActiveGrant, owner: str, record: ImageRecord, *, has_position: bool = False
+    ) -> None:
         """Authorize an image again under the current policies. Call this before each part of the image is sent.
 
         Args:
             grant: Current Grant of the caller.
             owner: Owner of the image.
             record: Record that `retrieve` returned, with all filters that were applied.
+            has_position: True if reply or metadata contain the position of the image.
 
         Raises:
-            Refused: Current policies forbid the image, or require more filters than were applied.
+            Refused: Current policies forbid the image or its position, or require more filters than were applied.
         """
         if owner_of(grant) != owner:
             raise PolicyDenied(
@@ -116,6 +133,11 @@ class StoredImages:
             reason = f"{verdict.reason}, which was not required when this image was requested; request it again"
             refusal = Verdict("deny", None, "PrivacyZone", reason, verdict.policies)
             self._authorizer.enforce(call, grant, refusal, now)
+        if has_position and not self.locates(grant, record):
+            reason = (
+                "the image contains its position, and the component may no longer call GetPosition; request it again"
+            )
+            self._authorizer.enforce(call, grant, Verdict("deny", None, "MethodDenied", reason), now)
 
     async def _filter(self, owner: str, path: Path, plan: FilterPlan, record: ImageRecord) -> bytes:
         def render() -> bytes:
@@ -141,3 +163,15 @@ class StoredImages:
 
     def _now(self) -> Situation:
         return self._poses.situation(self._clock())
+
+
+def _read_image(path: Path, name: str) -> bytes:
+    """Read the file of an image.
+
+    Raises:
+        NoSuchImage: The image was deleted.
+    """
+    try:
+        return read_file(path, MAX_BYTES)
+    except (FileNotFoundError, UnsuitableFile):
+        raise NoSuchImage(f"image {name[:64]!r} was deleted") from None

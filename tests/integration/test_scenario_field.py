@@ -98,6 +98,36 @@ def test_scenario_field_violating_program_is_corrected_and_owner_settings_surviv
         assert (out / name).stat().st_size > 1000
 
 
+def test_scenario_field_interrupted_run_names_the_command_that_restores_the_vehicle(tmp_path: Path):
+    link = f"tcp:127.0.0.1:{free_port()}"
+    guest = f"tcp:127.0.0.1:{free_port()}"
+    home = ("--home", f"{HOME[0]},{HOME[1]},584", "--ready-after", "5", "--speedup", SPEEDUP)
+    with running_vehicle(*home, *parameter_arguments(), links=(link, guest)):
+        upload_lists(guest, HOME)
+        owner = read_settings(guest)
+        interrupted = scenario(link, tmp_path, "--run", "normal")
+        until_printed(interrupted, "run: normal")
+        log = tmp_path / "field/normal/logs/drone-1-mobility.log"
+        deadline = time.monotonic() + 60
+        while not (log.exists() and "failsafes: set" in log.read_text()):
+            assert time.monotonic() < deadline
+            time.sleep(0.2)
+        interrupted.send_signal(signal.SIGINT)
+        output = interrupted.communicate(timeout=60)[0]
+        assert interrupted.returncode != 0
+        assert "may still have settings of the experiment" in output
+        assert "--restore" in output
+        deadline = time.monotonic() + 120
+        restored = scenario(link, tmp_path, "--restore")
+        output = restored.communicate(timeout=120)[0]
+        while "is armed" in output and time.monotonic() < deadline:
+            restored = scenario(link, tmp_path, "--restore")
+            output = restored.communicate(timeout=120)[0]
+        assert restored.returncode == 0, output
+        assert "the settings of the owner are restored" in output
+        assert_owned(guest, owner)
+
+
 def test_scenario_field_missing_autopilot_is_reported_in_one_line(tmp_path: Path):
     link = f"tcp:127.0.0.1:{free_port()}"
     process = subprocess.run(

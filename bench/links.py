@@ -42,7 +42,6 @@ def main() -> int:
         report.add("drone_linked", cpu_percent(drone.pid, seconds))
         report.add("edge_linked", cpu_percent(edge.pid, seconds))
         report.add("memory", memory_mb(drone.pid)["private"])
-        drone.stop()
     return report.finish()
 
 

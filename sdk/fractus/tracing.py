@@ -25,6 +25,10 @@ CLOSE_TIMEOUT_S = 1.0
 """Maximum time for the export of the last spans when the program ends, in seconds."""
 
 
+UNTRACED = "/ConfirmAlive"
+"""Method without spans: the answer to a liveness request, once per second."""
+
+
 def collector(environment: Mapping[str, str]) -> str:
     """Return the collector's address from OpenTelemetry's standard variables, or an empty string if tracing is off."""
     disabled = environment.get("OTEL_SDK_DISABLED", "").strip().lower() == "true"
@@ -92,6 +96,8 @@ class _TracedChannel:
 
     def unary_unary(self, method: str, *args: Any, **options: Any) -> Callable[..., Any]:
         """Return a callable for a method with one response."""
+        if method.endswith(UNTRACED):
+            return self._channel.unary_unary(method, *args, **options)  # type: ignore[no-any-return]
         return self._traced(method, self._channel.unary_unary(method, *args, **options))
 
     def unary_stream(self, method: str, *args: Any, **options: Any) -> Callable[..., Any]:

@@ -8,7 +8,7 @@ import os
 import time
 from collections import Counter
 from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine
-from contextlib import asynccontextmanager
+from contextlib import AbstractContextManager, asynccontextmanager, nullcontext
 from typing import Any
 
 import grpc
@@ -51,6 +51,9 @@ Clients send both together, but a bad link may delay the message.
 
 STOP_TIMEOUT_S = 2.0
 """Time for which open calls may continue when the server stops."""
+
+UNTRACED = frozenset({"fractus.v1.MobilityService/ConfirmAlive"})
+"""Methods without spans: the answer to a liveness request, once per second."""
 
 _MAX_COUNTED = 1_000
 
@@ -188,7 +191,10 @@ class CallAdmission(grpc.aio.ServerInterceptor):  # type: ignore[misc]  # grpc h
         unsent: Counter[str] = Counter()
 
         async def behaviour(_requests: Any, context: Any) -> Any:
-            with tracing.server_span(method, context.invocation_metadata(), grpc.aio.AbortError):
+            span: AbstractContextManager[None] = nullcontext()
+            if method not in UNTRACED:
+                span = tracing.server_span(method, context.invocation_metadata(), grpc.aio.AbortError)
+            with span:
                 body = await self._received(unsent, context)
                 try:
                     request = None if body is grpc.aio.EOF else decode(body)

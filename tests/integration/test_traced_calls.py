@@ -143,6 +143,9 @@ async def test_corrected_goto_is_one_trace_from_the_sdk_to_the_autopilot(rig: Ri
     assert control_stream.attributes["rpc.grpc.status_code"] in {0, 1}
     armed = collector.find(f"{MOBILITY}/Arm", SERVER)
     assert parts(collector, armed, "autopilot.COMPONENT_ARM_DISARM")
+    assert not [s for s in collector.spans if s.name.endswith("ConfirmAlive")], (
+        "answers to liveness requests have spans"
+    )
     lat, lon = (f"{value:.3f}" for value in FRAME.latlon(0, 8))
     content = "".join(str(s.span) for s in collector.spans)
     assert lat not in content and lon not in content, "a span contains a position"

@@ -1,10 +1,11 @@
 """The whole mobility service on the simulated vehicle in virtual time: random flights on bad links, checked by an oracle.
 
 Each seed is one flight (tests/component/closed_loop.py) with zones and limits, a vehicle of another owner, and wind.
-The link delays frames by up to 0.25 s each way with jitter, loses up to 10 % of them, and is interrupted. The GPS is
-wrong for some seconds. Some zones and limits are added while the driver flies or during the return flight. The oracle
-knows the true position of the vehicle. It reports every breach of a zone or limit that the documented guarantee rules
-out.
+The link delays frames by up to 0.25 s each way with jitter, loses up to 10 % of them, and is interrupted. The
+position has a fault: a wrong GPS, a wrong second GPS, a jump of the estimate, a wrong barometer, or a slow drift. Some
+zones and limits are added while the driver flies or during the return flight. The oracle knows the true position of the
+vehicle. It reports every breach of a zone or limit that the documented guarantee rules out. A drift that no sign shows
+may lead the drone into a zone by as much as the position is wrong.
 """
 
 from __future__ import annotations

@@ -5,7 +5,8 @@ jerk-limited motion in steps of 50 ms, with wind, latency and position errors in
 reports drones in forbidden places. It also reports a corrected target if the engine would not allow it unchanged, or if
 it lies inside a margin. Vehicles differ in acceleration and return altitude, and ground stations change both parameters
 in flight. After the requests, some drones return under the system like in the mobility service, and some under their
-autopilot (tests/component/return_flights.py). The motion monitor checks some of the flights and must not stop them.
+autopilot (tests/component/return_flights.py). The motion monitor checks some of the flights and must not stop them. The position
+of some drones fails on a leg: GPS wrong, second GPS wrong, or a jump of the estimate (tests/component/position_fault_flights.py).
 
 A case is one request of one drone under one set of policies. Each drone makes three requests, two of them in flight. In
 addition, vehicles with missing, absent and unusual parameters are armed (tests/component/parameter_faults.py).
@@ -22,6 +23,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "component"))
 from harness import Progress, Report, parser
 from parameter_faults import parameter_faults
 from policy_flights import Tally, flights
+from position_fault_flights import PositionFaultFlights
 from return_flights import ReturnFlights
 
 DRONES = 500
@@ -29,6 +31,7 @@ REQUESTS = 3
 WATCH_EVERY = 8
 WATCHED = 12
 HOME_EVERY = 8
+FAULT_EVERY = 5
 VEHICLES = 100
 
 
@@ -44,7 +47,10 @@ def main() -> int:
     seed = options.seed
     while total.requests < cases:
         returns = ReturnFlights(seed, HOME_EVERY)
-        batch = flights(seed, DRONES, requests=REQUESTS, watch_every=WATCH_EVERY, watched=WATCHED, returns=returns)
+        faults = PositionFaultFlights(seed, FAULT_EVERY)
+        batch = flights(
+            seed, DRONES, requests=REQUESTS, watch_every=WATCH_EVERY, watched=WATCHED, returns=returns, faults=faults
+        )
         batch.wrong += parameter_faults(seed, VEHICLES)
         vehicles += VEHICLES
         total.add(batch)
@@ -55,7 +61,7 @@ def main() -> int:
         progress.show(
             total.requests,
             f"{total.permitted:,} permitted ({total.corrected:,} corrected, {total.braked:,} after a stop), {total.taken:,} takeovers,"
-            f" {total.system_returns:,} flights home ({total.autopilot_returns:,} by the autopilot), {vehicles:,} arming requests,"
+            f" {total.system_returns:,} flights home ({total.autopilot_returns:,} by the autopilot), {total.position_faults:,} position faults, {vehicles:,} arming requests,"
             f" {len(total.wrong)} wrong, {len(total.stopped)} stopped (seed {seed})",
         )
         seed += 1
@@ -63,7 +69,7 @@ def main() -> int:
     report.add(
         "wrong", len(total.wrong), cases=total.requests, permitted=total.permitted, corrected=total.corrected,
         braked=total.braked, takeovers=total.taken, changed=total.changed, homeward=total.system_returns,
-        alone=total.autopilot_returns, vehicles=vehicles,
+        alone=total.autopilot_returns, faults=total.position_faults, vehicles=vehicles,
     )  # fmt: skip
     report.add("stopped", len(total.stopped), shortened=total.shortened)
     return report.finish()

@@ -197,6 +197,11 @@ class Estimator:
         self._shift = (0.0, 0.0)
         return north, east, -self.altitude.take_reset()
 
+    def reset_position(self, north_m: float, east_m: float) -> None:
+        """Move the estimate by an offset at once, as a change of the lane may."""
+        self._shift = (self._shift[0] + north_m, self._shift[1] + east_m)
+        self._gps_error = (self._gps_error[0] + north_m, self._gps_error[1] + east_m)
+
     def _follow_gps(self, time_s: float) -> None:
         """Follow the GPS position, or reject it while it is too far away. After a long rejection, jump to it."""
         glitch_n, glitch_e = self.gps_receivers.error

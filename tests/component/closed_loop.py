@@ -74,6 +74,34 @@ JERK_MPS3 = 5.0
 """ArduCopter's PSC_JERK_XY. It limits how fast the vehicle can reduce its acceleration."""
 
 
+JUMP_SWERVE_M = 2.0
+JUMP_SWERVE_MPS = 20.0
+"""Distance from docs/mobility.md by which a drone may leave its course when its estimate jumps, without delay and per second of it."""
+
+DRIFT_MPS = 0.5
+"""Speed of a GPS position that drifts. GPS and estimate drift together, so that no sign shows the fault."""
+
+
+@dataclass(frozen=True)
+class PositionFault:
+    """Fault of the position in flight.
+
+    Attributes:
+        kind: `glitch`: the GPS is wrong. `second`: one of two GPS receivers is wrong. `jump`: the estimate is reset to a wrong
+            position. `altitude`: the barometer is wrong. `drift`: the GPS drifts slowly, and does not return.
+        at_s: Begin, after the start of the flight.
+        lasting_s: Duration.
+        north_m, east_m, up_m: Error of the position.
+    """
+
+    kind: str
+    at_s: float
+    lasting_s: float
+    north_m: float = 0.0
+    east_m: float = 0.0
+    up_m: float = 0.0
+
+
 @dataclass(frozen=True)
 class Weather:
     """Environment of a flight.
@@ -88,7 +116,7 @@ class Weather:
         claimed_error_m: Position error reported by the GPS. If None, the GPS reports the actual error.
         speedup: Speed of the vehicle's clock relative to the clock of the service.
         cut: Begin and duration of the link outage, if any.
-        glitch: Begin and duration of a wrong GPS position, and its error north and east in metres, if any.
+        fault: Fault of the position, if any.
         stall: Process ("service" or "vehicle") that stalls every few seconds, and the duration of each stall.
     """
 
@@ -101,7 +129,7 @@ class Weather:
     claimed_error_m: float | None = None
     speedup: int = 1
     cut: tuple[float, float] | None = None
-    glitch: tuple[float, float, float, float] | None = None
+    fault: PositionFault | None = None
     stall: tuple[str, float] | None = None
 
 
@@ -171,6 +199,9 @@ class Sky(Loop):
         wind = {"SIM_WIND_SPD": weather.wind_mps, "SIM_WIND_DIR": float(seed % 360), "SIM_WIND_TURB": weather.gusts_mps}
         claimed_m = abs(weather.error_m) if weather.claimed_error_m is None else weather.claimed_error_m
         wind["SIM_GPS_ACC"] = max(claimed_m, 0.3)
+        if weather.fault is not None and weather.fault.kind == "second":
+            # First receiver, mean of both, and the one with more satellites.
+            wind |= {"GPS2_TYPE": 1.0, "SIM_GPS2_DISABLE": 0.0, "GPS_AUTO_SWITCH": float((0, 2, 1)[seed % 3])}
         config = VehicleConfig(start=place, seed=seed, ready_after_s=2.0, parameters=wind | parameters)
         self.simulation = Simulation([config])
         self.craft = self.simulation.crafts[0]
@@ -306,6 +337,19 @@ class Oracle:
         x, y = FRAME.xy(truth.lat_e7 / 1e7, truth.lon_e7 / 1e7)
         return float(x), float(y) + self._sky.weather.error_m, -self._sky.truth.body.down
 
+    def undetected_m(self) -> float:
+        """Return by how far the drone may be from where it must be, because of a fault that no sign shows or only its effect."""
+        fault = self._sky.weather.fault
+        if fault is None:
+            return 0.0
+        if fault.kind == "drift":
+            truth = self._sky.truth
+            return math.hypot(*truth.true_place.vector_to(truth.place)[:2])
+        if fault.kind != "jump":
+            return 0.0
+        weather = self._sky.weather
+        return JUMP_SWERVE_M + JUMP_SWERVE_MPS * 1.5 * (weather.uplink_s + weather.downlink_s)
+
     def speeds(self) -> tuple[float, float]:
         """Return the true ground speed and climb rate in m/s."""
         body = self._sky.truth.body
@@ -378,9 +422,11 @@ class Oracle:
                 wall.excused = inside or wall.box.distance(point) < 0.5 * self.unavoidable_m() + 2.0
             elif inside:
                 depth = float(wall.box.exterior.distance(point))
+                if depth <= self.undetected_m():
+                    continue
                 self._account.depth_m = max(self._account.depth_m, depth)
                 self._wrong(f"zone {number}", f"{depth:.1f} m deep at ({x:.0f}, {y:.0f}, {height:.0f})")
-        if not self.arena.contains(point):
+        if self.arena.distance(point) > self.undetected_m():
             self._wrong("area", f"outside by {self.arena.distance(point):.1f} m")
         speed, climb = self.speeds()
         settled, slowed = (
@@ -696,10 +742,11 @@ class Flight:
         await self._until(lambda: self.account.flew)
         if self.weather.cut is not None:
             asyncio.get_running_loop().call_later(self.weather.cut[0], self._sever)
-        if self.weather.glitch is not None:
-            at_s, lasting_s, north_m, east_m = self.weather.glitch
-            self.sky.call_later(at_s, self._glitch, north_m, east_m)
-            self.sky.call_later(at_s + lasting_s, self._glitch, 0.0, 0.0)
+        fault = self.weather.fault
+        if fault is not None:
+            self.sky.call_later(fault.at_s, self._begin_fault, fault)
+            if fault.kind != "drift":
+                self.sky.call_later(fault.at_s + fault.lasting_s, self._set_error, fault, 0.0)
         for _ in range(chance.randrange(6)):
             await asyncio.sleep(chance.uniform(2, 30))
             if chance.random() < 0.15:
@@ -710,11 +757,28 @@ class Flight:
                 self.add_limit()
             self.drone.grants.put(self.spec())
 
-    def _glitch(self, north_m: float, east_m: float) -> None:
+    def _begin_fault(self, fault: PositionFault) -> None:
+        self.account.events.append(f"{self.sky.time() - 1000:7.2f} position fault {fault}")
+        if fault.kind == "jump":
+            self.sky.truth.estimator.reset_position(fault.north_m, fault.east_m)
+        elif fault.kind == "drift":
+            self._drift(fault, self.sky.time())
+        else:
+            self._set_error(fault, 1.0)
+
+    def _drift(self, fault: PositionFault, began_s: float) -> None:
+        lasted_s = self.sky.time() - began_s
+        self._set_error(fault, min(lasted_s / fault.lasting_s, 1.0))
+        if lasted_s < fault.lasting_s:
+            self.sky.call_later(0.5, self._drift, fault, began_s)
+
+    def _set_error(self, fault: PositionFault, share: float) -> None:
+        """Set the sensors to a share of the error of a fault."""
         params = self.sky.truth.params
-        params.assign("SIM_GPS_GLITCH_X", north_m / METRES_PER_DEG)
-        params.assign("SIM_GPS_GLITCH_Y", east_m / METRES_PER_DEG / math.cos(math.radians(FRAME.lat)))
-        self.account.events.append(f"{self.sky.time() - 1000:7.2f} GPS wrong by {north_m:.0f}, {east_m:.0f}")
+        prefix = "SIM_GPS2_GLTCH" if fault.kind == "second" else "SIM_GPS_GLITCH"
+        params.assign(f"{prefix}_X", share * fault.north_m / METRES_PER_DEG)
+        params.assign(f"{prefix}_Y", share * fault.east_m / METRES_PER_DEG / math.cos(math.radians(FRAME.lat)))
+        params.assign("SIM_BARO_GLITCH", share * fault.up_m)
 
     def _sever(self) -> None:
         assert self.weather.cut is not None
@@ -729,19 +793,32 @@ class Flight:
         self.account.events.append(f"{self.sky.time() - 1000:7.2f} link restored")
 
 
+def position_fault_of(seed: int, share: float = 0.2) -> PositionFault | None:
+    """Return the position fault of a share of the seeds."""
+    chance = random.Random(seed * 13 + 3)
+    if chance.random() >= share:
+        return None
+    kind = chance.choice(["glitch", "glitch", "second", "jump", "altitude", "drift"])
+    at_s = chance.uniform(3, 60)
+    angle = chance.uniform(0, 2 * math.pi)
+    # A longer fault may never be undone. The drone then lands, which may lead it into a zone below.
+    lasting_s = chance.uniform(1, 15)
+    wrong_m = chance.uniform(8, 80)
+    if kind == "altitude":
+        return PositionFault(kind, at_s, lasting_s, up_m=math.copysign(chance.uniform(12, 30), chance.uniform(-1, 1)))
+    if kind == "drift":
+        lasting_s = chance.uniform(10, 60)
+        wrong_m = DRIFT_MPS * lasting_s
+    return PositionFault(kind, at_s, lasting_s, wrong_m * math.cos(angle), wrong_m * math.sin(angle))
+
+
 def weather_of(seed: int) -> Weather:
     """Return the environment for a seed."""
     chance = random.Random(seed * 7 + 1)
     bad = chance.random() < 0.7
     cut = (chance.uniform(3, 60), chance.uniform(0.5, 8)) if chance.random() < 0.15 else None
-    fault = random.Random(seed * 13 + 3)
-    glitch = None
-    # The autopilot alone does not stop for a glitch: its failsafe returns on the wrong position.
-    if cut is None and fault.random() < 0.15:
-        wrong_m = fault.uniform(8, 80)
-        angle = fault.uniform(0, 2 * math.pi)
-        # A longer glitch may never be undone. The drone then lands, which may lead it into a zone below.
-        glitch = fault.uniform(3, 60), fault.uniform(1, 15), wrong_m * math.cos(angle), wrong_m * math.sin(angle)
+    # The autopilot alone does not stop for a wrong position: its failsafe returns on it.
+    fault = position_fault_of(seed) if cut is None else None
     return Weather(
         uplink_s=chance.uniform(0, 0.25) if bad else 0.0,
         downlink_s=chance.uniform(0, 0.25) if bad else 0.0,
@@ -749,7 +826,7 @@ def weather_of(seed: int) -> Weather:
         wind_mps=chance.choice([0.0, 0.0, 3.0, 6.0]),
         gusts_mps=chance.choice([0.0, 1.0]),
         cut=cut,
-        glitch=glitch,
+        fault=fault,
     )
 
 

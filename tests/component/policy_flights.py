@@ -609,6 +609,7 @@ class Tally:
         changed: Number of vehicles whose parameters another station changed in flight.
         system_returns: Number of return flights by the system.
         autopilot_returns: Number of return flights by the autopilot.
+        position_faults: Number of simulated faults of the position.
     """
 
     requests: int = 0
@@ -620,6 +621,7 @@ class Tally:
     changed: int = 0
     system_returns: int = 0
     autopilot_returns: int = 0
+    position_faults: int = 0
     wrong: list[str] = field(default_factory=list)
     stopped: list[str] = field(default_factory=list)
     """Permitted flights that the monitor stopped."""
@@ -638,6 +640,7 @@ def flights(
     watch_every: int = 0,
     watched: int = 1,
     returns: Returns | None = None,
+    faults: Faults | None = None,
 ) -> Tally:
     """Fly a fleet through random scenes, each drone with several requests, and report violations.
 
@@ -649,6 +652,7 @@ def flights(
         watch_every: Number of steps between two checks by the motion monitor. 0 disables the monitor.
         watched: The monitor checks every `watched`-th drone.
         returns: Return flights, or None.
+        faults: Faults of the position, or None.
     """
     rng = np.random.default_rng(seed)
     scenes = [s for s in (scene(rng) for _ in range(math.ceil(count / shared))) for _ in range(shared)][:count]
@@ -671,6 +675,8 @@ def flights(
             if returns is not None and fleet.time_s >= called_s:
                 called_s = math.inf
                 returns.fly_by_system(fleet, exempt, tally)
+            if faults is not None and turn and n == FAULT_STEP:
+                faults.fly(fleet, exempt, tally)
             if (
                 turn == requests - 1
                 and math.isinf(called_s)
@@ -690,6 +696,17 @@ def flights(
     if returns is not None:
         returns.fly_by_autopilot(fleet, exempt, tally)
     return tally
+
+
+FAULT_STEP = 30
+"""Step after a request at which positions fail. Most requests have taken effect, and most drones still fly."""
+
+
+class Faults(Protocol):
+    """Simulator of faults of the position. The given fleet is not changed."""
+
+    def fly(self, fleet: Fleet, exempt: Flags, tally: Tally) -> None:
+        """Let the position of some flying drones fail."""
 
 
 class Returns(Protocol):

@@ -5,11 +5,12 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from closed_loop import Weather, flight, weather_of
+from closed_loop import Weather, flight, position_fault_of, weather_of
 from depth import cells, examples
 from fractus_services.mobility.flight import monitor as monitor_module
 
@@ -25,6 +26,20 @@ def test_random_flight_violates_no_rule(seed: int, tmp_path: Path) -> None:
 def test_random_flight_with_faster_simulator_violates_no_rule(seed: int, speedup: int, tmp_path: Path) -> None:
     account = flight(seed, tmp_path, replace(weather_of(seed), loss=0.0, cut=None, speedup=speedup))
     assert account.wrong == [], "\n".join(account.events)
+
+
+@pytest.mark.parametrize("kind", cells(["glitch", "second", "jump", "altitude", "drift"], quick=["jump", "drift"]))
+def test_random_flight_with_position_fault_violates_no_rule(kind: str, tmp_path: Path) -> None:
+    seeds = (seed for seed in itertools.count(1) if fault_kind(seed) == kind)
+    for seed in itertools.islice(seeds, examples(6, 1)):
+        account = flight(seed, tmp_path, replace(weather_of(seed), cut=None, fault=position_fault_of(seed, 1.0)))
+        assert account.wrong == [], "\n".join(account.events)
+
+
+def fault_kind(seed: int) -> str:
+    fault = position_fault_of(seed, 1.0)
+    assert fault is not None
+    return fault.kind
 
 
 def test_oracle_detects_missing_monitor(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -25,6 +25,7 @@ from hypothesis import strategies as st
 from parameter_faults import parameter_faults
 from policy_flights import CORNERS, EAST_M, LIMIT, NORTH_M, ZONES, Fleet, Scene, excused, flights
 from policy_world import HOME, Corners, altitude, ask, at, compiled, exclusion, goto, inclusion, ring, target
+from position_fault_flights import PositionFaultFlights
 from return_flights import ReturnFlights
 
 STEP_S = 0.05
@@ -331,3 +332,16 @@ def test_oracle_finds_no_permitted_flight_stopped_by_monitor(seed: int) -> None:
 def test_oracle_detects_monitor_that_stops_permitted_flights(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(policy_flights, "monitor", lambda now, grant, **_: monitor(now, grant))
     assert flights(seed=7, count=64, requests=2, watch_every=3).stopped
+
+
+def test_position_fault_on_permitted_leg_breaches_no_fence() -> None:
+    tally = flights(3, 64, requests=2, faults=PositionFaultFlights(3, 1))
+    assert tally.position_faults > 10
+    assert tally.wrong == []
+
+
+def test_oracle_detects_drone_that_does_not_stop_after_jump_of_position(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Fleet, "stop", lambda _fleet, _rows: None)
+    assert any(
+        "left its course" in text for text in flights(3, 64, requests=2, faults=PositionFaultFlights(3, 1)).wrong
+    )

@@ -17,6 +17,8 @@ from fractus_vehicle.rtl import ReturnToLaunch
 from fractus_vehicle.spline import SplineLeg
 from fractus_vehicle.state import CONTROL_STEP_S, VehicleState
 
+# Bit of MIS_OPTIONS: the mission goes on after a landing. Otherwise it does so only if it takes off again.
+CONTINUE_AFTER_LAND = 4
 # Waypoint commands that can be passed without a stop.
 CURVES = frozenset({mavlink.MAV_CMD_NAV_WAYPOINT, mavlink.MAV_CMD_NAV_SPLINE_WAYPOINT})
 
@@ -47,23 +49,33 @@ class AutoFlight(Flight):
         return self._landing or (self._returning is not None and self._returning.landing)
 
     def begin(self, v: VehicleState) -> None:
-        """Hold position. The mission starts in the first step with running motors."""
+        """Hold position. The mission starts in the first step with running motors. A completed one starts again."""
         v.control.hold_position()
         v.heading.follow_course()
+        if v.mission.complete:
+            v.mission.rewind()
 
     def _start(self, v: VehicleState) -> None:
         """Start the mission at its current item, or at its beginning."""
         self._started = True
         mission = v.mission
-        if mission.complete or int(v.params["MIS_RESTART"]) == 1 or mission.current == 0:
+        if int(v.params["MIS_RESTART"]) == 1 or mission.current == 0:
             mission.rewind()
             self._start_from(v, mission.next_after(0))
         else:
             self._start_from(v, mission.current)
 
     def wait(self, v: VehicleState) -> None:
-        """Report the first item of the mission in a STATUSTEXT while the motors are off."""
-        if not self._announced and v.origin is not None:
+        """Report the first item of the mission in a STATUSTEXT while the motors are off.
+
+        A mission that was running when the motors stopped was reset. It waits at its first item.
+        """
+        if self._started:
+            self._started = False
+            self._announced = False
+            self._item = self._leg = self._returning = None
+            self._landing = False
+        if not self._announced and v.origin is not None and not v.mission.complete:
             self._announced = True
             self._announce(v)
 
@@ -219,23 +231,22 @@ class AutoFlight(Flight):
         if not self._landing and math.hypot(north - v.est.north, east - v.est.east) < 2.0:
             self._landing = True
             v.touch_time_s = 0.0
-        if self._landing:
-            descend(v)
-            self._finish_if_down(v)
+        if not self._landing:
+            return
+        goes_on = v.mission.takes_off(self._index + 1) or bool(int(v.params["MIS_OPTIONS"]) & CONTINUE_AFTER_LAND)
+        # The motors stop, and the mission is reset, before this item is complete. It is therefore not reported.
+        descend(v, disarm=not goes_on)
+        if goes_on and v.landed:
+            self._landing = False
+            v.item_reached = self._index
+            self._start_from(v, v.mission.next_after(self._index))
 
     def _finish_if_down(self, v: VehicleState) -> None:
-        """Complete a landing or return item if the motors have stopped.
-
-        The next item begins when the motors start again.
-        """
+        """Complete a return item if the motors have stopped."""
         if v.armed:
             return
-        self._item = None
         v.item_reached = self._index
-        following = v.mission.next_after(self._index)
-        v.mission.complete = following is None
-        if following is not None:
-            v.mission.current = following
+        v.mission.complete = v.mission.peek_after(self._index) is None
 
     def _turn(self, v: VehicleState, item: Item) -> None:
         radius = min(max(abs(item.param3) or v.params["CIRCLE_RADIUS"] / 100.0, 1.0), 500.0)

@@ -10,8 +10,13 @@ from fractus_vehicle.state import CONTROL_STEP_S, VehicleState
 LANDING_CONFIRMED_S = 1.0
 
 
-def descend(v: VehicleState) -> None:
-    """Descend for one control step as in LAND: fast at first, slowly below LAND_ALT_LOW. Disarm after touchdown."""
+def descend(v: VehicleState, *, disarm: bool = True) -> None:
+    """Descend for one control step as in LAND: fast at first, slowly below LAND_ALT_LOW. Stop the motors after touchdown.
+
+    Args:
+        v: State of the vehicle.
+        disarm: False to keep the motors running after touchdown, for a mission that takes off again.
+    """
     p = v.params
     slow = p["LAND_SPEED"] / 100.0
     high = (p["LAND_SPEED_HIGH"] / 100.0) or v.control.limits.sink_mps
@@ -25,6 +30,7 @@ def descend(v: VehicleState) -> None:
         v.touch_time_s += CONTROL_STEP_S
         if v.touch_time_s >= LANDING_CONFIRMED_S:
             v.land_complete()
-            v.disarm()
+            if disarm:
+                v.disarm()
     else:
         v.touch_time_s = 0.0

@@ -32,19 +32,23 @@ class Mission:
         """The stored items."""
         return self.store.items
 
-    def rewind(self) -> None:
-        """Reset to the beginning of the mission."""
+    def reset(self) -> None:
+        """Go back to the beginning. A completed mission stays complete until it is started again."""
         self.current = 0
-        self.complete = False
         self._jumps.clear()
+
+    def rewind(self) -> None:
+        """Go back to the beginning of a mission that is not complete."""
+        self.reset()
+        self.complete = False
 
     def first_navigating(self, index: int) -> int | None:
         """Return the index of the first NAV item at or after `index`, excluding home, or None."""
         return next((at for at in range(max(index, 1), len(self.items)) if self.items[at].navigates), None)
 
-    def takes_off(self, *, restart: bool) -> bool:
-        """Return True if the first NAV item to execute is a takeoff. Delays are skipped."""
-        at = self.first_navigating(0 if restart else self.current)
+    def takes_off(self, index: int) -> bool:
+        """Return True if the first NAV item at or after `index` is a takeoff. Delays are skipped."""
+        at = self.first_navigating(index)
         while at is not None and self.items[at].command == mavlink.MAV_CMD_NAV_DELAY:
             at = self.first_navigating(at + 1)
         return at is not None and self.items[at].command == mavlink.MAV_CMD_NAV_TAKEOFF

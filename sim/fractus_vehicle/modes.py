@@ -74,7 +74,7 @@ class FlightModes:
         v = self._state
         if len(v.mission.items) <= 1:
             return False
-        if v.landed and not v.mission.takes_off(restart=int(v.params["MIS_RESTART"]) == 1):
+        if v.landed and not v.mission.takes_off(0 if int(v.params["MIS_RESTART"]) == 1 else v.mission.current):
             v.send_text(mavlink.MAV_SEVERITY_CRITICAL, "Auto: Missing Takeoff Cmd")
             return False
         return True

@@ -33,13 +33,11 @@ def replace_items(v: VehicleState, store: ItemStore, items: list[Item]) -> int:
 
 
 def clear_items(v: VehicleState, store: ItemStore) -> int:
-    """Clear a list. Return an error for a mission that is being flown."""
-    if (
-        store.kind == mavlink.MAV_MISSION_TYPE_MISSION
-        and v.armed
-        and v.mission.state(v.mode) == mavlink.MISSION_STATE_ACTIVE
-    ):
-        return mavlink.MAV_MISSION_ERROR
+    """Clear a list. Return an error for a mission that is active."""
+    if store.kind == mavlink.MAV_MISSION_TYPE_MISSION:
+        if v.mission.state(v.mode) == mavlink.MISSION_STATE_ACTIVE:
+            return mavlink.MAV_MISSION_ERROR
+        v.mission.reset()
     return replace_items(v, store, [])
 
 
@@ -49,8 +47,6 @@ def _accept(v: VehicleState, kind: int, items: list[Item]) -> int:
             if items and v.home is not None:
                 items[0] = home_item(v.home)
             v.params.assign("MIS_TOTAL", len(items))
-            if v.mode != mavlink.COPTER_MODE_AUTO:
-                v.mission.rewind()
         case mavlink.MAV_MISSION_TYPE_FENCE:
             try:
                 v.fence.shapes = build_shapes(_local(v, items))

@@ -267,10 +267,11 @@ class VehicleState:
     # -- motors and ground -------------------------------------------------------------------------------------
 
     def disarm(self, *, force: bool = False) -> None:
-        """Stop the motors."""
+        """Stop the motors. The mission then begins at its first item again."""
         if not self.armed:
             return
         self.armed = False
+        self.mission.reset()
         self.taking_off_until_m = None
         if force or self.landed:
             self.landed = self.landed or self.body.on_ground

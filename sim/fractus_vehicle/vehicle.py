@@ -65,7 +65,6 @@ class Vehicle:
         v.landed = True
         v.taking_off_until_m = None
         v.touch_time_s = 0.0
-        v.mission.complete = False
         if not v.home_locked and v.position_ok:
             set_home(v, v.place)
         v.control.reset(v.est)

@@ -418,3 +418,86 @@ def test_mission_legs_use_wpnav_jerk():
     assert max(speeds) == pytest.approx(10.0, abs=0.01)
     assert steps[-1] == pytest.approx(300.0)
     assert max(abs(b - a) for a, b in itertools.pairwise(speeds)) < 2.6 * 0.01
+
+
+SHORT = [HOME, {"command": 22, "frame": 3, "z": 6.0}, _waypoint(8.0, 0.0, 6.0), {"command": 20}]
+
+
+def _start_mission(pilot: Pilot) -> int:
+    """Arm in GUIDED and start the stored mission. Return the result of MISSION_START."""
+    vehicle = pilot.craft.vehicle.state
+    pilot.mode(mavlink.COPTER_MODE_GUIDED)
+    pilot.wait(lambda: not arming_refusals(vehicle), 5.0)
+    assert pilot.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1.0) == mavlink.MAV_RESULT_ACCEPTED
+    return pilot.command(mavlink.MAV_CMD_MISSION_START)
+
+
+def _current(pilot: Pilot) -> tuple[int, int]:
+    pilot.command(mavlink.MAV_CMD_REQUEST_MESSAGE, mavlink.MAVLINK_MSG_ID_MISSION_CURRENT)
+    message = pilot.last["MISSION_CURRENT"]
+    return message.integer("seq"), message.integer("mission_state")
+
+
+@pytest.mark.parametrize("replaced", [False, True])
+def test_completed_mission_is_flown_again_from_its_first_item(replaced: bool):
+    vehicle, pilot = alone()
+    upload(pilot, 0, SHORT)
+    assert _start_mission(pilot) == mavlink.MAV_RESULT_ACCEPTED
+    pilot.wait(lambda: not vehicle.armed, 90.0)
+    assert _current(pilot) == (0, mavlink.MISSION_STATE_COMPLETE)
+    if replaced:
+        upload(pilot, 0, SHORT)
+        assert _current(pilot) == (0, mavlink.MISSION_STATE_COMPLETE)
+    before = len(pilot.texts)
+    assert _start_mission(pilot) == mavlink.MAV_RESULT_ACCEPTED
+    assert "Mission: 1 Takeoff" in pilot.texts[before:]
+    pilot.wait(lambda: vehicle.altitude_m > 5.0, 20.0)
+    assert _current(pilot)[1] == mavlink.MISSION_STATE_ACTIVE
+
+
+def test_mission_that_was_left_in_flight_starts_at_its_first_item_after_landing():
+    vehicle, pilot = alone()
+    upload(pilot, 0, SHORT)
+    _start_mission(pilot)
+    pilot.wait(lambda: vehicle.mission.current == 2, 30.0)
+    pilot.mode(mavlink.COPTER_MODE_LAND)
+    pilot.wait(lambda: not vehicle.armed, 60.0)
+    assert _current(pilot) == (0, mavlink.MISSION_STATE_NOT_STARTED)
+    assert _start_mission(pilot) == mavlink.MAV_RESULT_ACCEPTED
+
+
+def test_landing_item_at_the_end_rewinds_the_mission_without_completing_it():
+    vehicle, pilot = alone()
+    upload(pilot, 0, [*SHORT[:3], {"command": 21, "frame": 3}])
+    _start_mission(pilot)
+    before = len(pilot.texts)
+    reached: list[int] = []
+    while vehicle.armed:
+        reached += [message.integer("seq") for message in pilot.step() if message.name == "MISSION_ITEM_REACHED"]
+    pilot.fly_on(0.5)
+    assert reached == [1, 2], "the landing item itself is not reported"
+    assert pilot.texts[before:][-2:] == ["Disarming motors", "Mission: 1 Takeoff"]
+    assert _current(pilot) == (1, mavlink.MISSION_STATE_ACTIVE)
+
+
+def test_landing_item_before_a_takeoff_item_continues_the_mission():
+    vehicle, pilot = alone()
+    upload(pilot, 0, [*SHORT[:3], {"command": 21, "frame": 3}, {"command": 93, "param1": 2.0}, *SHORT[1:]])
+    _start_mission(pilot)
+    pilot.wait(lambda: vehicle.mission.current == 4 and vehicle.landed, 60.0)
+    pilot.wait(lambda: vehicle.altitude_m > 5.0, 20.0)
+    assert vehicle.armed
+    assert "Disarming motors" not in pilot.texts
+
+
+def test_running_mission_cannot_be_cleared():
+    vehicle, pilot = alone()
+    upload(pilot, 0, SHORT)
+    pilot.wait(lambda: vehicle.origin is not None, 5.0)
+    pilot.mode(mavlink.COPTER_MODE_AUTO)
+    pilot.send("MISSION_CLEAR_ALL", {"target_system": 1, "target_component": 1})
+    assert pilot.expect("MISSION_ACK").integer("type") == mavlink.MAV_MISSION_ERROR
+    pilot.mode(mavlink.COPTER_MODE_GUIDED)
+    pilot.send("MISSION_CLEAR_ALL", {"target_system": 1, "target_component": 1})
+    assert pilot.expect("MISSION_ACK").integer("type") == mavlink.MAV_MISSION_ACCEPTED
+    assert _current(pilot) == (0, mavlink.MISSION_STATE_NO_MISSION)

@@ -17,6 +17,8 @@ MAX_ITEMS = {
     mavlink.MAV_MISSION_TYPE_FENCE: 70,
     mavlink.MAV_MISSION_TYPE_RALLY: 46,
 }
+# Lists whose items are stored one by one as they arrive. A fence is stored as a whole, when all of its items have arrived.
+STORED_BY_ITEM = frozenset({mavlink.MAV_MISSION_TYPE_MISSION, mavlink.MAV_MISSION_TYPE_RALLY})
 UPLOAD_TIMEOUT_S = 8.0
 RETRY_S = 1.0
 # STATUSTEXT sent when a list is stored.
@@ -49,7 +51,6 @@ class Upload:
     next: int
     last: int
     items: list[Item]
-    partial: bool
     received_s: float
     requested_s: float
     old_format: bool = False
@@ -137,7 +138,10 @@ class Transfers:
         elif not item_range:
             self._complete(channel, message, store, [])
         else:
-            partial = message.name == "MISSION_WRITE_PARTIAL_LIST"
+            kept = list(store.items)
+            if message.name == "MISSION_COUNT":
+                kept = kept[: len(item_range)] if store.kind in STORED_BY_ITEM else []
+                self._store_arrived(store, kept)
             self.uploads[store.kind] = up = Upload(
                 channel=channel,
                 sysid=message.sysid,
@@ -145,8 +149,7 @@ class Transfers:
                 kind=store.kind,
                 next=item_range.start,
                 last=item_range.stop - 1,
-                items=list(store.items) if partial else [],
-                partial=partial,
+                items=kept,
                 received_s=self.now_s,
                 requested_s=self.now_s,
             )
@@ -177,10 +180,8 @@ class Transfers:
             self._ack(channel, message, store.kind, verdict)
             return
         up.items[seq : seq + 1] = [item]
-        if store.kind == mavlink.MAV_MISSION_TYPE_MISSION and up.next < up.last:
-            # Each mission item is stored when it arrives. After an aborted upload, the mission consists of the received
-            # items only.
-            self._replace(store, list(up.items))
+        if up.next < up.last:
+            self._store_arrived(store, up.items)
         up.next += 1
         up.received_s = self.now_s
         if up.next <= up.last:
@@ -188,6 +189,14 @@ class Transfers:
             return
         del self.uploads[store.kind]
         self._complete(channel, message, store, up.items)
+
+    def _store_arrived(self, store: ItemStore, items: list[Item]) -> None:
+        """Store the items of an unfinished upload, if the list is stored item by item.
+
+        After an aborted upload, the list consists of the new items that arrived and the old items behind them.
+        """
+        if store.kind in STORED_BY_ITEM:
+            self._replace(store, list(items))
 
     def _complete(self, channel: Channel, message: Message, store: ItemStore, items: list[Item]) -> None:
         """Store a completed list and acknowledge it."""

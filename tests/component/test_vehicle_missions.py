@@ -108,7 +108,7 @@ def test_mission_item_with_float_coordinates_is_accepted():
     assert pilot.expect("MISSION_ITEM").real("x") == pytest.approx(48.2001, abs=1e-5)
 
 
-def test_stalled_upload_is_repeated_then_cancelled_without_changes():
+def test_stalled_upload_is_repeated_then_cancelled():
     vehicle, pilot = alone()
     upload(pilot, 0, MISSION)
     pilot.send("MISSION_COUNT", {"target_system": 1, "target_component": 1, "count": 3})
@@ -116,7 +116,25 @@ def test_stalled_upload_is_repeated_then_cancelled_without_changes():
     pilot.expect("MISSION_REQUEST", 2.0)
     pilot.expect("MISSION_ACK", 12.0)
     assert pilot.last["MISSION_ACK"].integer("type") != mavlink.MAV_MISSION_ACCEPTED
-    assert len(vehicle.mission.items) == len(MISSION)
+    assert len(vehicle.mission.items) == 3, "the mission was cut to the new length when the upload began"
+
+
+FIVE = [HOME, *(_waypoint(1.0, 0.0, 11.0 + at) for at in range(4))]
+RALLY = [{"command": 5100, "frame": 3, "x": START.lat_e7 + at, "y": START.lon_e7, "z": 10.0 + at} for at in range(5)]
+CIRCLES = [{"command": 5003, "x": START.lat_e7, "y": START.lon_e7, "param1": 50.0 + at} for at in range(5)]
+
+
+@pytest.mark.parametrize(("kind", "old", "arrived"), [(0, FIVE, 2), (2, RALLY, 2), (1, CIRCLES, 0)])
+def test_failed_upload_leaves_old_items_behind_the_new_ones(kind: int, old: list[dict[str, float]], arrived: int):
+    """A fence is replaced as a whole, so that a failed upload changes nothing."""
+    _, pilot = alone()
+    assert upload(pilot, kind, old) == mavlink.MAV_MISSION_ACCEPTED
+    before = _download(pilot, kind)
+    new = [item | {"x": START.lat_e7 + 500} for item in old]
+    assert upload(pilot, kind, [*new[:2], {"command": 4000, "frame": 3}, *new[3:]]) != mavlink.MAV_MISSION_ACCEPTED
+    after = _download(pilot, kind)
+    assert after[arrived:] == before[arrived:]
+    assert [item["x"] for item in after[1:arrived]] == [START.lat_e7 + 500] * max(arrived - 1, 0)
 
 
 @pytest.mark.parametrize(
@@ -168,7 +186,7 @@ def test_list_is_neither_read_nor_cleared_during_upload():
     ):
         pilot.send(name, target | more)
         assert pilot.expect("MISSION_ACK").integer("type") == result
-    assert len(vehicle.mission.items) == len(MISSION)
+    assert len(vehicle.mission.items) == 3, "the items that the upload has not replaced yet"
 
 
 def test_jump_tag_selects_tagged_item():

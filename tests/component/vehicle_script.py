@@ -490,12 +490,8 @@ class Player:
         return f"{mission_result(ack.integer('type'))} mt={ack.integer('mission_type')}"
 
     def do_stored(self, kind_name: str, bad: str = "") -> str:
-        """Return the number of stored items.
-
-        If `bad` is set, first upload a valid list, then the invalid list `bad`.
-        """
+        """Return the number of stored items. If `bad` is set, upload this invalid list first."""
         if bad:
-            self.do_upload(kind_name, "good")
             self.do_upload(kind_name, bad)
         self.connection.send("MISSION_REQUEST_LIST", TARGET | {"mission_type": KINDS[kind_name]})
         count = self._until("MISSION_COUNT", 2.0)

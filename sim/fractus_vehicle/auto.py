@@ -212,7 +212,6 @@ class AutoFlight(Flight):
             self._returning.step(v)
             self._finish_if_down(v)
             return
-        self._commands.step(v)
         if self._leg is not None:
             self._leg.step(v)
         if item.command == mavlink.MAV_CMD_NAV_LAND:
@@ -224,6 +223,7 @@ class AutoFlight(Flight):
             if item.command != mavlink.MAV_CMD_NAV_TAKEOFF:
                 v.send_text(mavlink.MAV_SEVERITY_INFO, f"Reached command #{self._index}")
             self._start_from(v, v.mission.next_after(self._index))
+        self._commands.step(v)
         v.heading.step(v.est, CONTROL_STEP_S)
 
     def _land(self, v: VehicleState) -> None:

@@ -21,31 +21,43 @@ class MissionCommands:
 
     def __init__(self) -> None:
         self._indices: deque[int] = deque()
-        self._begun_s: float | None = None
+        self._index: int | None = None
+        self._begun_s = 0.0
 
     def begin(self, v: VehicleState, indices: list[int]) -> None:
-        """Queue the commands that precede the current NAV command, and run them up to the first unmet condition."""
+        """Queue the commands that precede the current NAV command, and start the first one."""
         self._indices = deque(indices)
-        self._begun_s = None
+        self._index = None
         self.step(v)
 
     def step(self, v: VehicleState) -> None:
-        """Run commands up to the first unmet condition."""
-        while self._indices:
-            index = self._indices[0]
-            if index >= len(v.mission.items):
-                self._indices.clear()
-                return
-            item = v.mission.items[index]
-            if self._begun_s is None:
-                self._begun_s = v.time_s
-                v.send_text(mavlink.MAV_SEVERITY_INFO, f"Mission: {index} {title(item)}")
-                _do(v, item)
-            if not _fulfilled(v, item, v.time_s - self._begun_s):
-                return
-            self._indices.popleft()
-            self._begun_s = None
+        """Start the next command, or end the current one if its condition is met.
+
+        Each takes one step, as on ArduPilot. Otherwise, only the last one of several commands could be reported as
+        reached.
+        """
+        if self._index is None:
+            self._start_next(v)
+            return
+        index = self._index
+        if index >= len(v.mission.items):
+            self._index = None
+        elif _fulfilled(v, v.mission.items[index], v.time_s - self._begun_s):
+            self._index = None
             v.item_reached = index
+
+    def _start_next(self, v: VehicleState) -> None:
+        if not self._indices:
+            return
+        index = self._indices.popleft()
+        if index >= len(v.mission.items):
+            self._indices.clear()
+            return
+        self._index = index
+        self._begun_s = v.time_s
+        item = v.mission.items[index]
+        v.send_text(mavlink.MAV_SEVERITY_INFO, f"Mission: {index} {title(item)}")
+        _do(v, item)
 
 
 def _fulfilled(v: VehicleState, item: Item, waited_s: float) -> bool:

@@ -103,7 +103,8 @@ class VehicleState:
         self.breadcrumbs = Breadcrumbs(self.params, self.send_text)
         self.heading = Heading(self.control, self.params)
         self.gimbal = Gimbal(int(self.params["MNT1_TYPE"]))
-        self.item_reached: int | None = None  # last reached mission item, reported at the end of a step
+        self.item_reached: int | None = None  # mission item reached in this step, reported at its end
+        self.last_item_reached: int | None = None
         self.impacts_reported = 0
         self.impact_reported_s = -math.inf
         self.receiver = Receiver(config.throttle_us)

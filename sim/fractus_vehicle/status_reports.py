@@ -136,6 +136,11 @@ def mission_current(v: VehicleState) -> Values:
     }
 
 
+def mission_item_reached(v: VehicleState) -> Values:
+    """Build MISSION_ITEM_REACHED: the last reached item, or 65535 if no item was reached since the start."""
+    return {"seq": UNKNOWN_U16 if v.last_item_reached is None else v.last_item_reached}
+
+
 def hwstatus(_v: VehicleState) -> Values:
     """Build HWSTATUS."""
     return {"Vcc": 5000, "I2Cerr": 0}

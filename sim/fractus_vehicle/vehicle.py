@@ -16,7 +16,7 @@ from fractus_vehicle.readiness import arming_refusals
 from fractus_vehicle.report_units import UNKNOWN_U16
 from fractus_vehicle.settings import LIMIT_PREFIXES, set_battery, set_fence, set_limits, set_wind
 from fractus_vehicle.state import CONTROL_STEP_S, VehicleConfig, VehicleState
-from fractus_vehicle.telemetry import attach, follow_rate, send_parameter, serve
+from fractus_vehicle.telemetry import attach, follow_rate, send_on_all, send_parameter, serve
 from fractus_vehicle.transfers import Transfers
 
 # Modes that disarm immediately after landing.
@@ -93,8 +93,9 @@ class Vehicle:
             end_motor_test(v)
             self._report_while_disarmed()
         if v.item_reached is not None:
-            v.broadcast("MISSION_ITEM_REACHED", {"seq": v.item_reached})
+            v.last_item_reached = v.item_reached
             v.item_reached = None
+            send_on_all(v, "MISSION_ITEM_REACHED")
         move(v)
         v.gimbal.step(CONTROL_STEP_S)
         if self.transfers.uploads:

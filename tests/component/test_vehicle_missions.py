@@ -519,3 +519,32 @@ def test_running_mission_cannot_be_cleared():
     pilot.send("MISSION_CLEAR_ALL", {"target_system": 1, "target_component": 1})
     assert pilot.expect("MISSION_ACK").integer("type") == mavlink.MAV_MISSION_ACCEPTED
     assert _current(pilot) == (0, mavlink.MISSION_STATE_NO_MISSION)
+
+
+def test_commands_that_end_one_after_another_are_all_reported_as_reached():
+    vehicle, pilot = airborne(10.0)
+    speed = {"command": 178, "param1": 1.0, "param2": 4.0}
+    upload(
+        pilot,
+        0,
+        [HOME, _waypoint(5.0, 0.0, 10.0), {"command": 112, "param1": 1.0}, speed, speed, _waypoint(40.0, 0.0, 10.0)],
+    )
+    pilot.mode(mavlink.COPTER_MODE_AUTO)
+    reached: list[int] = []
+    while vehicle.mission.state(vehicle.mode) != mavlink.MISSION_STATE_COMPLETE:
+        reached += [message.integer("seq") for message in pilot.step() if message.name == "MISSION_ITEM_REACHED"]
+    assert reached == [1, 2, 3, 4, 5]
+
+
+def test_last_reached_item_is_repeated_at_a_requested_interval():
+    _, pilot = airborne(10.0)
+    reached = mavlink.MAVLINK_MSG_ID_MISSION_ITEM_REACHED
+    pilot.command(mavlink.MAV_CMD_REQUEST_MESSAGE, reached)
+    assert pilot.last["MISSION_ITEM_REACHED"].integer("seq") == 65535, "no item has been reached"
+    upload(pilot, 0, [HOME, _waypoint(5.0, 0.0, 10.0), _waypoint(60.0, 0.0, 10.0)])
+    pilot.mode(mavlink.COPTER_MODE_AUTO)
+    pilot.expect("MISSION_ITEM_REACHED", 20.0)
+    pilot.command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, reached, 200_000)
+    repeated = [m.integer("seq") for _ in range(200) for m in pilot.step() if m.name == "MISSION_ITEM_REACHED"]
+    assert len(repeated) == pytest.approx(10, abs=1)
+    assert set(repeated) == {1}

@@ -21,6 +21,11 @@ from fractus_vehicle.state import CONTROL_STEP_S, VehicleState
 CONTINUE_AFTER_LAND = 4
 # Waypoint commands that can be passed without a stop.
 CURVES = frozenset({mavlink.MAV_CMD_NAV_WAYPOINT, mavlink.MAV_CMD_NAV_SPLINE_WAYPOINT})
+# Commands whose end is reported in a STATUSTEXT.
+ARRIVALS = CURVES | {mavlink.MAV_CMD_NAV_LOITER_TIME}
+# LOITER_TURNS: distance from the circle up to which the vehicle does not fly to it first, and smallest acceleration.
+CIRCLE_NEAR_M = 3.0
+CIRCLE_ACCEL_MIN_RPS2 = math.radians(2.0)
 
 
 class AutoFlight(Flight):
@@ -39,8 +44,9 @@ class AutoFlight(Flight):
         self._leg: Leg | SplineLeg | None = None
         self._track: Point = (0.0, 0.0, 0.0)  # direction at the end of the current leg; zero if the vehicle stops there
         self._commands = MissionCommands()
-        self._circle_centre: tuple[float, float] | None = None
+        self._circle_centre = (0.0, 0.0)
         self._turned = 0.0
+        self._turn_rate_rps = 0.0
         self._angle = 0.0
 
     @property
@@ -109,6 +115,14 @@ class AutoFlight(Flight):
         v.mission.complete = False
         self._start_from(v, index)
 
+    def _advance(self, v: VehicleState) -> None:
+        """Begin the item after the current one."""
+
+        def report(text: str) -> None:
+            v.send_text(mavlink.MAV_SEVERITY_INFO, text)
+
+        self._start_from(v, v.mission.next_after(self._index, report))
+
     def _start_from(self, v: VehicleState, index: int | None) -> None:
         """Begin the next NAV command from `index` on. The DO and CONDITION commands before it run while it is flown."""
         waiting: list[int] = []
@@ -159,12 +173,10 @@ class AutoFlight(Flight):
                 self._returning = ReturnToLaunch()
                 self._returning.begin(v)
             case mavlink.MAV_CMD_NAV_LOITER_TURNS:
-                self._circle_centre = (north, east)
-                self._turned = 0.0
-                self._angle = math.atan2(v.est.east - east, v.est.north - north)
-                v.control.go_to(north, east, down)
+                self._begin_turns(v, item, (north, east, down))
             case mavlink.MAV_CMD_NAV_DELAY:
                 self._arrived_s = v.time_s
+                v.send_text(mavlink.MAV_SEVERITY_INFO, f"Delaying {max(int(item.param1), 0)} sec")
             case mavlink.MAV_CMD_NAV_SPLINE_WAYPOINT:
                 position = (v.control.pos[0], v.control.pos[1], v.control.pos[2])
                 self._track = self._arrival(v, item, position, (north, east, down))
@@ -216,13 +228,13 @@ class AutoFlight(Flight):
             self._leg.step(v)
         if item.command == mavlink.MAV_CMD_NAV_LAND:
             self._land(v)
-        elif item.command == mavlink.MAV_CMD_NAV_LOITER_TURNS and self._circle_centre is not None:
+        elif item.command == mavlink.MAV_CMD_NAV_LOITER_TURNS:
             self._turn(v, item)
         elif self._done(v, item):
             v.item_reached = self._index
-            if item.command != mavlink.MAV_CMD_NAV_TAKEOFF:
+            if item.command in ARRIVALS:
                 v.send_text(mavlink.MAV_SEVERITY_INFO, f"Reached command #{self._index}")
-            self._start_from(v, v.mission.next_after(self._index))
+            self._advance(v)
         self._commands.step(v)
         v.heading.step(v.est, CONTROL_STEP_S)
 
@@ -239,7 +251,7 @@ class AutoFlight(Flight):
         if goes_on and v.landed:
             self._landing = False
             v.item_reached = self._index
-            self._start_from(v, v.mission.next_after(self._index))
+            self._advance(v)
 
     def _finish_if_down(self, v: VehicleState) -> None:
         """Complete a return item if the motors have stopped."""
@@ -248,17 +260,47 @@ class AutoFlight(Flight):
         v.item_reached = self._index
         v.mission.complete = v.mission.peek_after(self._index) is None
 
+    def _begin_turns(self, v: VehicleState, item: Item, centre: Point) -> None:
+        """Begin LOITER_TURNS. If the vehicle is far from the circle, it flies to the nearest point of it first."""
+        north, east, down = centre
+        self._circle_centre = (north, east)
+        self._turned = 0.0
+        self._turn_rate_rps = 0.0
+        self._angle = math.atan2(v.est.east - east, v.est.north - north)
+        edge = (*self._circle_point(_radius_m(v, item)), down)
+        if math.dist((v.est.north, v.est.east, v.est.down), edge) > CIRCLE_NEAR_M:
+            self._leg = Leg(v, *edge)
+        else:
+            v.control.go_to(*edge)
+
+    def _circle_point(self, radius_m: float) -> tuple[float, float]:
+        north, east = self._circle_centre
+        return (north + radius_m * math.cos(self._angle), east + radius_m * math.sin(self._angle))
+
     def _turn(self, v: VehicleState, item: Item) -> None:
-        radius = min(max(abs(item.param3) or v.params["CIRCLE_RADIUS"] / 100.0, 1.0), 500.0)
-        rate = min(math.radians(v.params["CIRCLE_RATE"]), v.control.limits.speed_mps / radius)
-        step = math.copysign(rate * CONTROL_STEP_S, item.param3 or 1.0)
-        centre = self._circle_centre or (v.est.north, v.est.east)
-        self._angle += step
-        self._turned += abs(step)
-        v.control.target = (centre[0] + radius * math.cos(self._angle), centre[1] + radius * math.sin(self._angle))
-        if self._turned >= 2.0 * math.pi * max(item.param1, 1.0):
+        if self._leg is not None:
+            if not self._arrived(v, self._leg):
+                return
+            self._leg = None
+            v.control.go_to(*v.control.target, v.control.target_down)
+        radius_m = _radius_m(v, item)
+        fastest_mps = min(v.control.limits.speed_mps, math.sqrt(0.5 * v.control.limits.accel_mps2 * radius_m))
+        rate_rps = min(math.radians(abs(v.params["CIRCLE_RATE"])), fastest_mps / radius_m)
+        # The full rate is reached after one second.
+        accel_rps2 = max(rate_rps, CIRCLE_ACCEL_MIN_RPS2)
+        self._turn_rate_rps = min(self._turn_rate_rps + accel_rps2 * CONTROL_STEP_S, rate_rps)
+        step = self._turn_rate_rps * CONTROL_STEP_S
+        self._angle += math.copysign(step, item.param3 or 1.0)
+        self._turned += step
+        v.control.target = self._circle_point(radius_m)
+        if self._turned >= 2.0 * math.pi * item.param1:
             v.item_reached = self._index
-            self._start_from(v, v.mission.next_after(self._index))
+            self._advance(v)
+
+    def _arrived(self, v: VehicleState, leg: Leg | SplineLeg) -> bool:
+        """Return True if the vehicle is near the end of a leg and, unless it passes without a stop, has stopped there."""
+        passes = any(self._track)
+        return leg.reached(v, max(v.params["WPNAV_RADIUS"] / 100.0, 0.3)) and (passes or leg.finished)
 
     def _done(self, v: VehicleState, item: Item) -> bool:
         if item.command == mavlink.MAV_CMD_NAV_TAKEOFF:
@@ -268,7 +310,12 @@ class AutoFlight(Flight):
         if item.command == mavlink.MAV_CMD_NAV_DELAY:
             return v.time_s - (self._arrived_s or 0.0) >= max(item.param1, 0.0)
         if self._arrived_s is None:
-            if self._leg is None or not self._leg.reached(v, max(v.params["WPNAV_RADIUS"] / 100.0, 0.3)):
+            if self._leg is None or not self._arrived(v, self._leg):
                 return False
             self._arrived_s = v.time_s
         return v.time_s - self._arrived_s >= max(item.param1, 0.0)
+
+
+def _radius_m(v: VehicleState, item: Item) -> float:
+    """Return the radius of a LOITER_TURNS item in metres."""
+    return min(max(abs(item.param3) or v.params["CIRCLE_RADIUS"] / 100.0, 1.0), 500.0)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fractus_vehicle.earth import Place
@@ -69,8 +71,13 @@ class Mission:
         self._jumps = jumps
         return at
 
-    def next_after(self, index: int) -> int | None:
-        """Return the index of the item to execute after `index`. Follow jumps. Return None at the end."""
+    def next_after(self, index: int, report: Callable[[str], None] | None = None) -> int | None:
+        """Return the index of the item to execute after `index`. Follow jumps. Return None at the end.
+
+        Args:
+            index: Index of the item that ends.
+            report: Called with the STATUSTEXT of each counted jump.
+        """
         at = index + 1
         for _ in range(100):
             if at >= len(self.items):
@@ -84,8 +91,13 @@ class Mission:
             if target is None or not 0 < target < len(self.items):
                 return None
             done = self._jumps.get(at, 0)
-            if item.param2 < 0 or done < int(item.param2):
+            times = int(item.param2)
+            if times < 0:
+                at = target
+            elif done < times:
                 self._jumps[at] = done + 1
+                if report is not None:
+                    report(f"Mission: {at} Jump {done + 1}/{times}")
                 at = target
             else:
                 at += 1

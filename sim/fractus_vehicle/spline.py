@@ -133,10 +133,15 @@ class SplineLeg:
         # A short tangent may bend the curve more sharply than the vehicle can fly.
         return _scaled(demand, min(1.0, most_mps2 / max(math.hypot(*demand), 1e-6)))
 
+    @property
+    def finished(self) -> bool:
+        """True if the trajectory has reached the end of the curve."""
+        return self._share >= 1.0
+
     def reached(self, v: VehicleState, radius_m: float) -> bool:
         """Return True if the curve is complete."""
         position = (v.est.north, v.est.east, v.est.down)
-        return self._share >= 1.0 and (not self._stops or math.dist(position, self.end) <= radius_m)
+        return self.finished and (not self._stops or math.dist(position, self.end) <= radius_m)
 
 
 def _scaled(vector: Point, scale: float) -> Point:

@@ -548,3 +548,36 @@ def test_last_reached_item_is_repeated_at_a_requested_interval():
     repeated = [m.integer("seq") for _ in range(200) for m in pilot.step() if m.name == "MISSION_ITEM_REACHED"]
     assert len(repeated) == pytest.approx(10, abs=1)
     assert set(repeated) == {1}
+
+
+def test_jump_and_delay_are_reported_with_their_numbers():
+    _, pilot, _ = _fly_mission(
+        [
+            _waypoint(5.0, 0.0, 10.0),
+            {"command": 177, "param1": 1.0, "param2": 2.0},
+            {"command": 93, "param1": 3.0},
+        ]
+    )
+    assert [text for text in pilot.texts if "Jump" in text or "elay" in text] == [
+        "Mission: 2 Jump 1/2",
+        "Mission: 2 Jump 2/2",
+        "Mission: 3 Delay",
+        "Delaying 3 sec",
+    ]
+    assert [text for text in pilot.texts if text.startswith("Reached")] == ["Reached command #1"] * 3
+
+
+def test_loiter_turns_flies_to_the_circle_before_it_counts_turns():
+    begun = _fly_mission([_waypoint(5.0, 0.0, 10.0, command=18, param1=1.0, param3=5.0)])[2]
+    far = _fly_mission([_waypoint(30.0, 0.0, 10.0, command=18, param1=1.0, param3=5.0)])[2]
+    at_circle_s = begun[-1][4] - begun[0][4]
+    from_afar_s = far[-1][4] - far[0][4]
+    assert at_circle_s == pytest.approx(18.5, abs=1.0), "20 degrees per second, after one second of acceleration"
+    assert from_afar_s - at_circle_s == pytest.approx(9.3, abs=1.0), "a leg of 25 m from rest to rest"
+    assert max(math.dist(at[:2], (30.0, 0.0)) for at in far[-1000:]) < 6.5
+
+
+def test_loiter_of_no_turns_ends_on_the_circle():
+    vehicle, _, track = _fly_mission([_waypoint(30.0, 0.0, 10.0, command=18, param3=5.0)])
+    assert track[-1][4] - track[0][4] < 12.0
+    assert distance_m(vehicle, 25.0, 0.0) < 3.0

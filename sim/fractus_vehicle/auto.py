@@ -12,7 +12,7 @@ from fractus_vehicle.descent import descend
 from fractus_vehicle.flight import Flight
 from fractus_vehicle.leg import Leg
 from fractus_vehicle.mission_commands import MissionCommands, item_target, title
-from fractus_vehicle.mission_items import Item
+from fractus_vehicle.mission_items import LANDINGS, TAKEOFFS, Item
 from fractus_vehicle.rtl import ReturnToLaunch
 from fractus_vehicle.spline import SplineLeg
 from fractus_vehicle.state import CONTROL_STEP_S, VehicleState
@@ -23,6 +23,15 @@ CONTINUE_AFTER_LAND = 4
 CURVES = frozenset({mavlink.MAV_CMD_NAV_WAYPOINT, mavlink.MAV_CMD_NAV_SPLINE_WAYPOINT})
 # Commands whose end is reported in a STATUSTEXT.
 ARRIVALS = CURVES | {mavlink.MAV_CMD_NAV_LOITER_TIME}
+# Commands for which the vehicle holds its position.
+HOLDS = frozenset(
+    {
+        mavlink.MAV_CMD_NAV_DELAY,
+        mavlink.MAV_CMD_NAV_GUIDED_ENABLE,
+        mavlink.MAV_CMD_NAV_SCRIPT_TIME,
+        mavlink.MAV_CMD_NAV_ATTITUDE_TIME,
+    }
+)
 # LOITER_TURNS: distance from the circle up to which the vehicle does not fly to it first, and smallest acceleration.
 CIRCLE_NEAR_M = 3.0
 CIRCLE_ACCEL_MIN_RPS2 = math.radians(2.0)
@@ -164,7 +173,7 @@ class AutoFlight(Flight):
             return
         north, east, down = item_target(v, item)
         match item.command:
-            case mavlink.MAV_CMD_NAV_TAKEOFF:
+            case mavlink.MAV_CMD_NAV_TAKEOFF | mavlink.MAV_CMD_NAV_VTOL_TAKEOFF:
                 if v.landed:
                     v.begin_takeoff(down)
                 else:
@@ -174,20 +183,25 @@ class AutoFlight(Flight):
                 self._returning.begin(v)
             case mavlink.MAV_CMD_NAV_LOITER_TURNS:
                 self._begin_turns(v, item, (north, east, down))
-            case mavlink.MAV_CMD_NAV_DELAY:
-                self._arrived_s = v.time_s
-                v.send_text(mavlink.MAV_SEVERITY_INFO, f"Delaying {max(int(item.param1), 0)} sec")
             case mavlink.MAV_CMD_NAV_SPLINE_WAYPOINT:
                 position = (v.control.pos[0], v.control.pos[1], v.control.pos[2])
                 self._track = self._arrival(v, item, position, (north, east, down))
                 self._leg = SplineLeg(v, (north, east, down), track, self._track)
-            case mavlink.MAV_CMD_NAV_LAND:
+            case mavlink.MAV_CMD_NAV_LAND | mavlink.MAV_CMD_NAV_VTOL_LAND:
                 v.control.go_to(north, east)
+            case command if command in HOLDS:
+                self._hold(v, item)
             case _:
                 position = (v.control.pos[0], v.control.pos[1], v.control.pos[2])
                 if self._following(v, item) is not None:
                     self._track = (north - position[0], east - position[1], down - position[2])
                 self._leg = Leg(v, north, east, down)
+
+    def _hold(self, v: VehicleState, item: Item) -> None:
+        self._arrived_s = v.time_s
+        v.control.hold_position()
+        if item.command == mavlink.MAV_CMD_NAV_DELAY:
+            v.send_text(mavlink.MAV_SEVERITY_INFO, f"Delaying {max(int(item.param1), 0)} sec")
 
     def _following(self, v: VehicleState, item: Item) -> Item | None:
         """Return the next NAV item if the vehicle flies on to it without a stop.
@@ -226,7 +240,7 @@ class AutoFlight(Flight):
             return
         if self._leg is not None:
             self._leg.step(v)
-        if item.command == mavlink.MAV_CMD_NAV_LAND:
+        if item.command in LANDINGS:
             self._land(v)
         elif item.command == mavlink.MAV_CMD_NAV_LOITER_TURNS:
             self._turn(v, item)
@@ -303,17 +317,34 @@ class AutoFlight(Flight):
         return leg.reached(v, max(v.params["WPNAV_RADIUS"] / 100.0, 0.3)) and (passes or leg.finished)
 
     def _done(self, v: VehicleState, item: Item) -> bool:
-        if item.command == mavlink.MAV_CMD_NAV_TAKEOFF:
+        if item.command in TAKEOFFS:
             return v.takeoff_done()
-        if item.command == mavlink.MAV_CMD_NAV_LOITER_UNLIM:
-            return False
-        if item.command == mavlink.MAV_CMD_NAV_DELAY:
-            return v.time_s - (self._arrived_s or 0.0) >= max(item.param1, 0.0)
         if self._arrived_s is None:
             if self._leg is None or not self._arrived(v, self._leg):
                 return False
             self._arrived_s = v.time_s
-        return v.time_s - self._arrived_s >= max(item.param1, 0.0)
+        return v.time_s - self._arrived_s >= _wait_s(item)
+
+
+def _wait_s(item: Item) -> float:
+    """Return how long an item lasts after the vehicle has arrived, in seconds. Infinite if only a client can end it."""
+    match item.command:
+        case mavlink.MAV_CMD_NAV_LOITER_UNLIM:
+            return math.inf
+        case mavlink.MAV_CMD_NAV_GUIDED_ENABLE:
+            return math.inf if item.param1 > 0.0 else 0.0
+        case mavlink.MAV_CMD_NAV_SCRIPT_TIME:
+            return item.param2 if item.param2 > 0.0 else math.inf  # there are no scripts that could end earlier
+        case (
+            mavlink.MAV_CMD_NAV_WAYPOINT
+            | mavlink.MAV_CMD_NAV_SPLINE_WAYPOINT
+            | mavlink.MAV_CMD_NAV_LOITER_TIME
+            | mavlink.MAV_CMD_NAV_DELAY
+            | mavlink.MAV_CMD_NAV_ATTITUDE_TIME
+        ):
+            return max(item.param1, 0.0)
+        case _:
+            return 0.0
 
 
 def _radius_m(v: VehicleState, item: Item) -> float:

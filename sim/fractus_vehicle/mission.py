@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fractus_vehicle.earth import Place
-from fractus_vehicle.mission_items import Item, ItemStore, home_item
+from fractus_vehicle.mission_items import TAKEOFFS, Item, ItemStore, home_item
 
 
 class Mission:
@@ -53,7 +53,7 @@ class Mission:
         at = self.first_navigating(index)
         while at is not None and self.items[at].command == mavlink.MAV_CMD_NAV_DELAY:
             at = self.first_navigating(at + 1)
-        return at is not None and self.items[at].command == mavlink.MAV_CMD_NAV_TAKEOFF
+        return at is not None and self.items[at].command in TAKEOFFS
 
     def peek_after(self, index: int) -> int | None:
         """Return the index of the next NAV item, without changing the counters of jumps.

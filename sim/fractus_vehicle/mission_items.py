@@ -12,7 +12,19 @@ from fractus_vehicle.copter import GLOBAL_FRAMES
 from fractus_vehicle.earth import ALTITUDE_MAX_M, Place, valid_coordinates
 
 # Commands whose fourth parameter (heading) may be NaN. No other parameter may be NaN.
-NAN_HEADINGS = frozenset({mavlink.MAV_CMD_NAV_WAYPOINT, mavlink.MAV_CMD_NAV_LAND, mavlink.MAV_CMD_NAV_TAKEOFF})
+NAN_HEADINGS = frozenset(
+    {
+        mavlink.MAV_CMD_NAV_WAYPOINT,
+        mavlink.MAV_CMD_NAV_LAND,
+        mavlink.MAV_CMD_NAV_TAKEOFF,
+        mavlink.MAV_CMD_NAV_VTOL_TAKEOFF,
+        mavlink.MAV_CMD_NAV_VTOL_LAND,
+    }
+)
+TAKEOFFS = frozenset({mavlink.MAV_CMD_NAV_TAKEOFF, mavlink.MAV_CMD_NAV_VTOL_TAKEOFF})
+LANDINGS = frozenset({mavlink.MAV_CMD_NAV_LAND, mavlink.MAV_CMD_NAV_VTOL_LAND})
+# NAV commands whose numbers are not in the range of NAV commands.
+LATER_NAV_COMMANDS = frozenset({mavlink.MAV_CMD_NAV_SCRIPT_TIME, mavlink.MAV_CMD_NAV_ATTITUDE_TIME})
 FENCE_COMMANDS = frozenset(range(5000, 5005))
 SUPPORTED = frozenset(
     {
@@ -25,7 +37,13 @@ SUPPORTED = frozenset(
         mavlink.MAV_CMD_NAV_RETURN_TO_LAUNCH,
         mavlink.MAV_CMD_NAV_LAND,
         mavlink.MAV_CMD_NAV_TAKEOFF,
+        mavlink.MAV_CMD_NAV_VTOL_TAKEOFF,
+        mavlink.MAV_CMD_NAV_VTOL_LAND,
+        mavlink.MAV_CMD_NAV_GUIDED_ENABLE,
         mavlink.MAV_CMD_NAV_DELAY,
+        mavlink.MAV_CMD_NAV_PAYLOAD_PLACE,
+        mavlink.MAV_CMD_NAV_SCRIPT_TIME,
+        mavlink.MAV_CMD_NAV_ATTITUDE_TIME,
         mavlink.MAV_CMD_CONDITION_DELAY,
         mavlink.MAV_CMD_CONDITION_DISTANCE,
         mavlink.MAV_CMD_CONDITION_YAW,
@@ -43,6 +61,9 @@ SUPPORTED = frozenset(
         mavlink.MAV_CMD_DO_WINCH,
         mavlink.MAV_CMD_DO_DIGICAM_CONFIGURE,
         mavlink.MAV_CMD_DO_GUIDED_LIMITS,
+        mavlink.MAV_CMD_DO_SET_REVERSE,
+        mavlink.MAV_CMD_DO_SET_RESUME_REPEAT_DIST,
+        mavlink.MAV_CMD_DO_ENGINE_CONTROL,
         mavlink.MAV_CMD_DO_LAND_START,
         mavlink.MAV_CMD_DO_SET_ROI_LOCATION,
         mavlink.MAV_CMD_DO_SET_ROI_NONE,
@@ -90,7 +111,7 @@ class Item:
         """True for NAV commands. The mission does not continue before a NAV command is complete."""
         return (
             mavlink.MAV_CMD_NAV_WAYPOINT <= self.command < mavlink.MAV_CMD_NAV_LAST
-            or self.command >= mavlink.MAV_CMD_NAV_FENCE_RETURN_POINT
+            or self.command in LATER_NAV_COMMANDS
         )
 
 
@@ -134,6 +155,10 @@ PLACED = frozenset(
         mavlink.MAV_CMD_NAV_LAND,
         mavlink.MAV_CMD_NAV_TAKEOFF,
         mavlink.MAV_CMD_NAV_SPLINE_WAYPOINT,
+        mavlink.MAV_CMD_NAV_VTOL_TAKEOFF,
+        mavlink.MAV_CMD_NAV_VTOL_LAND,
+        mavlink.MAV_CMD_NAV_GUIDED_ENABLE,
+        mavlink.MAV_CMD_NAV_PAYLOAD_PLACE,
         mavlink.MAV_CMD_DO_SET_HOME,
         mavlink.MAV_CMD_DO_LAND_START,
         mavlink.MAV_CMD_DO_SET_ROI,
@@ -176,7 +201,7 @@ def item_from(message: Message) -> Item:
     return Item(
         command=command,
         frame=_CURRENT_FRAMES.get(frame, frame)
-        if command in PLACED or command >= mavlink.MAV_CMD_NAV_FENCE_RETURN_POINT
+        if command in PLACED or command in FENCE_COMMANDS or command == mavlink.MAV_CMD_NAV_RALLY_POINT
         else mavlink.MAV_FRAME_GLOBAL,
         param1=param1,
         param2=param2,
@@ -184,7 +209,7 @@ def item_from(message: Message) -> Item:
         param4=param4,
         x=int(max(-2147483648, min(2147483647, round(x)))),
         y=int(max(-2147483648, min(2147483647, round(y)))),
-        z=z if command in PLACED or Item(command).navigates else _finite(z),
+        z=z if command in PLACED or command == mavlink.MAV_CMD_NAV_RALLY_POINT else _finite(z),
         autocontinue=message.integer("autocontinue"),
     )
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import pytest
+from fractus_vehicle.readiness import arming_refusals
 from fractus_vehicle.shaping import wrap_pi
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from vehicle_world import START, airborne, alone, distance_m, upload
@@ -286,3 +287,35 @@ def test_target_during_pause_is_flown_on_resume():
     assert pilot.command(mavlink.MAV_CMD_DO_PAUSE_CONTINUE, 1) == mavlink.MAV_RESULT_ACCEPTED
     pilot.fly_on(9.0)
     assert distance_m(vehicle, 15.0, 0.0) < 1.0
+
+
+@pytest.mark.parametrize("command", [84, 85, 92, 94, 194, 215, 223, 42702, 42703])
+def test_mission_command_is_stored(command: int):
+    vehicle, pilot = alone()
+    assert upload(pilot, 0, [HOME, _waypoint(5.0, command=command)]) == mavlink.MAV_MISSION_ACCEPTED
+    assert vehicle.mission.items[1].command == command
+
+
+def test_mission_with_commands_without_effect_is_flown_to_its_end():
+    vehicle, pilot = alone()
+    passed = [92, 94, 194, 215, 223, 42600]
+    items = [
+        {"command": 84, "frame": 3, "z": 5.0},
+        *({"command": command, "frame": 3, "z": 5.0} for command in passed),
+        {"command": 42702, "param1": 1.0, "param2": 2.0},
+        {"command": 42703, "param1": 2.0},
+        {"command": 85, "frame": 3},
+    ]
+    upload(pilot, 0, [HOME, *items])
+    pilot.mode(mavlink.COPTER_MODE_GUIDED)
+    pilot.wait(lambda: not arming_refusals(vehicle), 5.0)
+    pilot.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1.0)
+    before = len(pilot.texts)
+    assert pilot.command(mavlink.MAV_CMD_MISSION_START) == mavlink.MAV_RESULT_ACCEPTED
+    took_s = pilot.wait(lambda: not vehicle.armed, 60.0)
+    assert took_s > 4.0
+    titles = [text.split()[-1] for text in pilot.texts[before:] if text.startswith("Mission")]
+    assert [title for title in titles if title.startswith(("VTOL", "Guided", "Nav", "Payload"))] == [
+        *("VTOLTakeoff", "VTOLTakeoff", "GuidedEnable", "PayloadPlace", "NavScriptTime", "NavAttitudeTime"),
+        "VTOLLand",
+    ]

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import struct
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from fractus_runtime.mavlink_codec import Message
@@ -167,23 +169,111 @@ PLACED = frozenset(
 )
 
 
-# Commands of which not all parameters are stored. 1: only the first parameter, a delay in whole seconds. 0: none.
-STORED_PARAMETERS: dict[int, int] = {
-    mavlink.MAV_CMD_NAV_WAYPOINT: 1,
-    mavlink.MAV_CMD_NAV_SPLINE_WAYPOINT: 1,
-    mavlink.MAV_CMD_NAV_TAKEOFF: 1,
-    mavlink.MAV_CMD_NAV_RETURN_TO_LAUNCH: 0,
-}
+Parameters = tuple[float, float, float, float]
 _UINT16_MAX = 65535
+_INT16_MAX = 32767
 
 
-def _parameters(message: Message, command: int) -> tuple[float, float, float, float]:
+def _whole(value: float, low: int = 0, high: int = _UINT16_MAX) -> float:
+    """Return a parameter as a whole number within the range of its field in storage."""
+    return float(int(min(max(value, low), high)))
+
+
+def _direction(value: float) -> float:
+    return -1.0 if value < 0.0 else 1.0
+
+
+def _flag(value: float) -> float:
+    return 1.0 if value > 0.0 else 0.0
+
+
+def _no_parameters(_p: Parameters) -> Parameters:
+    return (0.0, 0.0, 0.0, 0.0)
+
+
+def _one_number(p: Parameters) -> Parameters:
+    return (_whole(p[0]), 0.0, 0.0, 0.0)
+
+
+def _land(p: Parameters) -> Parameters:
+    """Return the parameters of a landing. Only the sign of its heading is stored."""
+    return (_whole(p[0]), 0.0, 0.0, _direction(p[3]))
+
+
+def _loiter_unlimited(p: Parameters) -> Parameters:
+    return (0.0, 0.0, math.copysign(_whole(abs(p[2])), p[2]), 0.0)
+
+
+def _loiter_turns(p: Parameters) -> Parameters:
+    """Return turns in one byte, less than one turn as a fraction of 256, and radii above 255 m in steps of 10 m."""
+    turns = int(p[0] * 256.0) / 256.0 if 0.0 < p[0] < 1.0 else _whole(p[0], high=255)
+    radius_m = abs(p[2])
+    stored_m = _whole(radius_m) if radius_m <= 255.0 else 10.0 * _whole(radius_m * 0.1, high=255)
+    return (turns, 0.0, math.copysign(stored_m, p[2]), _flag(p[3]))
+
+
+def _loiter_time(p: Parameters) -> Parameters:
+    return (_whole(p[0]), 0.0, _direction(p[2]), _flag(p[3]))
+
+
+def _loiter_to_altitude(p: Parameters) -> Parameters:
+    return (0.0, math.copysign(_whole(abs(p[1])), p[1]), 0.0, _flag(p[3]))
+
+
+def _jump(p: Parameters) -> Parameters:
+    return (_whole(p[0]), _whole(p[1], -_INT16_MAX, _INT16_MAX), 0.0, 0.0)
+
+
+def _payload_place(p: Parameters) -> Parameters:
+    return (_whole(p[0] * 100.0) / 100.0, 0.0, 0.0, 0.0)
+
+
+def _engine_control(p: Parameters) -> Parameters:
+    return (_flag(p[0]), _flag(p[1]), p[2], 0.0)
+
+
+# Commands whose parameters are stored in fewer bits than they are sent with. The parameters of other commands are kept.
+_STORED: dict[int, Callable[[Parameters], Parameters]] = {
+    mavlink.MAV_CMD_NAV_WAYPOINT: _one_number,
+    mavlink.MAV_CMD_NAV_SPLINE_WAYPOINT: _one_number,
+    mavlink.MAV_CMD_NAV_TAKEOFF: _one_number,
+    mavlink.MAV_CMD_NAV_VTOL_TAKEOFF: _no_parameters,
+    mavlink.MAV_CMD_NAV_RETURN_TO_LAUNCH: _no_parameters,
+    mavlink.MAV_CMD_NAV_LAND: _land,
+    mavlink.MAV_CMD_NAV_VTOL_LAND: _one_number,
+    mavlink.MAV_CMD_NAV_LOITER_UNLIM: _loiter_unlimited,
+    mavlink.MAV_CMD_NAV_LOITER_TURNS: _loiter_turns,
+    mavlink.MAV_CMD_NAV_LOITER_TIME: _loiter_time,
+    mavlink.MAV_CMD_NAV_LOITER_TO_ALT: _loiter_to_altitude,
+    mavlink.MAV_CMD_NAV_GUIDED_ENABLE: _one_number,
+    mavlink.MAV_CMD_NAV_PAYLOAD_PLACE: _payload_place,
+    mavlink.MAV_CMD_DO_JUMP: _jump,
+    mavlink.MAV_CMD_DO_JUMP_TAG: _jump,
+    mavlink.MAV_CMD_JUMP_TAG: _one_number,
+    mavlink.MAV_CMD_DO_SET_REVERSE: _one_number,
+    mavlink.MAV_CMD_DO_SET_RESUME_REPEAT_DIST: _one_number,
+    mavlink.MAV_CMD_DO_ENGINE_CONTROL: _engine_control,
+}
+
+
+def _parameters(message: Message, command: int) -> Parameters:
     """Return the four parameters as ArduPilot stores them."""
-    one, *more = (_finite(message.real(f"param{at}")) for at in range(1, 5))
-    stored = STORED_PARAMETERS.get(command)
-    if stored is None:
-        return (one, more[0], more[1], more[2])
-    return (float(min(max(int(one), 0), _UINT16_MAX)) if stored else 0.0, 0.0, 0.0, 0.0)
+    sent = (
+        _finite(message.real("param1")),
+        _finite(message.real("param2")),
+        _finite(message.real("param3")),
+        _finite(message.real("param4")),
+    )
+    stored = _STORED.get(command)
+    return sent if stored is None else stored(sent)
+
+
+def _centimetres(altitude_m: float) -> float:
+    """Return an altitude as stored: whole centimetres, computed with 32-bit floating-point numbers."""
+    if not abs(altitude_m) < ALTITUDE_MAX_M:
+        return altitude_m  # refused by `validate_item`
+    scaled: float = struct.unpack("<f", struct.pack("<f", altitude_m * 100.0))[0]
+    return int(scaled) / 100.0
 
 
 def item_from(message: Message) -> Item:
@@ -209,7 +299,7 @@ def item_from(message: Message) -> Item:
         param4=param4,
         x=int(max(-2147483648, min(2147483647, round(x)))),
         y=int(max(-2147483648, min(2147483647, round(y)))),
-        z=z if command in PLACED or command == mavlink.MAV_CMD_NAV_RALLY_POINT else _finite(z),
+        z=_centimetres(z) if command in PLACED or command == mavlink.MAV_CMD_NAV_RALLY_POINT else _finite(z),
         autocontinue=message.integer("autocontinue"),
     )
 

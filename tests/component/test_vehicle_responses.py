@@ -289,6 +289,50 @@ def test_target_during_pause_is_flown_on_resume():
     assert distance_m(vehicle, 15.0, 0.0) < 1.0
 
 
+STORED_AS = [
+    ((21, 3.7, 8.0, 9.0, 180.0), (3, 0, 0, 1)),
+    ((21, 0.0, 0.0, 0.0, -90.0), (0, 0, 0, -1)),
+    ((21, 0.0, 0.0, 0.0, math.nan), (0, 0, 0, 1)),
+    ((177, 1.0, 2.9, 7.0, 7.0), (1, 2, 0, 0)),
+    ((177, 1.0, -1.0), (1, -1, 0, 0)),
+    ((177, 1.0, 1e6), (1, 32767, 0, 0)),
+    ((17, 5.0, 0.0, -12.5, 3.0), (0, 0, -12, 0)),
+    ((18, 300.0, 5.0, -12.5, 0.5), (255, 0, -12, 1)),
+    ((18, 0.5, 0.0, 1234.0), (0.5, 0, 1230, 0)),
+    ((19, 2.9, 5.0, 0.0, 0.0), (2, 0, 1, 0)),
+    ((31, 1.0, -20.5, 3.0, 1.0), (0, -20, 0, 1)),
+    (
+        (
+            94,
+            1.239,
+        ),
+        (1.23, 0, 0, 0),
+    ),
+    ((92, 1.0, 2.0), (1, 0, 0, 0)),
+    ((223, 2.0, -1.0, 1.5), (1, 0, 1.5, 0)),
+    ((115, 90.0, 20.0, -1.0, 1.0), (90, 20, -1, 1)),
+]
+
+
+@pytest.mark.parametrize(("sent", "stored"), STORED_AS, ids=lambda value: "-".join(map(str, value)))
+def test_mission_item_parameters_are_stored_like_on_a_real_autopilot(sent, stored):
+    _, pilot = alone()
+    command, *params = sent
+    item = _waypoint(5.0, command=command, **{f"param{at}": value for at, value in enumerate(params, start=1)})
+    assert upload(pilot, 0, [HOME, item]) == mavlink.MAV_MISSION_ACCEPTED
+    pilot.send("MISSION_REQUEST_INT", TARGET | {"seq": 1})
+    message = pilot.expect("MISSION_ITEM_INT")
+    assert [message.real(f"param{at}") for at in range(1, 5)] == pytest.approx(stored, abs=1e-4)
+
+
+def test_mission_item_altitude_is_stored_in_whole_centimetres():
+    _, pilot = alone()
+    assert upload(pilot, 0, [HOME, _waypoint(5.0, z=12.349), _waypoint(6.0, z=0.29)]) == mavlink.MAV_MISSION_ACCEPTED
+    for seq, altitude_m in ((1, 12.34), (2, 0.29)):
+        pilot.send("MISSION_REQUEST_INT", TARGET | {"seq": seq})
+        assert pilot.expect("MISSION_ITEM_INT").real("z") == pytest.approx(altitude_m, abs=1e-6)
+
+
 @pytest.mark.parametrize("command", [84, 85, 92, 94, 194, 215, 223, 42702, 42703])
 def test_mission_command_is_stored(command: int):
     vehicle, pilot = alone()

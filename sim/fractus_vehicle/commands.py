@@ -75,7 +75,7 @@ def _takeoff(vehicle: Vehicle, o: Command, _c: Channel) -> int:
         return mavlink.MAV_RESULT_DENIED
     # The third parameter is not zero if the client accepts a takeoff without horizontal position, as in ALT_HOLD.
     may_take_off = v.mode in TAKEOFF_MODES or (v.mode == mavlink.COPTER_MODE_ALT_HOLD and o.params[2] != 0.0)
-    if not v.armed or not v.landed or not may_take_off or not v.altitude_m < o.z < ALTITUDE_MAX_M:
+    if not v.armed or not v.landed or not may_take_off or not max(v.altitude_m, 0.0) < o.z < ALTITUDE_MAX_M:
         return mavlink.MAV_RESULT_FAILED
     origin = v.origin or v.start
     flight = vehicle.modes.flight

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
+from fractus_vehicle.home import set_home
 from fractus_vehicle.readiness import arming_refusals
 from fractus_vehicle.shaping import wrap_pi
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -287,6 +289,17 @@ def test_target_during_pause_is_flown_on_resume():
     assert pilot.command(mavlink.MAV_CMD_DO_PAUSE_CONTINUE, 1) == mavlink.MAV_RESULT_ACCEPTED
     pilot.fly_on(9.0)
     assert distance_m(vehicle, 15.0, 0.0) < 1.0
+
+
+@pytest.mark.parametrize("noise_m", [-0.4, 0.0])
+def test_takeoff_to_no_altitude_fails(noise_m: float):
+    vehicle, pilot = alone()
+    pilot.mode(mavlink.COPTER_MODE_GUIDED)
+    pilot.wait(lambda: not arming_refusals(vehicle), 5.0)
+    pilot.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1.0)
+    assert vehicle.home is not None
+    set_home(vehicle, replace(vehicle.home, alt_m=vehicle.place.alt_m - noise_m))
+    assert pilot.command(mavlink.MAV_CMD_NAV_TAKEOFF) == mavlink.MAV_RESULT_FAILED
 
 
 STORED_AS = [

@@ -184,7 +184,7 @@ class Failsafes:
             return
         p = v.params
         battery = v.battery
-        left = battery.capacity_mah - battery.used_mah
+        left = max(battery.capacity_mah - battery.used_mah, 0.0)
         timer = p["BATT_LOW_TIMER"]
         critical = 0.0 < battery.voltage_v < p["BATT_CRT_VOLT"]
         low = 0.0 < battery.voltage_v < p["BATT_LOW_VOLT"]

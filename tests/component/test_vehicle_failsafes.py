@@ -253,3 +253,26 @@ def test_velocity_is_limited_before_fence():
     assert vehicle.mode == mavlink.COPTER_MODE_GUIDED
     assert 26.0 < vehicle.est.north < 30.0
     assert vehicle.fence.limiting
+
+
+@pytest.mark.parametrize(
+    ("limits", "level"),
+    [
+        ({}, None),
+        ({"BATT_LOW_MAH": 300.0}, "low"),
+        ({"BATT_CRT_MAH": 300.0}, "critical"),
+    ],
+)
+def test_battery_capacity_failsafe_acts_only_on_a_set_limit(limits: dict[str, float], level: str | None):
+    """A limit of 0 disables the check, also when more charge was used than BATT_CAPACITY."""
+    vehicle, pilot = airborne(5.0, BATT_CAPACITY=1000, BATT_FS_CRT_ACT=1, BATT_FS_LOW_ACT=1, **limits)
+    vehicle.battery.used_mah = 800.0
+    pilot.fly_on(0.5)
+    if level is None:
+        vehicle.battery.used_mah = 1100.0
+        pilot.fly_on(0.5)
+        assert vehicle.mode == mavlink.COPTER_MODE_GUIDED
+        assert not vehicle.failsafes.battery
+    else:
+        assert vehicle.mode == mavlink.COPTER_MODE_LAND
+        assert any(text.startswith(f"Battery 1 is {level}") for text in pilot.texts)

@@ -96,7 +96,7 @@ def _parameter_read(vehicle: Vehicle, m: Message, c: Channel) -> None:
 
 def _parameter_set(vehicle: Vehicle, m: Message, c: Channel) -> None:
     v = vehicle.state
-    name = m.text("param_id")
+    name = m.text("param_id").upper()
     value = m.real("param_value")
     if not math.isfinite(value):
         return

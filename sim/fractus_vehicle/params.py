@@ -79,6 +79,12 @@ def _index() -> dict[str, int]:
     return {parameter.name: at for at, parameter in enumerate(table())}
 
 
+def canonical(name: str) -> str:
+    """Return the name of a parameter in this release, for a name in any case or of a later release."""
+    upper = name.upper()
+    return ALIASES.get(upper, upper)
+
+
 class UnknownParameterError(KeyError):
     """A parameter name that this vehicle does not have."""
 
@@ -139,7 +145,7 @@ class Parameters(Mapping[str, float]):
             UnknownParameterError: The parameter does not exist.
             ParameterValueError: The value is NaN.
         """
-        name = ALIASES.get(name, name)
+        name = canonical(name)
         index = _index().get(name)
         if index is None:
             raise UnknownParameterError(name)
@@ -150,7 +156,7 @@ class Parameters(Mapping[str, float]):
 
     def set(self, name: str, value: float) -> bool:
         """Set a parameter for a client. Return False if it is unknown or read-only, or the value is not finite."""
-        name = ALIASES.get(name, name)
+        name = canonical(name)
         if name not in self._values or name in READ_ONLY or not math.isfinite(value):
             return False
         self.assign(name, value)
@@ -182,7 +188,7 @@ class Parameters(Mapping[str, float]):
                 return None
             row = table()[index]
             return row.name, row, index
-        at = _index().get(ALIASES.get(name, name))
+        at = _index().get(canonical(name))
         return None if at is None else (name, table()[at], at)
 
     def _save(self) -> None:

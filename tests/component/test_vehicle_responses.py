@@ -376,3 +376,14 @@ def test_mission_with_commands_without_effect_is_flown_to_its_end():
         *("VTOLTakeoff", "VTOLTakeoff", "GuidedEnable", "PayloadPlace", "NavScriptTime", "NavAttitudeTime"),
         "VTOLLand",
     ]
+
+
+@pytest.mark.parametrize("name", ["wpnav_speed", "WpNav_Speed"])
+def test_parameter_names_are_case_insensitive(name: str):
+    vehicle, pilot = alone()
+    pilot.send("PARAM_REQUEST_READ", TARGET | {"param_id": name.encode("ascii"), "param_index": -1})
+    assert pilot.expect("PARAM_VALUE").text("param_id") == name, "a reader gets the spelling that it requested"
+    pilot.send("PARAM_SET", TARGET | {"param_id": name.encode("ascii"), "param_value": 345.0, "param_type": 9})
+    reply = pilot.expect("PARAM_VALUE")
+    assert (reply.text("param_id"), reply.real("param_value")) == ("WPNAV_SPEED", 345.0)
+    assert vehicle.params["WPNAV_SPEED"] == 345.0

@@ -129,6 +129,11 @@ def _file_transfer(_vehicle: Vehicle, m: Message, c: Channel) -> None:
     )
 
 
+def _log_list(_vehicle: Vehicle, _m: Message, c: Channel) -> None:
+    """Report an empty list of logs, because the vehicle stores none."""
+    c.send("LOG_ENTRY", {"id": 0, "num_logs": 0, "last_log_num": 0, "time_utc": 0, "size": 0})
+
+
 def _mission(vehicle: Vehicle, m: Message, c: Channel) -> None:
     if m.name not in ("MISSION_ITEM", "MISSION_ITEM_INT") or m.integer("current") not in (2, 3):
         vehicle.transfers.handle(c, m, vehicle.state.time_s)
@@ -214,6 +219,7 @@ HANDLERS: dict[str, Handler] = {
     "PARAM_REQUEST_READ": _parameter_read,
     "PARAM_SET": _parameter_set,
     "FILE_TRANSFER_PROTOCOL": _file_transfer,
+    "LOG_REQUEST_LIST": _log_list,
     "TIMESYNC": _timesync,
     "AUTOPILOT_VERSION_REQUEST": _reply_with("AUTOPILOT_VERSION"),
     "SET_POSITION_TARGET_LOCAL_NED": _target(local_target),

@@ -387,3 +387,10 @@ def test_parameter_names_are_case_insensitive(name: str):
     reply = pilot.expect("PARAM_VALUE")
     assert (reply.text("param_id"), reply.real("param_value")) == ("WPNAV_SPEED", 345.0)
     assert vehicle.params["WPNAV_SPEED"] == 345.0
+
+
+def test_list_of_logs_is_empty():
+    _, pilot = alone()
+    pilot.send("LOG_REQUEST_LIST", TARGET | {"start": 0, "end": 65535})
+    entry = pilot.expect("LOG_ENTRY")
+    assert [entry.integer(name) for name in ("id", "num_logs", "last_log_num", "size")] == [0, 0, 0, 0]

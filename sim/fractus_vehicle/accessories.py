@@ -85,11 +85,25 @@ def set_servo(v: VehicleState, channel: float, pwm_us: float) -> int:
     return mavlink.MAV_RESULT_ACCEPTED
 
 
-def set_relay(v: VehicleState, number: float) -> int:
-    """Handle DO_SET_RELAY and DO_REPEAT_RELAY for a relay enabled by RELAYn_FUNCTION."""
-    if not math.isfinite(number) or not 0 <= int(number) < RELAYS:
+def relays_present(v: VehicleState) -> set[int]:
+    """Return the numbers of the relays enabled by RELAYn_FUNCTION, from 0."""
+    return {number for number in range(RELAYS) if int(v.params[f"RELAY{number + 1}_FUNCTION"]) == RELAY_FUNCTION}
+
+
+def set_relay(v: VehicleState, number: float, state: float) -> int:
+    """Handle DO_SET_RELAY for an enabled relay: 1 switches it on, 0 off."""
+    if not (math.isfinite(number) and math.isfinite(state)) or int(number) not in relays_present(v):
         return mavlink.MAV_RESULT_FAILED
-    enabled = int(v.params[f"RELAY{int(number) + 1}_FUNCTION"]) == RELAY_FUNCTION
+    if int(state) == 1:
+        v.relays_on.add(int(number))
+    elif int(state) == 0:
+        v.relays_on.discard(int(number))
+    return mavlink.MAV_RESULT_ACCEPTED
+
+
+def repeat_relay(v: VehicleState, number: float) -> int:
+    """Handle DO_REPEAT_RELAY for an enabled relay. The pulses are not simulated."""
+    enabled = math.isfinite(number) and int(number) in relays_present(v)
     return mavlink.MAV_RESULT_ACCEPTED if enabled else mavlink.MAV_RESULT_FAILED
 
 

@@ -7,7 +7,7 @@ from collections import deque
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from fractus_vehicle.accessories import set_servo
+from fractus_vehicle.accessories import set_relay, set_servo
 from fractus_vehicle.home import set_home_at, set_home_to_position
 from fractus_vehicle.mission_items import Item
 from fractus_vehicle.shaping import wrap_pi
@@ -88,6 +88,8 @@ def _do(v: VehicleState, item: Item) -> None:
             switch_fence(v, item.param1)
         case mavlink.MAV_CMD_DO_SET_SERVO | mavlink.MAV_CMD_DO_REPEAT_SERVO:
             set_servo(v, item.param1, item.param2)
+        case mavlink.MAV_CMD_DO_SET_RELAY:
+            set_relay(v, item.param1, item.param2)
         case mavlink.MAV_CMD_DO_SET_HOME:
             set_home_to_position(v) if item.param1 > 0.5 else set_home_at(v, item.x, item.y, item.z)
         case _:

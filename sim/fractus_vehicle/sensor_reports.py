@@ -131,8 +131,10 @@ def ahrs(_v: VehicleState) -> Values:
     return {"error_rp": 0.002, "error_yaw": 0.002}
 
 
-def wind(v: VehicleState) -> Values:
-    """Build WIND: direction of origin and speed."""
+def wind(v: VehicleState) -> Values | None:
+    """Build WIND: direction of origin and speed. The EKF estimates it only with a position."""
+    if not v.position_ok:
+        return None
     return {"direction": (v.wind.from_deg + 180.0) % 360.0 - 180.0, "speed": v.wind.speed_mps, "speed_z": 0.0}
 
 

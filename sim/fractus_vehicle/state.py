@@ -109,6 +109,7 @@ class VehicleState:
         self.impact_reported_s = -math.inf
         self.receiver = Receiver(config.throttle_us)
         self.servos: dict[int, int] = {}
+        self.relays_on: set[int] = set()
         self.motor_test_until_s: float | None = None
         self.armed = False
         self.armed_at_s = 0.0

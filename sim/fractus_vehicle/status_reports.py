@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from fractus_vehicle.accessories import relays_present
 from fractus_vehicle.copter import CAPABILITIES, FLIGHT_VERSION
 from fractus_vehicle.readiness import arming_refusals
 from fractus_vehicle.report_units import UNKNOWN_U16, Values, boot_ms
@@ -139,6 +140,16 @@ def mission_current(v: VehicleState) -> Values:
 def mission_item_reached(v: VehicleState) -> Values:
     """Build MISSION_ITEM_REACHED: the last reached item, or 65535 if no item was reached since the start."""
     return {"seq": UNKNOWN_U16 if v.last_item_reached is None else v.last_item_reached}
+
+
+def relay_status(v: VehicleState) -> Values:
+    """Build RELAY_STATUS: bit masks of the enabled relays and of those that are on."""
+    present = relays_present(v)
+    return {
+        "time_boot_ms": boot_ms(v),
+        "present": sum(1 << number for number in present),
+        "on": sum(1 << number for number in present & v.relays_on),
+    }
 
 
 def hwstatus(_v: VehicleState) -> Values:

@@ -28,6 +28,7 @@ BUILDERS: dict[str, Builder] = {
     "AUTOPILOT_VERSION": status_reports.autopilot_version,
     "MISSION_CURRENT": status_reports.mission_current,
     "MISSION_ITEM_REACHED": status_reports.mission_item_reached,
+    "RELAY_STATUS": status_reports.relay_status,
     "RAW_IMU": sensor_reports.raw_imu,
     "SCALED_IMU2": sensor_reports.scaled_imu2,
     "SCALED_IMU": sensor_reports.scaled_imu2,
@@ -82,7 +83,6 @@ SILENT = frozenset(
         "RANGEFINDER",
         "RC_CHANNELS_RAW",
         "RC_CHANNELS_SCALED",
-        "RELAY_STATUS",
         "RPM",
         "SCALED_PRESSURE3",
         "SERVO_OUTPUT_RAW",
@@ -121,6 +121,7 @@ GROUPS: dict[int, tuple[str, tuple[str, ...]]] = {
         "EXTRA3",
         (
             "AHRS",
+            "WIND",
             "SYSTEM_TIME",
             "TERRAIN_REPORT",
             "BATTERY_STATUS",

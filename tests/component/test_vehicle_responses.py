@@ -394,3 +394,37 @@ def test_list_of_logs_is_empty():
     pilot.send("LOG_REQUEST_LIST", TARGET | {"start": 0, "end": 65535})
     entry = pilot.expect("LOG_ENTRY")
     assert [entry.integer(name) for name in ("id", "num_logs", "last_log_num", "size")] == [0, 0, 0, 0]
+
+
+def test_relay_status_contains_enabled_relays_and_their_state():
+    _, pilot = alone(RELAY3_FUNCTION=1)
+
+    def relays() -> tuple[int, int]:
+        pilot.command(mavlink.MAV_CMD_REQUEST_MESSAGE, mavlink.MAVLINK_MSG_ID_RELAY_STATUS)
+        status = pilot.last["RELAY_STATUS"]
+        return status.integer("present"), status.integer("on")
+
+    assert relays() == (0b101, 0)
+    pilot.command(mavlink.MAV_CMD_DO_SET_RELAY, 2, 1)
+    assert relays() == (0b101, 0b100)
+    pilot.command(mavlink.MAV_CMD_DO_SET_RELAY, 2, 0)
+    assert relays() == (0b101, 0)
+
+
+def test_wind_is_part_of_the_extra3_stream_once_the_position_is_known():
+    vehicle, pilot = alone(SIM_WIND_SPD=3.0)
+    values = {"req_stream_id": mavlink.MAV_DATA_STREAM_EXTRA3, "req_message_rate": 4, "start_stop": 1}
+    pilot.send("REQUEST_DATA_STREAM", TARGET | values)
+    pilot.wait(lambda: vehicle.position_ok, 5.0)
+    assert "WIND" not in pilot.last
+    assert pilot.expect("WIND").real("speed") == 3.0
+
+
+def test_origin_is_sent_with_every_new_home():
+    vehicle, pilot = alone()
+    pilot.wait(lambda: vehicle.position_ok, 5.0)
+    origin = pilot.last["GPS_GLOBAL_ORIGIN"]
+    assert origin.integer("latitude") == START.lat_e7
+    del pilot.last["GPS_GLOBAL_ORIGIN"]
+    pilot.command(mavlink.MAV_CMD_DO_SET_HOME, 1.0)
+    assert "GPS_GLOBAL_ORIGIN" in pilot.last

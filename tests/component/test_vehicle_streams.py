@@ -44,7 +44,7 @@ def test_stream_can_be_stopped_and_unknown_message_is_denied():
     assert pilot.command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 30, -1) == mavlink.MAV_RESULT_ACCEPTED
     pilot.last.clear()
     pilot.fly_on(2.0)
-    assert pilot.last.keys() <= {"HEARTBEAT", "STATUSTEXT", "HOME_POSITION"}
+    assert pilot.last.keys() <= {"HEARTBEAT", "STATUSTEXT", "HOME_POSITION", "GPS_GLOBAL_ORIGIN"}
     assert pilot.command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 9999, 1000) == mavlink.MAV_RESULT_DENIED
     assert pilot.command(mavlink.MAV_CMD_REQUEST_MESSAGE, 9999) == mavlink.MAV_RESULT_FAILED
     assert pilot.command(mavlink.MAV_CMD_REQUEST_MESSAGE, float("nan")) == mavlink.MAV_RESULT_FAILED

@@ -131,7 +131,8 @@ class Failsafes:
     def _check_radio(self, v: VehicleState) -> None:
         """Check the simulated radio receiver.
 
-        With SIM_RC_FAIL it has no signal, unless a ground station overrides channels.
+        With SIM_RC_FAIL it has no signal, unless a ground station overrides channels. A throttle below FS_THR_VALUE also
+        counts as a lost signal.
         """
         setting = int(v.params["FS_THR_ENABLE"])
         silent = int(v.params["SIM_RC_FAIL"]) != 0 and not v.receiver.overridden
@@ -140,7 +141,7 @@ class Failsafes:
         elif self._radio_lost_s is None:
             self._radio_lost_s = v.time_s
         lost = self._radio_lost_s is not None and v.time_s - self._radio_lost_s >= v.params["RC_FS_TIMEOUT"]
-        lost = lost and setting != 0
+        lost = (lost or v.throttle_below_failsafe) and setting != 0
         if lost == v.failsafes.radio:
             return
         v.failsafes.radio = lost

@@ -6,8 +6,8 @@ from enum import Enum
 
 from fractus_vehicle.descent import descend
 from fractus_vehicle.flight import Flight
-from fractus_vehicle.home import return_point
 from fractus_vehicle.leg import Leg, resting_place
+from fractus_vehicle.return_points import return_point
 from fractus_vehicle.state import VehicleState
 
 

@@ -10,7 +10,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from fractus_vehicle import noise
 from fractus_vehicle.body import GRAVITY
 from fractus_vehicle.report_units import UNKNOWN_U16, Values, boot_ms, boot_us, centi, milli
-from fractus_vehicle.sensors import Gps
+from fractus_vehicle.sensors import GPS_HDOP, Gps
 from fractus_vehicle.shaping import clamp
 from fractus_vehicle.state import VehicleState
 
@@ -44,7 +44,7 @@ def _gps_values(v: VehicleState, g: Gps) -> Values:
         "lat": g.place.lat_e7,
         "lon": g.place.lon_e7,
         "alt": round(g.place.alt_m * 1000.0),
-        "eph": 121,
+        "eph": GPS_HDOP,
         "epv": 200,
         "vel": max(0, centi(math.hypot(g.vn, g.ve))),
         "cog": round(math.degrees(math.atan2(g.ve, g.vn)) % 360.0 * 100.0) % 36000,

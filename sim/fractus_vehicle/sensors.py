@@ -18,6 +18,8 @@ _CELL_CURVE = ((0.0, 3.27), (0.05, 3.60), (0.1, 3.69), (0.2, 3.75), (0.4, 3.80),
 TILT_SIGMA_RAD = (math.radians(0.15), math.radians(0.15), math.radians(0.6))
 TILT_CORRELATION_S = 20.0
 HOVER_CURRENT_A = 14.0
+# Horizontal dilution of precision of the simulated GPS, in hundredths.
+GPS_HDOP = 121
 
 
 class Battery:

@@ -65,6 +65,15 @@ def set_fence(params: Parameters, fence: Fence, changed: str = "FENCE_ENABLE") -
     fence.avoid = bool(int(params["AVOID_ENABLE"]) & AVOID_FENCE)
 
 
+def accelerometers_differ(params: Parameters) -> bool:
+    """Return True if the biases of the first two accelerometers differ by more than ARMING_ACCTHRESH.
+
+    The vertical axis counts half, as in ArduPilot's check.
+    """
+    x, y, z = (params[f"SIM_ACC1_BIAS_{axis}"] - params[f"SIM_ACC2_BIAS_{axis}"] for axis in "XYZ")
+    return math.hypot(x, y, 0.5 * z) > params["ARMING_ACCTHRESH"]
+
+
 def set_battery(params: Parameters, battery: Battery) -> None:
     """Set capacity and full voltage of the battery."""
     battery.capacity_mah = max(params["BATT_CAPACITY"], 1.0)

@@ -11,8 +11,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from fractus_vehicle.breadcrumbs import Point
 from fractus_vehicle.descent import descend
 from fractus_vehicle.flight import Flight
-from fractus_vehicle.home import return_point
 from fractus_vehicle.leg import Leg
+from fractus_vehicle.return_points import return_point
 from fractus_vehicle.state import CONTROL_STEP_S, VehicleState
 
 # Height of the approach above the last point of the path.

@@ -111,6 +111,7 @@ class VehicleState:
         self.servos: dict[int, int] = {}
         self.relays_on: set[int] = set()
         self.motor_test_until_s: float | None = None
+        self.accels_agree_from_s = -math.inf  # accelerometers count as inconsistent until then
         self.armed = False
         self.armed_at_s = 0.0
         self.armed_heading = math.radians(config.heading_deg)
@@ -160,6 +161,11 @@ class VehicleState:
     def sticks(self) -> tuple[int, ...]:
         """RC channels in microseconds."""
         return self.receiver.channels
+
+    @property
+    def throttle_below_failsafe(self) -> bool:
+        """True if the throttle channel is below FS_THR_VALUE, the value that a receiver without signal outputs."""
+        return self.sticks[2] < self.params["FS_THR_VALUE"]
 
     @property
     def place(self) -> Place:

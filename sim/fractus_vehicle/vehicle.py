@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fractus_vehicle.accessories import end_motor_test
@@ -14,7 +16,7 @@ from fractus_vehicle.motion import move
 from fractus_vehicle.plans import clear_items, replace_items, stores_of
 from fractus_vehicle.readiness import arming_refusals
 from fractus_vehicle.report_units import UNKNOWN_U16
-from fractus_vehicle.settings import LIMIT_PREFIXES, set_battery, set_fence, set_limits, set_wind
+from fractus_vehicle.settings import LIMIT_PREFIXES, accelerometers_differ, set_battery, set_fence, set_limits, set_wind
 from fractus_vehicle.state import CONTROL_STEP_S, VehicleConfig, VehicleState
 from fractus_vehicle.telemetry import attach, follow_rate, send_on_all, send_parameter, serve
 from fractus_vehicle.transfers import Transfers
@@ -26,6 +28,8 @@ _LANDING_MODES = frozenset({mavlink.COPTER_MODE_LAND, mavlink.COPTER_MODE_RTL, m
 CHECKS_REPORT_INTERVAL_S = 30.0
 PRESSURE_REPORT_INTERVAL_S = 10.0
 FIRST_PRESSURE_S = 1.0
+# Time for which the accelerometers must agree after a difference.
+ACCELS_AGREE_S = 10.0
 
 
 class Vehicle:
@@ -46,6 +50,8 @@ class Vehicle:
         self._next_checks_s = 0.5 * CHECKS_REPORT_INTERVAL_S
         self._next_pressure_s = FIRST_PRESSURE_S
         self.state.params.watch(self._parameter_changed)
+        if accelerometers_differ(self.state.params):
+            self.state.accels_agree_from_s = math.inf
 
     def attach(self, channel: Channel) -> None:
         """Open a link."""
@@ -125,6 +131,13 @@ class Vehicle:
         elif (v.mode in _LANDING_MODES and idle_s > 1.0) or 0.0 < delay <= idle_s:
             v.disarm()
 
+    def _compare_accelerometers(self) -> None:
+        v = self.state
+        if accelerometers_differ(v.params):
+            v.accels_agree_from_s = math.inf
+        elif v.accels_agree_from_s == math.inf:
+            v.accels_agree_from_s = v.time_s + ACCELS_AGREE_S
+
     def _parameter_changed(self, name: str) -> None:
         v = self.state
         prefix = name.split("_", 1)[0]
@@ -134,6 +147,8 @@ class Vehicle:
             set_fence(v.params, v.fence, name)
         elif name.startswith("SIM_WIND"):
             set_wind(v.params, v.wind)
+        elif name.startswith("SIM_ACC") or name == "ARMING_ACCTHRESH":
+            self._compare_accelerometers()
         elif prefix in ("SIM", "BATT"):
             set_battery(v.params, v.battery)
         elif prefix[:2] == "SR" and prefix[2:].isdigit():

@@ -50,8 +50,8 @@ chaos: packages uv ## Fly missions on an embedded cluster while its parts fail (
 		--first-seed $(or $(FIRST),1) --out $(OUT)/chaos
 
 .PHONY: compare-vehicle
-compare-vehicle: env ## Compare the simulated vehicle with recorded replies of ArduCopter (AUTOPILOT=tcp:HOST:PORT: with a running one)
-	PYTHONPATH=tests/component $(RUN) python tests/component/vehicle_script.py --all $(if $(AUTOPILOT),--autopilot $(AUTOPILOT))
+compare-vehicle: env ## Compare the simulated vehicle with recorded replies of ArduCopter (AUTOPILOT=tcp:HOST:PORT: with a running one, STEPS=FILE: another recording)
+	PYTHONPATH=tests/component $(RUN) python tests/component/vehicle_script.py --all $(if $(AUTOPILOT),--autopilot $(AUTOPILOT)) $(if $(STEPS),--steps $(STEPS))
 
 # --no-loadscope-reorder keeps the order of collection, in which the longest flights come first.
 PYTEST := $(RUN) pytest -q --no-loadscope-reorder

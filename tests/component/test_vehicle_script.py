@@ -1,4 +1,4 @@
-"""Responses of the simulated vehicle compared with a real ArduCopter 4.6.3, played from one script."""
+"""Responses of the simulated vehicle compared with the recorded ones of real ArduCopters, played from scripts."""
 
 from __future__ import annotations
 
@@ -10,15 +10,31 @@ from pathlib import Path
 import pytest
 import vehicle_script
 from fractus_runtime.mavlink_codec import Endpoint
-from vehicle_script import SimulatedConnection, Step, Summary, abort_reason, compare, main, matches, steps
+from vehicle_script import (
+    MISSION_STEPS,
+    STEPS,
+    SimulatedConnection,
+    Step,
+    Summary,
+    abort_reason,
+    compare,
+    main,
+    matches,
+    steps,
+)
+
+SCRIPTS = pytest.mark.parametrize("path", [STEPS, MISSION_STEPS], ids=lambda path: path.stem)
 
 
-def test_every_script_step_is_played_or_has_a_reason():
-    assert len({step.name for step in steps()}) == len(steps())
-    assert [step.name for step in steps() if not step.action and not step.note] == []
+@SCRIPTS
+def test_every_script_step_is_played_or_has_a_reason(path: Path):
+    script = steps(path)
+    assert len({step.name for step in script}) == len(script)
+    assert [step.name for step in script if not step.action and not step.note] == []
 
 
-def test_vehicle_responses_match_real_ardupilot():
+@SCRIPTS
+def test_vehicle_responses_match_real_ardupilot(path: Path):
     differing: list[str] = []
 
     def report(step: Step, response: str, verdict: str) -> None:
@@ -26,7 +42,7 @@ def test_vehicle_responses_match_real_ardupilot():
             differing.append(f"{step.name}: recorded {step.recorded}, simulated {response}")
 
     summary = Summary()
-    compare(SimulatedConnection(), report, steps(), summary, simulated=True)
+    compare(SimulatedConnection(), report, steps(path), summary, simulated=True)
     assert summary.wrong == 0, differing
     assert not summary.lost
 

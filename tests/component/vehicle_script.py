@@ -1,10 +1,10 @@
-"""Script of MAVLink exchanges that can be played on any autopilot, with the recorded responses of a real ArduCopter 4.6.3.
+"""Scripts of MAVLink exchanges that can be played on any autopilot, with the recorded responses of a real ArduCopter.
 
     python tests/component/vehicle_script.py [--autopilot tcp:HOST:PORT] [--all] [--steps FILE]
 
-Each row of `tests/golden/vehicle/arducopter-4.6.3.tsv` is a step: name, action, recorded response and note. A note
-explains an intended difference of the simulated vehicle, or why a step cannot be repeated. Numbers in responses may
-have a tolerance: `4.2~10%` accepts a deviation of 10 %, and `4.2~0.5` a deviation of 0.5.
+Each row of `tests/golden/vehicle/arducopter-*.tsv` is a step: name, action, recorded response and note. A note explains
+an intended difference of the simulated vehicle, or why a step cannot be repeated. Numbers in responses may have a
+tolerance: `4.2~10%` accepts a deviation of 10 %, and `4.2~0.5` a deviation of 0.5.
 
 Without --autopilot, the script is played on the simulated vehicle after a cold start, in simulated time. With --autopilot, steps that
 abort SITL are not played. If the link is lost, the script continues after a reconnection, and the summary is printed in any case.
@@ -19,7 +19,7 @@ import socket
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
@@ -29,7 +29,10 @@ from fractus_vehicle.simulation import Simulation
 from fractus_vehicle.state import VehicleConfig
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-STEPS = Path(__file__).parents[1] / "golden/vehicle/arducopter-4.6.3.tsv"
+RECORDINGS = Path(__file__).parents[1] / "golden/vehicle"
+STEPS = RECORDINGS / "arducopter-4.6.3.tsv"
+MISSION_STEPS = RECORDINGS / "arducopter-4.6.2.tsv"
+"""Arming checks and flown missions of ArduCopter 4.6.2."""
 HOME = Place.from_degrees(50.864, 4.679, 0.1)
 """Position of the recorded vehicle."""
 
@@ -44,6 +47,7 @@ ELSEWHERE_M = 5_000.0
 TARGET: dict[str, Value] = {"target_system": 1, "target_component": 1}
 GUIDED = 4
 RTL = 6
+LAND = 9
 BRAKE = 17
 KINDS = {"mission": 0, "fence": 1, "rally": 2}
 LOCAL_FRAMES = (1, 7, 8, 9, 12, 20, 21)
@@ -57,6 +61,7 @@ Row = tuple[int, int, float | None, float, float, tuple[float, ...]]
 _HOME_ROW: Row = (16, 0, 0.0, 0.0, 0.0, ())
 _TAKEOFF: Row = (22, 3, None, 0.0, 12.0, ())
 _RTL: Row = (20, 3, None, 0.0, 0.0, ())
+_CLIMB: tuple[Row, Row] = (_HOME_ROW, _TAKEOFF)
 
 
 def _waypoint(north: float, east: float, command: int = 16, frame: int = 3, *params: float) -> Row:
@@ -89,6 +94,23 @@ LISTS: dict[str, list[Row]] = {
         *(_waypoint(25.0, 0.0), _waypoint(25.0, 25.0), _waypoint(0.0, 25.0, 82), _RTL),
     ],
     "none": [],
+    # The positions of these missions are not recorded. They are chosen so that the legs take about the recorded time.
+    "jump": [*_CLIMB, _waypoint(15.0, 0.0), _waypoint(15.0, 15.0), (177, 3, None, 0.0, 0.0, (2.0, 1.0)), _RTL],
+    "loiter_time_land": [
+        *(*_CLIMB, _waypoint(20.0, 15.0, 19, 3, 5.0), (112, 3, None, 0.0, 0.0, (3.0,))),
+        *((178, 3, None, 0.0, 0.0, (1.0, 3.0)), _waypoint(30.0, 10.0), (115, 3, None, 0.0, 0.0, (90.0, 10.0, 1.0))),
+        (21, 3, 5.0, 5.0, 0.0, ()),
+    ],
+    "spline_turns": [
+        *(*_CLIMB, _waypoint(27.0, 5.0, 82), _waypoint(27.0, 27.0, 82), _waypoint(5.0, 27.0, 82)),
+        *(_waypoint(25.0, 37.0, 18, 3, 1.0, 0.0, 5.0), (93, 3, None, 0.0, 0.0, (3.0,)), _RTL),
+    ],
+    "no_end": [*_CLIMB, _waypoint(0.0, 15.0)],
+    "no_takeoff": [_HOME_ROW, _waypoint(0.0, 15.0), _RTL],
+    "jumpcur": [
+        *(*_CLIMB, _waypoint(80.0, 15.0), _waypoint(80.0, 40.0), _waypoint(0.0, 35.0), _waypoint(20.0, 35.0), _RTL),
+    ],
+    "clear_air": [*_CLIMB, _waypoint(36.0, 15.0), _waypoint(36.0, 65.0), _RTL],
     "ring": _fence_polygon((4, 4, 4, 4)),
     "two": _fence_polygon((2, 2)),
     "short": _fence_polygon((5, 5, 5, 5)),
@@ -103,6 +125,10 @@ LISTS: dict[str, list[Row]] = {
     "two_returns": [(5000, 0, 0.0, 0.0, 0.0, ()), (5000, 0, 1.0, 0.0, 0.0, ())],
     "rally": [(5100, 3, 10.0, 10.0, 20.0, ())],
 }
+
+
+def _is_disarmed(heartbeat: Message) -> bool:
+    return not heartbeat.integer("base_mode") & mavlink.MAV_MODE_FLAG_SAFETY_ARMED
 
 
 def mission_result(value: int) -> str:
@@ -224,6 +250,32 @@ def _same(expected: str, actual: str) -> bool:
         return False
 
 
+@dataclass(slots=True)
+class FlightRecord:
+    """Mission progress of one flight.
+
+    Attributes:
+        begun_s: Time of MISSION_START.
+        texts_from: Number of STATUSTEXTs received before.
+        reached: Reached items, with the seconds since `begun_s`.
+        current: Current items with their MISSION_STATE, without repetitions.
+    """
+
+    begun_s: float
+    texts_from: int
+    reached: list[str] = field(default_factory=list)
+    current: list[str] = field(default_factory=list)
+
+    def add(self, message: Message, now_s: float) -> None:
+        """Record the message if it reports progress of the mission."""
+        if message.name == "MISSION_ITEM_REACHED":
+            self.reached.append(f"{message.integer('seq')}={now_s - self.begun_s:.0f}")
+        if message.name == "MISSION_CURRENT":
+            now = f"{message.integer('seq')}/{message.integer('mission_state')}"
+            if self.current[-1:] != [now]:
+                self.current.append(now)
+
+
 class Player:
     """Plays steps on a connection and returns the responses."""
 
@@ -234,6 +286,8 @@ class Player:
         self.home = HOME
         self._next_beat_s = 0.0
         self._chunks = ""
+        self._flight = FlightRecord(0.0, 0)
+        self._following = False
 
     # -- communication -----------------------------------------------------------------------------------------
 
@@ -244,6 +298,8 @@ class Player:
         messages = self.connection.receive()
         for message in messages:
             self.last[message.name] = message
+            if self._following:
+                self._flight.add(message, self.connection.now_s)
             if message.name == "GLOBAL_POSITION_INT":
                 self._set_home(Place(message.integer("lat"), message.integer("lon"), 0.0))
             if message.name == "STATUSTEXT":
@@ -416,10 +472,15 @@ class Player:
         return f"{result.split(' ')[0]} hz={count / duration_s:.1f}"
 
     def do_streams(self, rate: str) -> str:
-        values = {"req_stream_id": 0, "req_message_rate": int(rate), "start_stop": 1}
-        self.connection.send("REQUEST_DATA_STREAM", TARGET | values)
+        self.do_request_streams(rate)
         ignored = {"STATUSTEXT", "PARAM_VALUE", "COMMAND_ACK", "TIMESYNC"}
         return " ".join(sorted({m.name for m in self._stream(3.0)} - ignored))
+
+    def do_request_streams(self, rate: str) -> str:
+        """Request all streams, without a check of what is sent."""
+        values = {"req_stream_id": 0, "req_message_rate": int(rate), "start_stop": 1}
+        self.connection.send("REQUEST_DATA_STREAM", TARGET | values)
+        return "done"
 
     def do_ready(self) -> str:
         """Wait in an automatic mode until the checks pass. Return the EKF flags before and after."""
@@ -672,6 +733,61 @@ class Player:
         distinct = [text for at, text in enumerate(mission_texts) if text not in mission_texts[at - 1 : at]]
         return f"reached={','.join(sequences['MISSION_ITEM_REACHED'][1:])} | {'; '.join(distinct)}"
 
+    def do_check(self, name: str, value: str) -> str:
+        """Set one parameter, try to arm in GUIDED, and restore the parameter. Return result, PREARM bit and texts."""
+        self.connection.send("PARAM_REQUEST_READ", TARGET | {"param_id": name.encode("ascii"), "param_index": -1})
+        before = self._until("PARAM_VALUE", 1.5, lambda m: m.text("param_id") == name)
+        assert before is not None
+        self._set(name, float(value))
+        self.do_wait("2")
+        response = self._send_command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, [1.0])
+        if response.startswith("ACCEPTED"):
+            self._send_command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, [0.0])
+        status = self._until("SYS_STATUS", 3.0)
+        assert status is not None
+        healthy = status.integer("onboard_control_sensors_health") & mavlink.MAV_SYS_STATUS_PREARM_CHECK
+        self._set(name, before.real("param_value"))
+        result, _, texts = response.partition(" | ")
+        return f"{result} prearm={1 if healthy else 0}{' | ' if texts else ''}{texts}"
+
+    def do_start(self) -> str:
+        """Arm in GUIDED and start the stored mission. The record of the flight begins."""
+        self._send_command(mavlink.MAV_CMD_DO_SET_MODE, [1.0, GUIDED])
+        armed = self._send_command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, [1.0])
+        self._flight = FlightRecord(self.connection.now_s, len(self.texts))
+        return f"{armed} {self._send_command(mavlink.MAV_CMD_MISSION_START, [])}"
+
+    def do_follow(self, until: str) -> str:
+        """Wait until the motors stop, at most until `until` seconds after the start. Return the final state.
+
+        Progress is recorded during this wait only, as in the probe that was run on the real vehicle.
+        """
+        self._following = True
+        left_s = self._flight.begun_s + float(until) - self.connection.now_s
+        disarmed = self._until("HEARTBEAT", left_s, _is_disarmed)
+        self._following = False
+        after_s = self.connection.now_s - self._flight.begun_s
+        north, east, up = self._position()
+        return f"armed={disarmed is None} mode={self._mode()} t={after_s:.0f} N={north:.0f} E={east:.0f} alt={up:.0f}"
+
+    def do_progress(self, kind: str) -> str:
+        """Return the `reached` or `current` items of the flight, or its `texts`."""
+        if kind == "texts":
+            texts = self.texts[self._flight.texts_from :]
+            return "; ".join(text for text in texts if not text[4:].startswith(SPONTANEOUS))
+        return " ".join(self._flight.reached if kind == "reached" else self._flight.current) or "none"
+
+    def do_where(self) -> str:
+        """Return mode and altitude."""
+        return f"mode={self._mode()} alt={self._position()[2]:.0f}"
+
+    def do_land(self) -> str:
+        """Change to LAND and return the seconds until the motors stop."""
+        begun_s = self.connection.now_s
+        self._send_command(mavlink.MAV_CMD_DO_SET_MODE, [1.0, LAND])
+        self._until("HEARTBEAT", 90.0, _is_disarmed)
+        return f"s={self.connection.now_s - begun_s:.1f}"
+
     def do_until(self, timeout: str, *words: str) -> str:
         """Wait for a STATUSTEXT. Return the elapsed seconds and the mode."""
         begun_s = self.connection.now_s
@@ -754,7 +870,7 @@ def compare(
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Print the table, and return the exit code: 0 if all steps were played and none differs unintentionally."""
-    parser = argparse.ArgumentParser(description="Compare an autopilot with a real ArduCopter 4.6.3.")
+    parser = argparse.ArgumentParser(description="Compare an autopilot with a real ArduCopter 4.6.")
     parser.add_argument("--autopilot", help="tcp:HOST:PORT, freshly booted; default: the simulated vehicle")
     parser.add_argument(
         "--all", action="store_true", help="also print steps without differences and steps that are not played"

@@ -46,6 +46,7 @@ class AutoFlight(Flight):
         self._index = 0
         self._arrived_s: float | None = None
         self._started = False
+        self._started_s = 0.0
         self._announced = False
         self._landing = False
         self._returning: ReturnToLaunch | None = None
@@ -73,6 +74,7 @@ class AutoFlight(Flight):
     def _start(self, v: VehicleState) -> None:
         """Start the mission at its current item, or at its beginning."""
         self._started = True
+        self._started_s = v.time_s
         mission = v.mission
         if int(v.params["MIS_RESTART"]) == 1 or mission.current == 0:
             mission.rewind()
@@ -86,19 +88,27 @@ class AutoFlight(Flight):
         A mission that was running when the motors stopped was reset. It waits at its first item.
         """
         if self._started:
-            self._started = False
-            self._announced = False
-            self._item = self._leg = self._returning = None
-            self._landing = False
+            self._reset()
         if not self._announced and v.origin is not None and not v.mission.complete:
             self._announced = True
             self._announce(v)
+
+    def _reset(self) -> None:
+        """Forget the progress of the mission. It was reset when the motors stopped."""
+        self._started = False
+        self._announced = False
+        self._item = self._leg = self._returning = None
+        self._landing = False
 
     def start_by_command(self, v: VehicleState) -> None:
         """Handle MISSION_START: report the first item in a STATUSTEXT if the mission is not running yet.
 
         `step` reports the item again when it starts the mission.
         """
+        if v.mission.complete:
+            v.mission.rewind()
+            self._started = False
+            self._announced = False
         if not self._started and not self._announced:
             self._announce(v)
 
@@ -119,6 +129,7 @@ class AutoFlight(Flight):
     def jump_to(self, v: VehicleState, index: int) -> None:
         """Continue at item `index` (DO_SET_MISSION_CURRENT)."""
         self._started = True
+        self._started_s = v.time_s
         self._returning = None
         self._landing = False
         v.mission.complete = False
@@ -228,8 +239,10 @@ class AutoFlight(Flight):
         return (north - base[0], east - base[1], down - base[2])
 
     def step(self, v: VehicleState) -> None:
-        """Fly the current item, and begin the next item when it is complete."""
-        if not self._started:
+        """Fly the current item, and begin the next item when it is complete. A completed mission is not started."""
+        if self._started and v.armed_at_s > self._started_s:
+            self._reset()  # the motors stopped and started between two steps
+        if not self._started and not v.mission.complete:
             self._start(v)
         item = self._item
         if item is None or self.paused:

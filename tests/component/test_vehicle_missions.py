@@ -581,3 +581,30 @@ def test_loiter_of_no_turns_ends_on_the_circle():
     vehicle, _, track = _fly_mission([_waypoint(30.0, 0.0, 10.0, command=18, param3=5.0)])
     assert track[-1][4] - track[0][4] < 12.0
     assert distance_m(vehicle, 25.0, 0.0) < 3.0
+
+
+def test_mission_start_in_auto_restarts_a_completed_mission_on_the_ground():
+    vehicle, pilot = alone()
+    upload(pilot, 0, SHORT)
+    _start_mission(pilot)
+    pilot.wait(lambda: not vehicle.armed, 90.0)
+    assert vehicle.mode == mavlink.COPTER_MODE_AUTO
+    before = len(pilot.texts)
+    assert pilot.command(mavlink.MAV_CMD_MISSION_START) == mavlink.MAV_RESULT_ACCEPTED
+    pilot.fly_on(0.1)
+    assert pilot.texts[before:] == ["Mission: 1 Takeoff", "Mission: 1 Takeoff"]
+    assert _current(pilot) == (1, mavlink.MISSION_STATE_ACTIVE)
+
+
+@pytest.mark.parametrize("pause_s", [0.0, 0.5])
+def test_completed_mission_does_not_start_by_itself_when_armed_in_auto(pause_s: float):
+    vehicle, pilot = alone()
+    upload(pilot, 0, SHORT)
+    _start_mission(pilot)
+    pilot.wait(lambda: not vehicle.armed, 90.0)
+    pilot.fly_on(pause_s)
+    assert pilot.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1.0, 2989.0) == mavlink.MAV_RESULT_ACCEPTED
+    pilot.fly_on(8.0)
+    assert vehicle.armed
+    assert vehicle.landed
+    assert _current(pilot) == (0, mavlink.MISSION_STATE_COMPLETE)

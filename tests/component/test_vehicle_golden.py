@@ -12,14 +12,14 @@ from vehicle_flights import at_random, breaches, by_hand, failing, mission, pilo
 from vehicle_pilot import Pilot
 
 FLIGHTS: tuple[tuple[Callable[[Pilot], None], int, dict[str, float], str], ...] = (
-    (mission, 2, {"SIM_WIND_SPD": 5.0, "SIM_WIND_TURB": 1.5, "WP_YAW_BEHAVIOR": 0.0}, "ae85b51df9586d65"),
-    (by_hand, 3, {"SIM_WIND_SPD": 4.0, "SIM_WIND_TURB": 2.0}, "11af832e55a3f0db"),
-    (smart_return, 4, {}, "1ca6a0452a05003d"),
-    (breaches, 5, {}, "d9080c7c4cc3f2ba"),
-    (breaches, 6, {"FENCE_ACTION": 3.0}, "fa58da5692c7e3b1"),
-    (failing, 7, {}, "7982713408adefbe"),
-    (at_random, 10, {}, "063c2c1ed9ccf004"),
-    (at_random, 17, {}, "e029354244c33eed"),
+    (mission, 2, {"SIM_WIND_SPD": 5.0, "SIM_WIND_TURB": 1.5, "WP_YAW_BEHAVIOR": 0.0}, "99469accccc88673"),
+    (by_hand, 3, {"SIM_WIND_SPD": 4.0, "SIM_WIND_TURB": 2.0}, "891d43c7dd03c903"),
+    (smart_return, 4, {}, "d2b5b3b2d69a0b49"),
+    (breaches, 5, {}, "2356db92c8ffe468"),
+    (breaches, 6, {"FENCE_ACTION": 3.0}, "34486dd037334bea"),
+    (failing, 7, {}, "8c19001e99e0e0da"),
+    (at_random, 10, {}, "c9b9219166b54fb3"),
+    (at_random, 17, {}, "0da2e3b02a800de4"),
 )
 
 

@@ -216,7 +216,7 @@ def test_drain_setting_must_be_a_number_in_range() -> None:
             Settings.from_environment({"FRACTUS_NODE": "d1", "FRACTUS_DRAIN_S": bad})
     schema = json.loads((Path(__file__).parents[2] / "charts/fractus/values.schema.json").read_text())
     drain = schema["properties"]["directLinks"]["properties"]["drainSeconds"]
-    assert (drain["type"], drain["minimum"], drain["maximum"]) == ("number", 0, MAX_DRAIN_S)
+    assert (drain["type"], drain["minimum"], drain["maximum"]) == (["number", "string"], 0, MAX_DRAIN_S)
 
 
 def test_session_with_a_peer_that_sends_no_routes_is_lost(monkeypatch: pytest.MonkeyPatch) -> None:

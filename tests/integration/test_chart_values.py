@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import json
+import subprocess
+from collections.abc import Iterator
 from functools import cache
 from typing import Any
 
 import pytest
-from chart import render, values_of
+from chart import CHARTS, render, values_of
 
 VALUES = tuple(values_of("fractus"))
+SCHEMA = json.loads((CHARTS / "fractus" / "values.schema.json").read_text())
 EVERYTHING = [
     f"--set={part}.enabled=true" for part in ("view", "metrics.podMonitor", "metrics.rules", "metrics.dashboard")
 ]
@@ -76,3 +80,41 @@ def test_chart_quotes_names_and_paths() -> None:
     assert agent["priorityClassName"] == "123"
     paths = {volume["name"]: volume["hostPath"]["path"] for volume in agent["volumes"] if "hostPath" in volume}
     assert paths["config"] == "/etc/a: b}"
+
+
+FRACTIONS = {
+    "operator.planning.safetyRadius": ("7.5", ("0.0", "-7.5", "7.5m", "0", "-1")),
+    "operator.planning.depotRadius": ("0.5", ("0.00", "1e-3")),
+    "operator.planning.coverageShare": ("0.85", ("1.5", "-0.1", "2")),
+    "operator.planning.cruiseSpeed": ("5.25", ("fast", ".")),
+    "operator.planning.climbSpeed": ("2.5", ("0.0", "two")),
+    "operator.planning.batteryReserve": (".25", ("1.01", "20%")),
+    "mobility.driverGrace": ("2.5", ("-2.5", "-1", "2.5s")),
+    "directLinks.drainSeconds": ("2.5", ("600.5", "601", "-1.5", "1.5s")),
+}
+"""Values that may be fractions: a valid one, and invalid ones. `helm --set` passes fractions as strings."""
+
+
+@pytest.mark.parametrize("name", FRACTIONS)
+def test_chart_accepts_fraction_of_set_and_refuses_value_out_of_range(name: str) -> None:
+    enabled = ("--set=directLinks.enabled=true",)
+    valid, invalid = FRACTIONS[name]
+    rendered = render(*enabled, f"--set={name}={valid}")
+    assert rendered == render(*enabled, f"--set-json={name}={float(valid)}") or valid.startswith(".")
+    assert rendered != render(*enabled)
+    for value in invalid:
+        with pytest.raises(subprocess.CalledProcessError) as refused:
+            render(*enabled, f"--set={name}={value}")
+        assert f"/{name.replace('.', '/')}" in refused.value.stderr
+
+
+def test_every_fraction_of_values_schema_is_tested() -> None:
+    def fractions(schema: Any, name: str) -> Iterator[str]:
+        target = schema.get("$ref", "").rpartition("/")[2]
+        found = SCHEMA["definitions"][target] if target else schema
+        if "number" in found.get("type", ()):
+            yield name.removeprefix(".")
+        for key, inner in found.get("properties", {}).items():
+            yield from fractions(inner, f"{name}.{key}")
+
+    assert set(fractions(SCHEMA, "")) == set(FRACTIONS)

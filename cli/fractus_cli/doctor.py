@@ -302,8 +302,13 @@ def _scheduling_remedy(pod: Body) -> str:
 def _authority(config_map: Body | None, now: datetime) -> Iterator[Finding]:
     text = ((config_map or {}).get("data") or {}).get("ca.crt", "")
     if not text:
-        remedy = "the operator creates it when it starts; see the result of the check `operator`"
-        yield Finding("error", "certificates", "the certificate authority does not exist yet", remedy)
+        state = "does not exist" if config_map is None else "has no ca.crt"
+        remedy = (
+            "a running operator restores it within 10 s; see the result of the check `operator`, and"
+            f" kubectl -n {SYSTEM} logs deployment/fractus-operator"
+        )
+        message = f"the ConfigMap fractus-ca, from which nodes read the certificate of the authority, {state}"
+        yield Finding("error", "certificates", message, remedy)
         return
     try:
         ends = min(c.not_valid_after_utc for c in x509.load_pem_x509_certificates(text.encode()))

@@ -21,7 +21,7 @@ from prometheus_client import Metric
 
 from fractus_operator import handlers, kinds, node_liveness, operator_metrics, service_rollout
 from fractus_operator.application_controller import ApplicationController
-from fractus_operator.ca_secret import open_authority
+from fractus_operator.ca_secret import CERTIFICATE_PERIOD_S, open_authority, publish_certificate
 from fractus_operator.cache import ClusterCache
 from fractus_operator.cleanup import ORPHANED_PODS_PERIOD_S, OrphanedObjects, OrphanedPods
 from fractus_operator.csr_controller import CsrController
@@ -94,6 +94,11 @@ async def run(settings: Settings, stop: asyncio.Event | None = None) -> None:
             run_periodically("node liveness", liveness.step, node_liveness.LIVENESS_PERIOD_S),
             run_periodically("service rollout", services.step, service_rollout.ROLLOUT_PERIOD_S),
             run_periodically("orphaned pods", orphaned_pods.step, ORPHANED_PODS_PERIOD_S),
+            run_periodically(
+                "authority certificate",
+                lambda: publish_certificate(store, settings.namespace, authority),
+                CERTIFICATE_PERIOD_S,
+            ),
             # Shielded, because the last writes of cancelled parts need the Lease.
             _await(asyncio.shield(election)),
         ]

@@ -15,14 +15,19 @@ from fractus_operator.pods import PlannedRequest
 
 
 class PlanListener(Protocol):
-    """An index that depends on active plans."""
+    """An index that depends on plans."""
 
     def plan_changed(self, key: Key, old: OwnedPlan | None, new: OwnedPlan | None) -> None:
         """Handle a change of the active plan of an Application. A plan is None if there is no active plan."""
 
+    def mission_returns(self, key: Key, plan: OwnedPlan) -> None:
+        """Handle the plan of an Application whose mission is over and whose drone has not landed yet."""
+
 
 class ActivePlans:
-    """The active plans by Application. A plan is active until the mission that it was made for is over.
+    """The active plans by Application. A plan is active until it records the outcome of its mission.
+
+    The status of an Application is no input, because anyone who may edit the status could end a flight with it.
 
     Args:
         applications: All Applications. `application_changed` must be called for each change.
@@ -63,7 +68,7 @@ class ActivePlans:
         return plan.spec if plan is not None and plan.uid == uid else None
 
     def flight_host(self, plan: DeploymentPlanSpec | None) -> tuple[Submitted | None, DeploymentPlanSpec | None]:
-        """Return the Application whose flight a plan shares, and its active plan.
+        """Return the Application whose flight a plan shares, and its latest plan, even if its mission is over.
 
         The Application or plan is None if it does not exist.
         """
@@ -72,7 +77,7 @@ class ActivePlans:
         namespace, _, name = plan.drone.shared_with.partition("/")
         key = (namespace, name)
         host = self._applications.get(key)
-        return host, self.get(key, host.uid) if host is not None else None
+        return host, self.latest(key, host.uid) if host is not None else None
 
     def wake_guests(self, host: Key) -> None:
         """Wake the Applications that share the flight of `host`, because that flight may have ended or changed."""
@@ -114,6 +119,10 @@ class ActivePlans:
         if old is not new:
             self._listener.plan_changed(key, old, new)
         submitted = self._applications.get(key)
+        if latest is not None and latest.spec.is_over and self._is_current(latest, submitted):
+            assert latest.spec.flown is not None
+            if not latest.spec.flown.landed:
+                self._listener.mission_returns(key, latest)
         if old is not None or new is not None:
             planned = _requests(new, submitted) if new is not None and submitted is not None else ()
             self._on_requests(label_key(key), planned)
@@ -134,11 +143,11 @@ class ActivePlans:
         return self._decided.get(key) or self._stored.get(key)
 
     def _is_active(self, key: Key, plan: OwnedPlan) -> bool:
-        submitted = self._applications.get(key)
-        if submitted is None or submitted.uid != plan.uid:
-            return False
-        settled = submitted.settled_generation
-        return settled is None or (plan.spec.application_generation or 0) > settled
+        return self._is_current(plan, self._applications.get(key)) and not plan.spec.is_over
+
+    def _is_current(self, plan: OwnedPlan, submitted: Submitted | None) -> bool:
+        """Return True if a plan belongs to the Application that exists now under its name."""
+        return submitted is not None and submitted.uid == plan.uid
 
 
 def _requests(plan: OwnedPlan, submitted: Submitted) -> tuple[PlannedRequest, ...]:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from datetime import datetime, timedelta
 
 from fractus_core.api import Application, InvalidObject
-from fractus_core.api.plans import DeploymentPlanSpec
+from fractus_core.api.plans import DeploymentPlanSpec, MissionRecord
 from fractus_core.identity.authority import Authority
 from fractus_core.identity.grant_signer import GrantSigner
 from fractus_core.planning.inventory import Inventory, Settings
@@ -28,7 +28,7 @@ from fractus_operator.kinds import Key
 from fractus_operator.labels import FINALIZER
 from fractus_operator.operator_metrics import phase as timed
 from fractus_operator.operator_metrics import reconciling
-from fractus_operator.parsing import SETTLED, Submitted
+from fractus_operator.parsing import Submitted
 from fractus_operator.pods import refusal_of
 from fractus_operator.replanning import (
     choose_plan,
@@ -40,7 +40,15 @@ from fractus_operator.replanning import (
 )
 from fractus_operator.rollout import Rollout
 from fractus_operator.route_check_cache import RouteCheckCache
-from fractus_operator.status import Blocked, Phase, StatusUpdate, flight, mission_outcome
+from fractus_operator.status import (
+    Blocked,
+    Phase,
+    StatusUpdate,
+    flight,
+    mission_outcome,
+    reported_record,
+    reports_outcome,
+)
 from fractus_operator.status_reporter import StatusReporter
 from fractus_operator.store import KubeError, Store
 
@@ -197,19 +205,10 @@ class ApplicationController:
         """Take one step. Return the seconds until the next one."""
         submitted = observed.submitted
         self._cache.subscriptions.set_placed(observed.key, placed=False)
-        next_s = await self._clean_up_finished(observed)
+        next_s = await self._follow_finished(observed)
         if next_s is not None:
             return next_s
-        outcome = mission_outcome(observed.uid, observed.grants) or shared_flight_outcome(observed.plan, *observed.host)
-        if outcome is not None:
-            # The outcome is reported before anything is deleted, because the Grants are its only other record.
-            choice = observed.plan.drone if observed.plan is not None else None
-            name = choice.node if choice is not None else self._reporter.last(submitted).get("drone")
-            drone = self._cache.drone(name) if name is not None else None
-            update = status.finished(outcome, name, drone, observed.pods)
-            await self._reporter.report(submitted, update, flown_generation(submitted.application, observed.plan))
-            await self._finish(submitted)
-            return RESYNC_S
+        observed = self._record_takeoff(observed)
         present = None
         if observed.plan is not None and self._objects.of(observed.key, kinds.DEPLOYMENT):
             present = self._deployed_status(observed, observed.plan, 0)
@@ -226,37 +225,84 @@ class ApplicationController:
         await self._reporter.report(submitted, update)
         return next_s
 
-    async def _clean_up_finished(self, observed: ObservedApplication) -> float | None:
-        """Remove the objects of a finished mission.
+    async def _follow_finished(self, observed: ObservedApplication) -> float | None:
+        """Record the outcome of a mission that is over, report it, and remove its objects.
+
+        The plan is the record of the outcome. It is written before anything is deleted, because the Grants are the only other
+        record.
 
         Returns:
             Seconds until the next step, or None if the mission is not over or a new one may begin.
         """
-        reported = self._reporter.last(observed.submitted)
-        if reported.get("phase") not in SETTLED:
-            return None
         submitted = observed.submitted
         application = submitted.application
-        reported_generation = reported.get("observedGeneration") == submitted.metadata.generation
         flown = self._cache.plans.latest(observed.key, observed.uid)
+        if flown is None:
+            return await self._follow_without_record(observed)
+        if not flown.is_over:
+            record = self._observed_record(observed, flown)
+            if record is None:
+                return None
+            flown = flown.model_copy(update={"flown": record})
+        elif application is not None and mission_changed(application, flown):
+            # A remaining plan of the last mission would claim its drone, and exempt the next mission from checks.
+            removed = await self._start_over(observed.key)
+            # The Grants of the last mission must be deleted before a new one begins.
+            return 1.0 if removed else None
         # An invalid manifest describes no new mission. The record of the last mission stays until the manifest is valid.
-        same_mission = observed.plan is None and (application is None or not mission_changed(application, flown))
-        if reported_generation or same_mission:
-            next_s = await self._finish(submitted) if observed.plan is None else RESYNC_S
-            if reported_generation and observed.plan is None and application is not None and flown is not None:
-                await self._rollout.keep_plan(application, flown)
-            returning = reported["phase"] == "Returning"
-            if returning or not reported_generation:
-                # A drone that has returned may already fly for another Application.
-                drone = self._cache.drone(reported.get("drone") or "") if returning else None
-                await self._reporter.report(submitted, status.still_over(reported, drone))
-            return next_s
-        if observed.plan is not None:
+        record = flown.flown
+        assert record is not None
+        name = flown.drone.node if flown.drone is not None else None
+        drone = self._cache.drone(name) if name is not None else None
+        # A drone that has landed may later fly for another Application.
+        if name is None or (drone is not None and not drone.in_air):
+            record = record.model_copy(update={"landed": True})
+        if record != flown.flown:
+            flown = flown.model_copy(update={"flown": record})
+        await self._rollout.keep_plan(submitted, flown)
+        generation = flown_generation(application, flown) if application is not None else None
+        await self._reporter.report(submitted, status.over(record, name, drone), generation)
+        return await self._finish(submitted)
+
+    def _observed_record(self, observed: ObservedApplication, flown: DeploymentPlanSpec) -> MissionRecord | None:
+        """Return the record of a mission that is over according to its Grants, or None."""
+        outcome = mission_outcome(observed.uid, observed.grants) or shared_flight_outcome(flown, observed.host[1])
+        if outcome is not None:
+            return status.mission_record(outcome, observed.pods)
+        # Earlier releases recorded the outcome only in the status. Anyone could have edited the status, so the mission counts as
+        # over only if nothing remains that could fly it.
+        if flown.drone is not None and flown.drone.shared_with is None:
+            remaining = any(reports_outcome(observed.uid, grant) for grant in observed.grants)
+        else:
+            remaining = bool(self._objects.of(observed.key, kinds.DEPLOYMENT))
+        if remaining:
             return None
-        # A remaining plan of the last mission would claim its drone, and exempt the next mission from checks.
-        removed = await self._start_over(observed.key)
-        # The Grants of the last mission must be deleted before a new one begins.
-        return 1.0 if removed else None
+        return reported_record(self._reporter.last(observed.submitted), flown.application_generation or 0)
+
+    async def _follow_without_record(self, observed: ObservedApplication) -> float | None:
+        """Keep an Application without a plan on the ground if its mission may have been flown.
+
+        Returns:
+            Seconds until the next step, or None if its Grants report no outcome, and its status reports none or a Grant shows that
+            the mission continues.
+        """
+        submitted = observed.submitted
+        generation = submitted.metadata.generation or 0
+        reported = self._reporter.last(submitted)
+        flies = any(reports_outcome(observed.uid, grant) for grant in observed.grants)
+        over = reported_record(reported, generation) is not None and not flies
+        if not over and mission_outcome(observed.uid, observed.grants) is None:
+            return None
+        await self._reporter.report(submitted, status.without_record())
+        return await self._finish(submitted)
+
+    def _record_takeoff(self, observed: ObservedApplication) -> ObservedApplication:
+        """Record in the active plan that its drone has taken off. The rollout of the plan stores the record."""
+        plan = observed.plan
+        if plan is None or plan.flown is not None or observed.in_flight is None:
+            return observed
+        self._cache.plans.decide(observed.key, observed.uid, plan.model_copy(update={"flown": MissionRecord()}))
+        return self._cache.observe(observed.submitted)
 
     async def _deploy(self, observed: ObservedApplication, state: _ApplicationState) -> tuple[StatusUpdate, float]:
         """Plan, compile Grants, and apply.
@@ -330,6 +376,9 @@ class ApplicationController:
                 observed.key, application, unchecked, rules=observed.rules, inventory=inventory, settings=settings
             )
         choice = choose_plan(application, present, inventory, settings, stuck=stuck, in_flight=observed.in_flight)
+        flown = observed.plan.flown if observed.plan is not None else None
+        if flown is not None and choice.plan.flown is None and _drone_of(choice.plan) == _drone_of(observed.plan):
+            choice = replace(choice, plan=choice.plan.model_copy(update={"flown": flown}))
         # On these nodes the plan would have more instances if they had free capacity.
         full = full_nodes(application, inventory, settings, choice.plan)
         self._cache.subscriptions.set_placed(observed.key, placed=choice.suits, full=full)
@@ -369,8 +418,11 @@ class ApplicationController:
 
     def _deployed_status(self, observed: ObservedApplication, plan: DeploymentPlanSpec, granted: int) -> StatusUpdate:
         node = plan.drone.node if plan.drone is not None else None
-        reported = self._reporter.last(observed.submitted)
-        flown = flight(node, self._cache.drone(node), reported) if node is not None else None
+        flown = flight(node, self._cache.drone(node), took_off=plan.flown is not None) if node is not None else None
         deployments = self._objects.of(observed.key, kinds.DEPLOYMENT)
         refused = {body["metadata"]["name"]: refusal_of(body) for body in deployments}
         return status.deployed(plan, observed.pods, granted, flown, refused)
+
+
+def _drone_of(plan: DeploymentPlanSpec | None) -> str | None:
+    return plan.drone.node if plan is not None and plan.drone is not None else None

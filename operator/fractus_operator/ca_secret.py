@@ -13,6 +13,9 @@ from fractus_operator.store import Conflict, NotFound, Store
 
 log = logging.getLogger(__name__)
 
+CERTIFICATE_PERIOD_S = 10.0
+"""Period of the check that the ConfigMap with the certificate exists and is unchanged, in seconds."""
+
 NAME = "fractus-ca"
 """Name of the Secret with the key of the authority, and of the ConfigMap with its certificate."""
 
@@ -39,9 +42,24 @@ async def open_authority(store: Store, namespace: str) -> Authority:
         raise BrokenAuthority(
             f"Secret {namespace}/{NAME}: {error}; restore it, or delete it to create a new authority"
         ) from error
-    public = {**_managed(CONFIG_MAP.header(NAME, namespace)), "data": {"ca.crt": authority.certificate_pem.decode()}}
-    await store.apply(CONFIG_MAP, public)
+    await publish_certificate(store, namespace, authority)
     return authority
+
+
+async def publish_certificate(store: Store, namespace: str, authority: Authority) -> None:
+    """Write the authority's certificate to its ConfigMap, unless the ConfigMap contains it. Agents read it from there.
+
+    Raises:
+        KubeError: The API server refused the write, or could not be reached.
+    """
+    data = {"ca.crt": authority.certificate_pem.decode()}
+    try:
+        present = (await store.get(CONFIG_MAP, NAME, namespace)).get("data")
+    except NotFound:
+        present = None
+    if present != data:
+        log.info("ca secret: certificate of the authority published (configmap=%s/%s)", namespace, NAME)
+        await store.apply(CONFIG_MAP, {**_managed(CONFIG_MAP.header(NAME, namespace)), "data": data})
 
 
 def _managed(header: Body) -> Body:

@@ -47,7 +47,7 @@ class ObservedApplication:
         plan: The active plan, if any.
         pods: Pods of the current mission.
         grants: All Grants under its name, including Grants of an earlier Application with the same name.
-        host: The Application whose flight it shares, and the active plan of that Application. Each may be None.
+        host: The Application whose flight it shares, and the latest plan of that Application. Each may be None.
         in_flight: The drone of its plan while that drone is in flight.
         rules: Revision of the inputs of Grants.
     """
@@ -329,7 +329,7 @@ class ClusterCache:
         if new is None:
             self.plans.forget(key)
             self.torn_down.pop(key, None)
-        if old is None or new is None or old.settled_generation != new.settled_generation:
+        if old is None or new is None:
             self.plans.wake_guests(key)
             # A new Application releases no resources.
             if old is not None:

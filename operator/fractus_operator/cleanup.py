@@ -120,7 +120,8 @@ class FinishedPods:
             KubeError: The API server refused a deletion, or could not be reached.
         """
         submitted = self._cache.applications.get(key)
-        interrupted = submitted is None or submitted.settled_generation is not None
+        plan = self._cache.plans.latest(key, submitted.uid) if submitted is not None else None
+        interrupted = plan is None or plan.is_over
         # A Deployment with a finalizer of another controller does not take its pods with it.
         deleted = await self._objects.remove_at_once(key, kinds.DEPLOYMENT)
         await self._objects.remove(key, *(kind for kind in reversed(kinds.CHILDREN) if kind is not kinds.DEPLOYMENT))

@@ -63,6 +63,10 @@ class ActiveMission:
     in_flight: bool
 
 
+_UNKNOWN_CLAIM = Claim(("fractus-system", "flight-home"), "")
+"""Claim on a drone in the air for which there is neither a Grant nor a plan."""
+
+
 def claims(plans: Mapping[Key, OwnedPlan], grants: Iterable[Grant]) -> dict[str, Claim]:
     """Return the claims by node name.
 
@@ -167,6 +171,13 @@ class Fleet:
                 else:
                     self._plans.drop(("", node), key)
 
+    def mission_returns(self, key: Key, plan: OwnedPlan) -> None:
+        """Handle a plan whose drone returns. An operator that restarted knows the claim of the drone only from such a plan."""
+        drone = plan.spec.drone
+        if drone is not None and drone.shared_with is None and drone.node not in self._last_claims:
+            self._last_claims[drone.node] = Claim(key, plan.uid)
+            self._changed.add(drone.node)
+
     def grant_changed(self, key: Key, old: Grant | None, new: Grant | None) -> None:
         """Handle a change of a Grant."""
         for grant in (old, new):
@@ -207,7 +218,7 @@ class Fleet:
             claim = claims(self._plans.members(("", node)), self._grants.of(("", node))).get(node)
             drone = self._drones.get(("", node))
             if claim is None and drone is not None and drone.in_air:
-                claim = replace(self._last_claims.get(node) or self._claim_from_status(node), returning=True)
+                claim = replace(self._last_claims.get(node, _UNKNOWN_CLAIM), returning=True)
             if claim is None:
                 self._claims.pop(node, None)
             else:
@@ -227,16 +238,6 @@ class Fleet:
             if plan.spec.drone is None or plan.spec.drone.shared_with is not None or submitted.application is None:
                 continue
             yield ActiveMission(submitted.application, plan.spec, drone, drone.in_air)
-
-    def _claim_from_status(self, drone: str) -> Claim:
-        """Return the claim of the Application that last flew a drone, from the status of the Applications.
-
-        An operator that restarted has no other record.
-        """
-        for key, submitted in sorted(self._applications.items()):
-            if (submitted.body.get("status") or {}).get("drone") == drone:
-                return Claim(key, submitted.uid)
-        return Claim(("fractus-system", "flight-home"), "")
 
 
 def offered_flights(
@@ -272,21 +273,18 @@ def offered_flights(
     return flights
 
 
-def shared_flight_outcome(
-    plan: DeploymentPlanSpec | None, host: Submitted | None, host_plan: DeploymentPlanSpec | None
-) -> Outcome | None:
+def shared_flight_outcome(plan: DeploymentPlanSpec | None, host_plan: DeploymentPlanSpec | None) -> Outcome | None:
     """Return the mission outcome of an Application that shares a flight, or None while the mission continues.
 
     The mission is complete when the mission of its host is complete.
 
     Args:
         plan: Plan of the Application.
-        host: Application whose flight it shares, if it still exists.
-        host_plan: Active plan of the host.
+        host_plan: Latest plan of the Application whose flight it shares.
     """
     if plan is None or plan.drone is None or plan.drone.shared_with is None:
         return None
-    if host is None or host_plan is not None or not host.completed:
+    if host_plan is None or host_plan.flown is None or host_plan.flown.outcome != "Complete":
         return None
     name = plan.drone.shared_with
     return Outcome(OutcomeKind.COMPLETE, f"{name} has flown {plan.drone.node} past all points of interest")
@@ -304,7 +302,7 @@ def shared_flight_lost(
     Args:
         application: Application that shares the flight.
         plan: Plan of the Application.
-        host_plan: Active plan of the Application whose flight it shares.
+        host_plan: Latest plan of the Application whose flight it shares.
         flight: Complete flight of the host, or None if it is unknown.
         radius_m: Maximum distance of a drone from its path, in metres.
     """
@@ -312,7 +310,9 @@ def shared_flight_lost(
         return None
     name = plan.drone.shared_with
     node = plan.drone.node
-    if host_plan is None or host_plan.drone is None or host_plan.drone.shared_with is not None:
+    if host_plan is None or host_plan.is_over:
+        return f"shared flight ended: {name} no longer flies {node}"
+    if host_plan.drone is None or host_plan.drone.shared_with is not None:
         return f"shared flight ended: {name} no longer flies {node}"
     if host_plan.drone.node != node:
         return f"shared flight changed: {name} now flies {host_plan.drone.node}"

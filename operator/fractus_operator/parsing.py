@@ -70,18 +70,6 @@ class Submitted(_Object):
         """(namespace, name)."""
         return self.body["metadata"].get("namespace", ""), self.body["metadata"]["name"]
 
-    @property
-    def completed(self) -> bool:
-        """True if the mission was completed, even if the drone is still returning."""
-        conditions = (self.body.get("status") or {}).get("conditions") or ()
-        return any(c["type"] == "MissionComplete" and c["status"] == "True" for c in conditions)
-
-    @property
-    def settled_generation(self) -> int | None:
-        """The generation whose mission is over. None before and during a mission."""
-        status = self.body.get("status") or {}
-        return int(status.get("observedGeneration") or 0) if status.get("phase") in SETTLED else None
-
 
 @dataclass(frozen=True, slots=True)
 class OwnedPlan:

@@ -23,8 +23,9 @@ from fractus_operator.child_objects import ChildObjects
 from fractus_operator.comparison import contains
 from fractus_operator.kinds import Body, Key, key_of
 from fractus_operator.labels import CAUSE_ANNOTATION, CERTIFICATE_ANNOTATION, COMPONENT_LABEL
+from fractus_operator.parsing import Submitted
 from fractus_operator.pods import PodView
-from fractus_operator.replanning import of_generation
+from fractus_operator.replanning import mission_changed, of_generation
 from fractus_operator.resources.children import children, deployment_plan
 from fractus_operator.resources.direct_link import direct_links, retargeted
 from fractus_operator.resources.secret import Certificate, Certificates
@@ -125,17 +126,27 @@ class Rollout:
             self.in_progress -= 1
         return current
 
-    async def keep_plan(self, application: Application, plan: DeploymentPlanSpec) -> None:
-        """Store the plan of a finished mission as the plan of the Application's current generation.
+    async def keep_plan(self, submitted: Submitted, plan: DeploymentPlanSpec) -> None:
+        """Store the plan of a finished mission, which records its outcome.
+
+        If the manifest describes the same mission, the plan becomes that of the Application's current generation.
 
         Raises:
             NameTaken: An object of another owner has its name.
             KubeError: The API server refused it, or could not be reached.
         """
-        kept = of_generation(application, plan)
-        if kept is not plan:
-            self._cache.plans.decide(application.key, application.metadata.uid or "", kept)
-            await self._objects.apply(application, {kinds.DEPLOYMENT_PLAN: [deployment_plan(application, kept)]})
+        application = submitted.application
+        if application is None:
+            observed = self._objects.get(kinds.DEPLOYMENT_PLAN, submitted.key)
+            fields = {"spec": {"flown": plan.to_dict()["flown"]}}
+            if observed is not None and not contains(observed, fields):
+                await self._objects.change(kinds.DEPLOYMENT_PLAN, observed, fields)
+            self._cache.plans.forget(submitted.key)
+            return
+        kept = plan if mission_changed(application, plan) else of_generation(application, plan)
+        await self._objects.apply(application, {kinds.DEPLOYMENT_PLAN: [deployment_plan(application, kept)]})
+        if kept is not self._cache.plans.latest(submitted.key, submitted.uid):
+            self._cache.plans.decide(submitted.key, submitted.uid, kept)
 
     def forget(self, key: Key) -> None:
         """Drop the state of a deleted Application."""

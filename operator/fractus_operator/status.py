@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from types import MappingProxyType
 from typing import Any, Literal, assert_never
 
 from fractus_core.api import Condition, Drone, Grant
 from fractus_core.api.conditions import ConditionUpdate
-from fractus_core.api.plans import DeploymentPlanSpec
+from fractus_core.api.grants import ReportedWaypoints
+from fractus_core.api.plans import DeploymentPlanSpec, MissionRecord
 from fractus_core.control import Outcome, OutcomeKind, WaypointCounts
 
+from fractus_operator.parsing import SETTLED
 from fractus_operator.pods import PodView
 
 FlightPhase = Literal["Waiting", "TakingOff", "Flying", "Returning", "Landed", "Unknown"]
@@ -20,10 +22,16 @@ Phase = Literal["Pending", "Queued", "Deploying", "Running", FlightPhase, "Compl
 STAGES = ("Planned", "Granted", "Deployed")
 """Conditions that an Application reaches one after the other."""
 MISSION_BEGUN = "MissionBegun"
-_REASONS = {
-    OutcomeKind.COMPLETE: "MissionComplete",
-    OutcomeKind.REVOKED: "MissionRevoked",
-    OutcomeKind.FAILED: "MissionFailed",
+OutcomeName = Literal["Complete", "Revoked", "Failed"]
+_OUTCOMES: Mapping[OutcomeKind, OutcomeName] = {
+    OutcomeKind.COMPLETE: "Complete",
+    OutcomeKind.REVOKED: "Revoked",
+    OutcomeKind.FAILED: "Failed",
+}
+_REASONS: Mapping[OutcomeName, str] = {
+    "Complete": "MissionComplete",
+    "Revoked": "MissionRevoked",
+    "Failed": "MissionFailed",
 }
 _MAX_NAMED = 3
 """Maximum number of instances that a message names. For further instances, the message contains only their number."""
@@ -105,17 +113,17 @@ class FlightStatus:
     begun: bool
 
 
-def flight(name: str, drone: Drone | None, reported: Mapping[str, Any]) -> FlightStatus:
+def flight(name: str, drone: Drone | None, *, took_off: bool) -> FlightStatus:
     """Return the status of a flight.
 
     Args:
         name: Name of the drone of the plan.
         drone: The drone, or None if its object does not exist.
-        reported: Last reported status of the Application.
+        took_off: True if the plan records that the drone has taken off for the Application.
     """
     status = drone.status if drone is not None else None
     in_air = status is not None and status.in_air
-    begun = in_air or (reported.get("drone") == name and _has_begun(reported))
+    begun = in_air or took_off
     if status is None or status.flight_state == "unknown":
         last = "on the ground"
         if status is not None and status.last_flight_state:
@@ -140,12 +148,9 @@ def mission_outcome(uid: str | None, grants: Iterable[Grant]) -> Outcome | None:
     for grant in grants:
         spec = grant.spec
         status = grant.status
-        reports_outcome = spec.class_ == "driver" or spec.tour
-        if not reports_outcome or spec.application.uid != uid or status is None:
+        if not reports_outcome(uid, grant) or status is None:
             continue
-        waypoints = WaypointCounts()
-        if status.waypoints is not None:
-            waypoints = WaypointCounts(**status.waypoints.model_dump())
+        waypoints = _counts(status.waypoints)
         match status.phase:
             case "Complete":
                 message = status.message or f"{spec.component} finished its mission"
@@ -163,9 +168,46 @@ def mission_outcome(uid: str | None, grants: Iterable[Grant]) -> Outcome | None:
     return None
 
 
-def _has_begun(reported: Mapping[str, Any]) -> bool:
-    conditions = reported.get("conditions") or ()
-    return any(c["type"] == "MissionComplete" and c["reason"] == MISSION_BEGUN for c in conditions)
+def reports_outcome(uid: str | None, grant: Grant) -> bool:
+    """Return True if the node of a Grant reports the outcome of the mission of the Application with this uid."""
+    spec = grant.spec
+    return spec.application.uid == uid and (spec.class_ == "driver" or bool(spec.tour))
+
+
+def mission_record(outcome: Outcome, pods: Sequence[PodView] = ()) -> MissionRecord:
+    """Return the record of a mission that is over.
+
+    Args:
+        outcome: Outcome of the mission.
+        pods: Pods of the Application. After an incomplete mission, their failures are recorded because the pods are deleted now.
+    """
+    failures = "" if outcome.kind is OutcomeKind.COMPLETE else _failures(pods)
+    message = "; ".join(filter(None, (outcome.reason, str(outcome.waypoints), failures)))
+    counts = ReportedWaypoints(**asdict(outcome.waypoints)) if str(outcome.waypoints) else None
+    return MissionRecord(outcome=_OUTCOMES[outcome.kind], message=message, waypoints=counts)
+
+
+def _counts(reported: ReportedWaypoints | None) -> WaypointCounts:
+    return WaypointCounts(**reported.model_dump()) if reported is not None else WaypointCounts()
+
+
+def reported_record(reported: Mapping[str, Any], generation: int) -> MissionRecord | None:
+    """Return the record of a mission from a status, or None if the status does not report that this mission is over.
+
+    Only for missions of a release that recorded the outcome in the status only.
+
+    Args:
+        reported: Status of the Application.
+        generation: Generation of the plan.
+    """
+    if reported.get("phase") not in SETTLED or generation > int(reported.get("observedGeneration") or 0):
+        return None
+    conditions: Iterable[Mapping[str, Any]] = reported.get("conditions") or ()
+    mission: Mapping[str, Any] = next((c for c in conditions if c["type"] == "MissionComplete"), {})
+    outcome: OutcomeName = "Complete" if mission.get("status") == "True" else "Failed"
+    if mission.get("reason") == _REASONS["Revoked"]:
+        outcome = "Revoked"
+    return MissionRecord(outcome=outcome, message=mission.get("message") or reported.get("message"))
 
 
 # -- status updates --
@@ -285,39 +327,52 @@ def waiting_for_landing(present: StatusUpdate, drone: str) -> StatusUpdate:
     return replace(present, message=f"{present.message}; {message}", conditions=(*present.conditions, update))
 
 
-def finished(outcome: Outcome, name: str | None, drone: Drone | None, pods: Sequence[PodView] = ()) -> StatusUpdate:
+def over(record: MissionRecord, name: str | None, drone: Drone | None) -> StatusUpdate:
     """Return the status of an Application whose mission is over, even if its drone is still returning.
 
     Args:
-        outcome: Outcome of the mission.
+        record: Record of the mission, with its outcome.
         name: Name of the drone.
         drone: The drone, if it exists.
-        pods: Its pods. After an incomplete mission, their failures are reported because the pods are deleted now.
     """
-    complete = outcome.kind is OutcomeKind.COMPLETE
-    reason = _REASONS[outcome.kind]
-    message = outcome.reason
-    counts = str(outcome.waypoints)
-    if counts:
-        message += f"; {counts}"
-    failures = "" if complete else _failures(pods)
-    if failures:
-        message += f"; {failures}"
+    assert record.outcome is not None
+    complete = record.outcome == "Complete"
+    reason = _REASONS[record.outcome]
+    message = record.message or ""
     conditions: tuple[ConditionUpdate, ...] = (
         ConditionUpdate("Ready", "False", reason, message, progress=complete),
         ConditionUpdate("MissionComplete", "True" if complete else "False", reason, message),
     )
-    if complete and outcome.waypoints.skipped:
+    if complete and record.waypoints is not None and record.waypoints.skipped:
+        counts = str(_counts(record.waypoints))
         text = f"{counts}: their legs were refused, or the driver omitted them; `fractus audit show` names the verdicts"
         conditions = (*conditions, ConditionUpdate("Partial", "True", "WaypointsSkipped", text, adverse=True))
-    return _mission_over(conditions, name, drone)
+    phase: Phase = "Completed" if complete else "Failed"
+    controller = None
+    if not record.landed and drone is not None and drone.status is not None and drone.in_air:
+        phase = "Returning"
+        if drone.status.flight_state == "unknown":
+            message += f"; {name} was returning at its last report"
+        else:
+            message += f"; {name} is returning"
+        controller = drone.status.controller
+    return StatusUpdate(phase, message, conditions, drone=name, controller=controller)
 
 
-def still_over(reported: Mapping[str, Any], drone: Drone | None) -> StatusUpdate:
-    """Return the status of an Application whose mission was reported to be over. Its drone may have landed since."""
-    kept = (Condition.model_validate(c) for c in reported.get("conditions") or ())
-    conditions = tuple(ConditionUpdate(c.type, c.status, c.reason, c.message) for c in kept)
-    return _mission_over(conditions, reported.get("drone"), drone)
+def without_record() -> StatusUpdate:
+    """Return the status of an Application whose status reports a finished mission while its plan, the record, is missing.
+
+    The mission may have been flown. To fly it again without a decision of a person would be wrong.
+    """
+    message = (
+        "the status reports a finished mission, but the DeploymentPlan with its record is missing, so the outcome is unknown;"
+        " to fly the mission, delete the Application and create it again"
+    )
+    conditions = (
+        ConditionUpdate("Ready", "False", "RecordMissing", message),
+        ConditionUpdate("MissionComplete", "Unknown", "RecordMissing", message),
+    )
+    return StatusUpdate("Failed", message, conditions)
 
 
 def blocked(by: Blocked, present: StatusUpdate | None) -> StatusUpdate:
@@ -332,21 +387,6 @@ def blocked(by: Blocked, present: StatusUpdate | None) -> StatusUpdate:
         conditions = (*conditions, _policy_conflict(by.message))
     kept = (present.drone, present.pods, present.controller) if present is not None else ()
     return StatusUpdate(by.phase, by.message, conditions, *kept)
-
-
-def _mission_over(conditions: tuple[ConditionUpdate, ...], name: str | None, drone: Drone | None) -> StatusUpdate:
-    mission = next(c for c in conditions if c.type == "MissionComplete")
-    phase: Phase = "Completed" if mission.status == "True" else "Failed"
-    message = mission.message
-    controller = None
-    if drone is not None and drone.status is not None and drone.in_air:
-        phase = "Returning"
-        if drone.status.flight_state == "unknown":
-            message += f"; {name} was returning at its last report"
-        else:
-            message += f"; {name} is returning"
-        controller = drone.status.controller
-    return StatusUpdate(phase, message, conditions, drone=name, controller=controller)
 
 
 def _policy_conflict(message: str) -> ConditionUpdate:

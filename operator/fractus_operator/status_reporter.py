@@ -106,13 +106,18 @@ class StatusReporter:
         }
         facts = {"drone": update.drone, "controller": update.controller, "pods": update.pods}
         status |= {name: value for name, value in facts.items() if value is not None}
-        if status == before:
+        present = self._applications.get(submitted.key)
+        # The observed status is compared, because a user may have edited it since the last report.
+        if present is not None and present.uid == submitted.uid and present.body.get("status") == status:
             return
         namespace, name = submitted.key
         # The uid prevents a write to a later Application of this name.
         body = {**kinds.APPLICATION.header(name, namespace, uid=submitted.uid), "status": status}
         try:
             applied = await self._store.apply(kinds.APPLICATION, body, subresource="status")
+            if applied.get("status") != status:
+                # An apply does not remove fields that a user added.
+                applied = await self._store.replace_status(kinds.APPLICATION, applied, status)
         except Conflict:
             present = self._applications.get(submitted.key)
             if present is not None and present.uid == submitted.uid:

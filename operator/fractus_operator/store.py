@@ -93,6 +93,18 @@ class Store(Client):
                 raise Conflict(409, "Conflict", f"{kind.name} {name} was created again") from error
             raise
 
+    async def replace_status(self, kind: Kind, observed: Body, status: Body) -> Body:
+        """Replace the whole status of an existing object, including fields of other managers.
+
+        Raises:
+            KubeError: The object was deleted or created again, the API server refused the status, or could not be reached.
+        """
+        changes = [
+            {"op": "test", "path": "/metadata/uid", "value": observed["metadata"]["uid"]},
+            {"op": "add", "path": "/status", "value": status},
+        ]
+        return await self.patch(kind, key_of(observed), changes, ContentType.JSON_PATCH, subresource="status")
+
     async def take_ownership(self, kind: Kind, key: Key) -> None:
         """Change the ownership of fields that this operator created with POST to ownership by apply.
 

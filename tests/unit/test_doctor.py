@@ -183,6 +183,14 @@ def test_doctor_ignores_failed_deletion_of_operator_pods() -> None:
     assert {finding.level for finding in findings(cluster)} == {"ok"}
 
 
+def no_certificate(cluster: Cluster) -> None:
+    del cluster.objects[f"/api/v1{SYSTEM}/configmaps/fractus-ca"]
+
+
+def empty_certificate(cluster: Cluster) -> None:
+    cluster.objects[f"/api/v1{SYSTEM}/configmaps/fractus-ca"] = {"data": {}}
+
+
 @pytest.mark.parametrize(
     ("break_cluster", "level", "check", "message", "remedy"),
     [
@@ -194,6 +202,8 @@ def test_doctor_ignores_failed_deletion_of_operator_pods() -> None:
         (renamed_node, "warning", "nodes", "drone drone-0 has no node", "kubectl delete drone drone-0"),
         (ipv6_first, "error", "nodes", "drone-1 has fd00::7 as first address", "--node-ip"),
         (weakly_tainted, "warning", "nodes", "drone-1 has no taint fractus.dev/class with the effect NoExecute", "=drone:NoExecute"),
+        (no_certificate, "error", "certificates", "the ConfigMap fractus-ca, from which nodes read", "logs deployment/fractus-operator"),
+        (empty_certificate, "error", "certificates", "of the authority, has no ca.crt", "restores it within 10 s"),
         (audit_only_binding, "error", "admission", f"{POLICIES[0]}: not in force", "helm upgrade --install fractus "),
     ],
 )  # fmt: skip

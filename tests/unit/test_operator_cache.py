@@ -69,6 +69,7 @@ class EventsOfTheCluster(RuleBasedStateMachine):
         self.pending: dict[Kind, list[tuple[str, Body]]] = {kind: [] for kind in KINDS}
         self.decided: dict[Key, OwnedPlan] = {}
         self.last_claims: dict[str, Claim] = {}
+        self.returning: set[tuple[str, str]] = set()
 
     # -- changes at the API server --
 
@@ -90,15 +91,16 @@ class EventsOfTheCluster(RuleBasedStateMachine):
         key=APPLICATIONS,
         uid=UIDS,
         generation=st.integers(1, 3),
-        returning=st.none() | st.integers(1, 3),
         cpu=st.integers(1, 3),
+        phase=st.sampled_from(["Flying", "Completed"]),
     )
-    def application(self, key: Key, uid: str, generation: int, returning: int | None, cpu: int) -> None:
+    def application(self, key: Key, uid: str, generation: int, cpu: int, phase: str) -> None:
         container = {"image": "i", "resources": {"limits": {"cpu": str(cpu)}}}
         locations = [{"center": {"lat": 0, "lon": 0}, "radius": 9, "instances": 1}]
         spec = {"components": [component("C", "edge", container=container, locations=locations)]}
         metadata = {"namespace": key[0], "name": key[1], "uid": f"{key}{uid}", "generation": generation}
-        status = {"phase": "Completed", "observedGeneration": returning, "drone": "d"} if returning is not None else {}
+        # A user may have edited the status, so it changes nothing.
+        status = {"phase": phase, "observedGeneration": generation, "drone": "d"}
         self.put(kinds.APPLICATION, {**manifest("Application", key[1], spec), "metadata": metadata, "status": status})
 
     @rule(
@@ -109,11 +111,22 @@ class EventsOfTheCluster(RuleBasedStateMachine):
         generation=st.integers(1, 3),
         placed_on=st.sampled_from(NODES),
         decided=st.booleans(),
+        flown=st.sampled_from([None, {}, {"outcome": "Complete"}, {"outcome": "Failed", "landed": True}]),
     )
     def plan(
-        self, key: Key, uid: str, node: str, host: Key | None, generation: int, placed_on: str, decided: bool
+        self,
+        key: Key,
+        uid: str,
+        node: str,
+        host: Key | None,
+        generation: int,
+        placed_on: str,
+        decided: bool,
+        flown: Body | None,
     ) -> None:
-        spec = plan_spec(node, host, generation, placed_on)
+        spec = plan_spec(node, host, generation, placed_on) | ({"flown": flown} if flown is not None else {})
+        if flown == {"outcome": "Complete"} and host is None:
+            self.returning.add((f"{key}{uid}", node))
         if decided:
             plan = DeploymentPlanSpec.model_validate(spec)
             self.decided[key] = OwnedPlan(f"{key}{uid}", plan)
@@ -230,10 +243,9 @@ class EventsOfTheCluster(RuleBasedStateMachine):
         active = {}
         for key, plan in self.plans().items():
             submitted = self.cache.applications.get(key)
-            if submitted is not None and submitted.uid == plan.uid:
-                returning = submitted.settled_generation
-                if returning is None or (plan.spec.application_generation or 0) > returning:
-                    active[key] = plan
+            over = plan.spec.flown is not None and plan.spec.flown.outcome is not None
+            if submitted is not None and submitted.uid == plan.uid and not over:
+                active[key] = plan
         return active
 
     def booked(self, node: str, application: Key) -> float:
@@ -266,7 +278,11 @@ class EventsOfTheCluster(RuleBasedStateMachine):
         held = claims(plans, self.cache._known_grants.values())
         for drone in self.cache.drones.values():
             if drone is not None and drone.in_air and drone.name not in held:
-                last = self.last_claims.get(drone.name) or self.cache.fleet._claim_from_status(drone.name)
+                last = self.last_claims.get(drone.name)
+                if last is None:
+                    # Only plans of missions whose drone returns show who has flown it.
+                    last = self.cache.fleet.claims()[drone.name]
+                    assert (last.uid, drone.name) in self.returning or not last.uid
                 held[drone.name] = replace(last, returning=True)
         self.last_claims.update(held)
         assert dict(self.cache.fleet.claims()) == held

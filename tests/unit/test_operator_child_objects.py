@@ -12,7 +12,7 @@ from typing import Any, cast
 import pytest
 import yaml
 from fractus_core.api import Application
-from fractus_core.api.plans import DeploymentPlanSpec
+from fractus_core.api.plans import DeploymentPlanSpec, MissionRecord
 from fractus_operator import kinds
 from fractus_operator.cache import ClusterCache
 from fractus_operator.child_objects import ChildObjects, NameTaken
@@ -222,6 +222,15 @@ async def test_deployment_with_changed_owner_is_deleted(owner: str) -> None:
     assert store.requests == ["delete Secret", "delete Deployment"]
 
 
+def applications(*, over: bool) -> SimpleNamespace:
+    """Return a cache of one Application whose mission is over or not."""
+    flown = MissionRecord(outcome="Complete") if over else None
+    plan = DeploymentPlanSpec(application="a", flown=flown)
+    return SimpleNamespace(
+        applications={("city", "a"): SimpleNamespace(uid="app")}, plans=SimpleNamespace(latest=lambda *_: plan)
+    )
+
+
 @pytest.mark.parametrize("has_finalizer", [True, False])
 async def test_pods_of_deployment_with_foreign_finalizer_are_deleted_one_by_one(has_finalizer: bool) -> None:
     """The finalizer keeps the Deployment, so the garbage collector does not delete its pods."""
@@ -247,7 +256,7 @@ async def test_pods_of_deployment_with_foreign_finalizer_are_deleted_one_by_one(
     copies = {kind: OwnedObjects(cast(Any, store), kind, lambda body: body, lambda *_: None) for kind in kinds.CHILDREN}
     deployment["metadata"]["labels"] = labels | {"fractus.dev/application": "a"}
     copies[kinds.DEPLOYMENT].record_write(("city", "one"), deployment)
-    cache = SimpleNamespace(applications={("city", "a"): SimpleNamespace(settled_generation=None)})
+    cache = applications(over=False)
     children = ChildObjects(cast(Any, store), copies, cast(Any, None))
     await FinishedPods(cast(Any, store), cast(Any, cache), children, lambda: NOW).tear_down(("city", "a"))
     assert store.requests == [
@@ -269,7 +278,7 @@ async def test_teardown_deletes_kept_pods() -> None:
 
     cast(Any, store).list_whole = list_whole
     copies = {kind: OwnedObjects(cast(Any, store), kind, lambda body: body, lambda *_: None) for kind in kinds.CHILDREN}
-    cache = SimpleNamespace(applications={("city", "a"): SimpleNamespace(settled_generation=1)})
+    cache = applications(over=True)
     children = ChildObjects(cast(Any, store), copies, cast(Any, None))
     await FinishedPods(cast(Any, store), cast(Any, cache), children, lambda: NOW).tear_down(("city", "a"))
     assert store.requests == ["delete Pod"]

@@ -262,9 +262,9 @@ def test_status_reports_exit_code_and_last_log_lines() -> None:
     ready = next(c for c in update.conditions if c.type == "Ready")
     assert (ready.reason, ready.warning) == ("ComponentFailed", True)
     assert update.message == "waiting for a-1; a-1 failed with exit code 1: ValueError: no route (before: Traceback)"
-    failed = status.finished(Outcome(OutcomeKind.FAILED, "driver lost"), "d", None, pods)
+    failed = status.mission_record(Outcome(OutcomeKind.FAILED, "driver lost"), pods)
     assert failed.message == "driver lost; a-1 failed with exit code 1: ValueError: no route (before: Traceback)"
-    assert status.finished(Outcome(OutcomeKind.COMPLETE, "done"), "d", None, pods).message == "done"
+    assert status.mission_record(Outcome(OutcomeKind.COMPLETE, "done"), pods).message == "done"
 
 
 def grant(phase: str | None, uid: str = "u1", class_: str = "driver") -> Grant:
@@ -287,7 +287,7 @@ def test_completed_status_contains_waypoint_counts_of_the_grant() -> None:
     body["status"]["waypoints"] = {"reached": 4, "skipped": 0, "corrected": 1}
     outcome = mission_outcome("u1", [Grant.from_body(body)])
     assert outcome is not None
-    update = status.finished(outcome, "d", None)
+    update = status.over(status.mission_record(outcome), "d", None)
     assert update.phase == "Completed"
     assert update.message == "because; 4 of 4 waypoints reached (1 with corrections by policies)"
     assert [c.type for c in update.conditions] == ["Ready", "MissionComplete"]
@@ -295,7 +295,7 @@ def test_completed_status_contains_waypoint_counts_of_the_grant() -> None:
 
 def test_completed_mission_with_skipped_waypoints_is_partial() -> None:
     outcome = Outcome(OutcomeKind.COMPLETE, "done", WaypointCounts(reached=3, skipped=1))
-    update = status.finished(outcome, "d", None)
+    update = status.over(status.mission_record(outcome), "d", None)
     assert (update.phase, update.message) == ("Completed", "done; 3 of 4 waypoints reached, 1 skipped")
     partial = next(c for c in update.conditions if c.type == "Partial")
     assert (partial.status, partial.reason, partial.warning) == ("True", "WaypointsSkipped", True)
@@ -304,7 +304,7 @@ def test_completed_mission_with_skipped_waypoints_is_partial() -> None:
 
 @pytest.mark.parametrize("kind", OutcomeKind)
 def test_status_reports_every_mission_outcome(kind: OutcomeKind) -> None:
-    update = status.finished(Outcome(kind, "because"), "d", None)
+    update = status.over(status.mission_record(Outcome(kind, "because")), "d", None)
     complete = kind is OutcomeKind.COMPLETE
     assert (update.phase, update.message) == ("Completed" if complete else "Failed", "because")
     assert [c.status for c in update.conditions] == ["False", "True" if complete else "False"]
@@ -318,16 +318,38 @@ def flown(state: str, last: str | None = None, controller: str | None = None) ->
 
 
 def test_phase_is_returning_until_drone_has_landed() -> None:
-    update = status.finished(Outcome(OutcomeKind.FAILED, "driver lost"), "d", flown("flying", controller="system"))
+    record = status.mission_record(Outcome(OutcomeKind.FAILED, "driver lost"))
+    update = status.over(record, "d", flown("flying", controller="system"))
     assert (update.phase, update.controller) == ("Returning", "system")
-    conditions = [{"type": c.type, "status": c.status, "reason": c.reason, "message": c.message,
-                   "lastTransitionTime": NOW} for c in update.conditions]  # fmt: skip
-    reported = {"drone": "d", "conditions": conditions}
-    silent = status.still_over(reported, flown("unknown", "flying"))
+    silent = status.over(record, "d", flown("unknown", "flying"))
     assert (silent.phase, "at its last report" in silent.message) == ("Returning", True)
     for landed in (flown("inactive"), None):
-        update = status.still_over(reported, landed)
+        update = status.over(record, "d", landed)
         assert (update.phase, update.message, update.controller) == ("Failed", "driver lost", None)
+
+
+def test_later_flight_does_not_change_status_of_landed_mission() -> None:
+    record = status.mission_record(Outcome(OutcomeKind.COMPLETE, "done")).model_copy(update={"landed": True})
+    assert status.over(record, "d", flown("flying", controller="system")).phase == "Completed"
+
+
+@pytest.mark.parametrize(
+    ("phase", "reason", "outcome"),
+    [
+        ("Completed", "MissionComplete", "Complete"),
+        ("Returning", "MissionComplete", "Complete"),
+        ("Returning", "MissionRevoked", "Revoked"),
+        ("Failed", "MissionFailed", "Failed"),
+        ("Flying", "MissionBegun", None),
+    ],
+)
+def test_outcome_is_read_from_status_of_earlier_release(phase: str, reason: str, outcome: str | None) -> None:
+    complete = "True" if reason == "MissionComplete" else "False"
+    mission = {"type": "MissionComplete", "status": complete, "reason": reason, "message": "because"}
+    reported = {"phase": phase, "observedGeneration": 2, "conditions": [mission]}
+    record = status.reported_record(reported, 2)
+    assert (record.outcome if record is not None else None) == outcome
+    assert status.reported_record(reported, 3) is None, "the plan is of a later mission"
 
 
 @pytest.mark.parametrize(
@@ -342,18 +364,12 @@ def test_phase_is_returning_until_drone_has_landed() -> None:
     ],
 )
 def test_flight_phase_follows_drone_state(drone: Drone | None, begun: bool, phase: str) -> None:
-    mission = {"type": "MissionComplete", "reason": "MissionBegun" if begun else "MissionWaiting"}
-    flight_phase = flight("d", drone, {"drone": "d", "conditions": [mission]})
+    flight_phase = flight("d", drone, took_off=begun)
     assert flight_phase.phase == phase
     update = status.deployed(PLAN, [view("a-1")], 0, flight_phase)
     assert update.phase == ("Deploying" if phase in {"Waiting", "Landed"} else phase), (
         "the phase is Deploying, because a pod is missing"
     )
-
-
-def test_flight_of_another_drone_does_not_begin_mission() -> None:
-    mission = {"type": "MissionComplete", "reason": "MissionBegun"}
-    assert flight("d", flown("inactive"), {"drone": "other", "conditions": [mission]}).phase == "Waiting"
 
 
 def test_status_reports_blocked_stage() -> None:

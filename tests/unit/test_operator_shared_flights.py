@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 from fractus_core.api import Drone, Grant
-from fractus_core.api.plans import DeploymentPlanSpec, DroneChoice
+from fractus_core.api.plans import DeploymentPlanSpec, DroneChoice, MissionRecord
 from fractus_core.control import OutcomeKind
 from fractus_core.planning import flight_of, plan
 from fractus_core.planning.mission import Flight
@@ -20,7 +20,7 @@ from fractus_operator.drone_claims import (
     shared_flight_lost,
     shared_flight_outcome,
 )
-from fractus_operator.parsing import OwnedPlan, parse_application
+from fractus_operator.parsing import OwnedPlan
 from fractus_operator.pods import PlannedRequest, PodView
 from test_planning import PATH, VIEWER, application, at, drone, inventory, manifest, navigator
 
@@ -37,11 +37,8 @@ def flown(state: str = "inactive", x: float = 0.0, **more: Any) -> ActiveMission
     return ActiveMission(HOST, HOST_PLAN, flying, in_flight=state != "inactive", **more)
 
 
-def submitted(phase: str | None) -> Any:
-    complete = {"type": "MissionComplete", "status": str(phase in {"Completed", "Returning"})}
-    status = {"phase": phase, "observedGeneration": 1, "conditions": [complete]} if phase else {}
-    body = {**manifest("Application", "traffic", {"components": []}), "status": status}
-    return parse_application(body)
+def over(outcome: Any) -> DeploymentPlanSpec:
+    return HOST_PLAN.model_copy(update={"flown": MissionRecord(outcome=outcome)})
 
 
 def test_drone_on_the_ground_offers_complete_flight() -> None:
@@ -62,19 +59,13 @@ def test_flight_of_changed_application_is_not_offered() -> None:
 
 
 @pytest.mark.parametrize(
-    ("phase", "host_plan", "done"),
-    [
-        ("Completed", None, True),
-        ("Returning", None, True),
-        ("Completed", HOST_PLAN, False),
-        ("Failed", None, False),
-        ("Running", HOST_PLAN, False),
-    ],
+    ("host_plan", "done"),
+    [(over("Complete"), True), (over("Failed"), False), (over(None), False), (HOST_PLAN, False), (None, False)],
 )
-def test_guest_is_complete_when_host_is_complete(phase: str, host_plan: Any, done: bool) -> None:
-    outcome = shared_flight_outcome(GUEST_PLAN, submitted(phase), host_plan)
+def test_guest_is_complete_when_host_is_complete(host_plan: DeploymentPlanSpec | None, done: bool) -> None:
+    outcome = shared_flight_outcome(GUEST_PLAN, host_plan)
     assert (outcome is not None and outcome.kind is OutcomeKind.COMPLETE) is done
-    assert shared_flight_outcome(HOST_PLAN, submitted("Completed"), None) is None
+    assert shared_flight_outcome(HOST_PLAN, over("Complete")) is None
 
 
 def test_lost_shared_flight_has_a_reason() -> None:
@@ -82,7 +73,8 @@ def test_lost_shared_flight_has_a_reason() -> None:
     assert shared_flight_lost(GUEST, GUEST_PLAN, HOST_PLAN, whole, 7.0) is None
     assert shared_flight_lost(GUEST, GUEST_PLAN, HOST_PLAN, None, 7.0) is None
     assert shared_flight_lost(GUEST, HOST_PLAN, None, None, 7.0) is None
-    assert "no longer flies d" in str(shared_flight_lost(GUEST, GUEST_PLAN, None, whole, 7.0))
+    for ended in (None, over("Complete"), over("Failed")):
+        assert "no longer flies d" in str(shared_flight_lost(GUEST, GUEST_PLAN, ended, whole, 7.0))
     moved = HOST_PLAN.model_copy(update={"drone": DroneChoice(node="e")})
     assert "now flies e" in str(shared_flight_lost(GUEST, GUEST_PLAN, moved, whole, 7.0))
     elsewhere = Flight(("default", "traffic"), ((*whole.legs[0][:1],),))

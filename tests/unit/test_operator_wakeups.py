@@ -246,10 +246,13 @@ async def test_drone_change_wakes_its_application_and_guests(shared: ClusterCach
     with shared.subscriptions.subscribe(SHARING) as sharing:
         shared.drones.record_write(("", "d"), drone_body(2, "inactive"))
         assert await sharing.changed(1)
-        returning = APPLICATION | {
-            "metadata": {"namespace": "ns", "name": "host", "uid": "host", "resourceVersion": "2"}
-        }
-        shared.applications.record_write(HOST, returning | {"status": {"phase": "Completed", "observedGeneration": 1}})
+        shared.plans.decide(
+            HOST,
+            "host",
+            DeploymentPlanSpec.model_validate(
+                {"application": "host", "drone": {"node": "d"}, "flown": {"outcome": "Complete"}}
+            ),
+        )
         assert await sharing.changed(1)
 
 

@@ -10,6 +10,7 @@ from fractus_core.api.components import (
     Placement,
 )
 from fractus_core.api.geometry import Position
+from fractus_core.api.grants import ReportedWaypoints
 from fractus_core.api.model import AGE, Model, Resource
 
 Role = Literal["drone", "static", "hybrid-edge", "hybrid-drone", "cloud"]
@@ -124,6 +125,21 @@ class Rejection(Model):
     message: str = Field(description="Human-readable explanation.")
 
 
+class MissionRecord(Model):
+    """The mission of a plan, as the operator observed it."""
+
+    outcome: Literal["Complete", "Revoked", "Failed"] | None = Field(
+        default=None, description="Outcome of the mission; unset: the mission has begun and is not over."
+    )
+    message: str | None = Field(default=None, description="Human-readable explanation of the outcome.")
+    waypoints: ReportedWaypoints | None = Field(
+        default=None, description="Waypoints of the mission. Missing if none were counted."
+    )
+    landed: bool = Field(
+        default=False, description="True if the drone was on the ground at the outcome, or has landed since."
+    )
+
+
 class DeploymentPlanSpec(Model):
     """Decisions of the planner, with reasons."""
 
@@ -148,6 +164,15 @@ class DeploymentPlanSpec(Model):
         ge=1,
         description="Number of rejected nodes omitted from `rejected` (out of range, or above the list limit).",
     )
+    flown: MissionRecord | None = Field(
+        default=None,
+        description="The mission of this plan, as the operator observed it; unset before the takeoff.",
+    )
+
+    @property
+    def is_over(self) -> bool:
+        """True if the mission of this plan is over, even if the drone is still returning."""
+        return self.flown is not None and self.flown.outcome is not None
 
 
 class DeploymentPlan(Resource, plural="deploymentplans", short="fplan", namespaced=True, written_by_operator=True):

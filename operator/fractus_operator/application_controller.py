@@ -76,7 +76,7 @@ _AFTER_PODS = (
 
 
 class BeingDeleted(Exception):
-    """The Application is being deleted, so there is nothing more to reconcile."""
+    """The Application or its namespace is being deleted, so there is nothing more to reconcile."""
 
 
 @dataclass
@@ -162,7 +162,7 @@ class ApplicationController:
             Seconds until the next step, unless an input changes earlier.
 
         Raises:
-            BeingDeleted: The Application is being deleted.
+            BeingDeleted: The Application or its namespace is being deleted.
             KubeError: The API server refused a write, or could not be reached.
         """
         submitted = self._cache.applications.get(key)
@@ -174,6 +174,10 @@ class ApplicationController:
         # Without the finalizer nothing is created, because a deletion would then leave Grants behind.
         if FINALIZER not in metadata.finalizers:
             return RESYNC_S
+        if self._cache.is_being_deleted(key[0]):
+            # Kubernetes deletes the Applications of a namespace only after its pods are gone, which an unreachable node delays.
+            await self.teardown(key, submitted.uid)
+            raise BeingDeleted
         state = self._states.setdefault(key, _ApplicationState())
         async with state.lock:
             if metadata.uid == self._cache.torn_down.get(key):

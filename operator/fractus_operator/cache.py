@@ -91,6 +91,7 @@ class ClusterCache:
         )
         self.node_objects = NodeObjects(store)
         self.hosts = Informer(store, kinds.NODE, parse_host, self._host_changed)
+        self.namespaces = Informer(store, kinds.NAMESPACE, _is_being_deleted, self._namespace_changed)
         self.pods = Informer(store, kinds.POD, parse_pod, self._pod_changed)
         self.drones = Informer(store, kinds.DRONE, optional_parser(Drone), self._drone_changed)
         self.edge_nodes = Informer(store, kinds.EDGE_NODE, optional_parser(EdgeNode), self._edge_node_changed)
@@ -215,6 +216,10 @@ class ClusterCache:
         message = shared_flight_lost(application, plan, observed.host[1], flights.get(node), radius_m)
         return inventory, ("SharedFlightLost", message) if message is not None else None
 
+    def is_being_deleted(self, namespace: str) -> bool:
+        """Return True if a namespace is being deleted."""
+        return bool(self.namespaces.get(("", namespace)))
+
     def drone(self, name: str) -> Drone | None:
         """Return a valid Drone by name, or None."""
         return self.drones.get(("", name))
@@ -246,6 +251,12 @@ class ClusterCache:
             self._locations.upsert_host(new.name, new.is_cloud)
         if _host_inputs(old) != _host_inputs(new):
             self.subscriptions.wake_all()
+
+    def _namespace_changed(self, key: Key, _old: bool | None, new: bool | None) -> None:
+        if new:
+            for submitted in self.applications.values():
+                if submitted.key[0] == key[1]:
+                    self.subscriptions.wake(submitted.key, urgent=True)
 
     def _pod_changed(self, key: Key, old: PodView | None, new: PodView | None) -> None:
         self._bookings.pod_changed(old, new)
@@ -375,6 +386,11 @@ def _host_inputs(host: Host | None) -> tuple[object, ...] | None:
 def _changed_by_user(old: Submitted | None, new: Submitted | None) -> bool:
     """Return True if a user changed the spec of an Application. A change of its status does not count."""
     return old is not None and new is not None and old.metadata.generation != new.metadata.generation
+
+
+def _is_being_deleted(namespace: Body) -> bool:
+    """Return True if a Namespace is being deleted."""
+    return "deletionTimestamp" in namespace["metadata"]
 
 
 def _occupied(pod: PodView | None) -> tuple[str, Mapping[str, float]] | None:

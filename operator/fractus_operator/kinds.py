@@ -37,6 +37,7 @@ ZONE = _fractus_kind(Zone)
 POLICY = _fractus_kind(Policy)
 
 NODE = Kind("v1", "Node", "nodes", namespaced=False)
+NAMESPACE = Kind("v1", "Namespace", "namespaces", namespaced=False)
 POD = Kind("v1", "Pod", "pods", namespaced=True)
 SERVICE = Kind("v1", "Service", "services", namespaced=True)
 SERVICE_ACCOUNT = Kind("v1", "ServiceAccount", "serviceaccounts", namespaced=True)

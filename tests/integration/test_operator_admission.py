@@ -274,6 +274,72 @@ def test_operator_writes_only_objects_that_it_has_created(
         client.close()
 
 
+def test_operator_writes_only_config_map_of_its_authority(
+    control_plane: ControlPlane, world: World, chart: None
+) -> None:
+    """Users apply manifests from ConfigMaps in the same namespace, and pods read kube-root-ca.crt."""
+    maps = f"/api/v1/namespaces/{SYSTEM}/configmaps"
+
+    def config_map(name: str) -> Body:
+        labels = {"app.kubernetes.io/managed-by": "fractus"}
+        return {
+            "apiVersion": "v1",
+            "kind": "ConfigMap",
+            "metadata": {"name": name, "labels": labels},
+            "data": {"a": "b"},
+        }
+
+    world.api.apply(f"{maps}/fractus-demo-applications", config_map("fractus-demo-applications"))
+    client = control_plane.with_token(operator_token(world))
+    try:
+        wait_for(lambda: _probe_refused(client), "the admission policy to be in force")
+        for name in ("fractus-demo-applications", "kube-root-ca.crt"):
+            denied(partial(client.merge, f"{maps}/{name}", {"data": {"a": "c"}}), 'cannot patch resource "configmaps"')
+            denied(partial(client.apply, f"{maps}/{name}", config_map(name)), 'cannot patch resource "configmaps"')
+            denied(partial(client.call, "GET", f"{maps}/{name}"), 'cannot get resource "configmaps"')
+            denied(partial(client.delete, f"{maps}/{name}"), 'cannot delete resource "configmaps"')
+        denied(lambda: client.call("POST", maps, config_map("theirs")), "may write only the ConfigMap fractus-ca")
+        generated = config_map("x") | {"metadata": {"generateName": "fractus-ca"}}
+        denied(lambda: client.call("POST", maps, generated), "may write only the ConfigMap fractus-ca")
+        client.apply(f"{maps}/fractus-ca", config_map("fractus-ca"))
+        # A user may remove the labels. The operator must be able to restore the certificate nevertheless.
+        world.api.apply(f"{maps}/fractus-ca", config_map("fractus-ca") | {"metadata": {"name": "fractus-ca"}})
+        client.apply(f"{maps}/fractus-ca", config_map("fractus-ca"))
+    finally:
+        client.close()
+        for name in ("fractus-demo-applications", "fractus-ca"):
+            world.api.delete(f"{maps}/{name}")
+
+
+def test_operator_deletes_only_pods_of_services_in_system_namespace(
+    control_plane: ControlPlane, world: World, chart: None
+) -> None:
+    client = control_plane.with_token(operator_token(world))
+    pods = f"/api/v1/namespaces/{SYSTEM}/pods"
+
+    def delete(name: str) -> object:
+        return client.call("DELETE", f"{pods}/{name}", {"dryRun": ["All"]})
+
+    try:
+        wait_for(lambda: _probe_refused(client), "the admission policy to be in force")
+        wait_for(lambda: world.api.get(f"/api/v1/namespaces/{SYSTEM}/serviceaccounts/default"), "the default account")
+        for name, part, permitted in (
+            ("fractus", "agent", True),
+            ("fractus", "operator", False),
+            ("fractus", "view", False),
+            ("fractus-demo", "vehicle", False),
+            ("other", "agent", False),
+        ):
+            labels = {"app.kubernetes.io/name": name, "app.kubernetes.io/component": part}
+            world.bound_pod(SYSTEM, f"{name}-{part}", "cloud-1", labels)
+            if permitted:
+                delete(f"{name}-{part}")
+            else:
+                denied(partial(delete, f"{name}-{part}"), "may write only pods that it has created")
+    finally:
+        client.close()
+
+
 _MADE = {
     "Service": ("v1", "services"),
     "EndpointSlice": ("discovery.k8s.io/v1", "endpointslices"),
@@ -363,6 +429,15 @@ def test_operator_token_cannot_escalate_with_pods_or_secrets(
         beyond = {"httpGet": {"host": "169.254.169.254", "port": 80}}
         for called in ({"livenessProbe": beyond}, {"lifecycle": {"postStart": beyond}}):
             denied(deployment(container=called), "without probes and hooks")
+        claim = {"name": "gpu", "resourceClaimName": "autopilot-link"}
+        block = {"name": "disk", "persistentVolumeClaim": {"claimName": "disk"}}
+        for changed in (
+            deployment(runtimeClassName="unconfined"),
+            deployment(resourceClaims=[claim]),
+            deployment(schedulerName="theirs"),
+            deployment(container={"volumeDevices": [{"name": "disk", "devicePath": "/d"}]}, volumes=[block]),
+        ):
+            denied(changed, "default runtime and scheduler, without devices")
         certificates = "only Secrets with certificates of instances"
         denied(
             secret("theirs-tls", type="kubernetes.io/service-account-token", data={}, metadata=account), certificates

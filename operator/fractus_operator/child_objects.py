@@ -127,6 +127,22 @@ class ChildObjects:
         with contextlib.suppress(NotFound):
             self._caches[kind].record_write(key, await self._store.patch(kind, key, fields, ContentType.MERGE))
 
+    async def create_secret(self, body: Body) -> bool:
+        """Create a Secret. Return False if the API server refuses it, for example because its name is taken.
+
+        Raises:
+            KubeError: The API server could not be reached.
+        """
+        async with self._limit:
+            try:
+                await self._store.create(kinds.SECRET, body)
+            except KubeError as error:
+                if not error.status:
+                    raise
+                log.debug("child objects: Secret not created yet (secret=%s/%s error=%s)", *key_of(body), error)
+                return False
+        return True
+
     async def write_secret(self, application: Application, instance: str, body: Body, reason: SecretWrite) -> bool:
         """Write the Secret of an instance, unless its Deployment belongs to another owner. Return True if it is written.
 

@@ -46,8 +46,9 @@ _AFTER_DEPLOYMENTS = (
 class Rollout:
     """Applies the child objects of Applications.
 
-    The order is: plan, deletion of stale objects, Grants, Deployments, Secrets, other objects. Grants come before Deployments,
-    so that a webhook that does not respond to Deployments does not delay a revocation.
+    The order is: plan, deletion of stale objects, Grants, new Secrets, Deployments, other Secrets, other objects. Grants come first,
+    so that a webhook that does not respond to other kinds does not delay a revocation. The Secret of a new Deployment comes before
+    it, because its pod could not mount a missing Secret.
 
     Attributes:
         in_progress: Number of Applications that are being rolled out.
@@ -99,18 +100,22 @@ class Rollout:
             await self._objects.prune(application, desired)
             # If the rules changed meanwhile, only existing Grants are applied. They are compiled again in the next step.
             current = rules == self._cache.rules_revision
-            first = {
+            granted = {
                 kinds.GRANT: [
                     body
                     for body in desired[kinds.GRANT]
                     if current or self._objects.get(kinds.GRANT, key_of(body)) is not None
-                ],
-                kinds.DEPLOYMENT: [body for body in desired[kinds.DEPLOYMENT] if not self._is_frozen(body, plan)],
+                ]
+            }
+            deployments = {
+                kinds.DEPLOYMENT: [body for body in desired[kinds.DEPLOYMENT] if not self._is_frozen(body, plan)]
             }
             last = {kind: desired[kind] for kind in _AFTER_DEPLOYMENTS}
             failures: list[Exception] = []
             for step in (
-                partial(self._objects.apply, application, first),
+                partial(self._objects.apply, application, granted),
+                partial(self._create_secrets, application, certificates),
+                partial(self._objects.apply, application, deployments),
                 # Only for existing Deployments. If the name of a Deployment is taken by another owner, the name of the
                 # Secret may be taken as well.
                 partial(self._write_secrets, application, certificates),
@@ -244,6 +249,24 @@ class Rollout:
             deployment = self._objects.get(kinds.DEPLOYMENT, (namespace, placed.instance))
             certificates[placed.instance] = self._certificates.of(application, placed, deployment, pods)
         return certificates
+
+    async def _create_secrets(self, application: Application, certificates: dict[str, Certificate]) -> None:
+        """Create the Secrets of Deployments that do not exist yet. Created ones are removed from `certificates`.
+
+        A Secret that exists already may belong to another owner, and a refused one is written again after its Deployment.
+        """
+        namespace, _ = application.key
+
+        async def create(instance: str, certificate: Certificate) -> None:
+            exists = self._objects.get(kinds.DEPLOYMENT, (namespace, instance)) is not None
+            if certificate.secret is None or exists or certificate.state.write_failed:
+                return
+            certificate.state.write_failed = True
+            if await self._objects.create_secret(certificate.secret):
+                certificate.state.write_failed = False
+                del certificates[instance]
+
+        await asyncio.gather(*(create(*each) for each in list(certificates.items())))
 
     async def _write_secrets(self, application: Application, certificates: Mapping[str, Certificate]) -> None:
         """Write the due Secrets of existing Deployments. A failure does not stop the others. Raise the first failure at the end."""

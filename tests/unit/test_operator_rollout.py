@@ -17,7 +17,7 @@ from fractus_core.api.plans import DeploymentPlanSpec
 from fractus_core.identity.authority import Authority
 from fractus_operator import kinds
 from fractus_operator.kinds import Body, Key, Kind
-from fractus_operator.labels import CERTIFICATE_ANNOTATION
+from fractus_operator.labels import CERTIFICATE_ANNOTATION, INSTANCE_LABEL
 from fractus_operator.resources import children
 from fractus_operator.rollout import Rollout
 from fractus_operator.store import KubeError
@@ -70,6 +70,8 @@ class FakeObjects:
         self.refused: Kind | None = None
         self.hanging: Kind | None = None
         self.cancelled = False
+        self.taken: set[Key] = set()
+        """Secrets that exist already."""
 
     def get(self, kind: Kind, key: Key) -> Body | None:
         return self.cache.children[kind].get(key)
@@ -91,6 +93,13 @@ class FakeObjects:
                 self.cache.children[kind][kinds.key_of(body)] = body
         if failed:
             raise KubeError(422, "Invalid", "no")
+
+    async def create_secret(self, body: Body) -> bool:
+        if kinds.SECRET is self.refused or kinds.key_of(body) in self.taken:
+            return False
+        self.requests.append("create Secret")
+        self.secrets.append((body["metadata"]["labels"][INSTANCE_LABEL], "new"))
+        return True
 
     async def write_secret(self, _application: Application, instance: str, _body: Body, why: str) -> bool:
         if kinds.SECRET is self.refused:
@@ -156,20 +165,29 @@ async def turns() -> None:
         await asyncio.sleep(0)
 
 
-async def test_rollout_applies_plan_then_grants_then_deployments_then_the_rest(scene: Scene) -> None:
+async def test_rollout_applies_plan_grants_secrets_deployments_and_the_rest_in_order(scene: Scene) -> None:
+    """A pod whose Secret does not exist yet would report FailedMount."""
     await scene.apply()
     assert scene.objects.requests[:8] == [
         "apply DeploymentPlan",
         "prune",
         "apply Grant",
         "apply Grant",
+        "create Secret",
+        "create Secret",
         "apply Deployment",
         "apply Deployment",
-        "write Secret",
-        "write Secret",
     ]
     assert scene.objects.requests[8] == "apply Service"
     assert scene.complete
+
+
+async def test_existing_secret_is_replaced_only_after_its_deployment_exists(scene: Scene) -> None:
+    """The Secret may belong to a user, like a Deployment of the same name."""
+    scene.objects.taken.add((APPLICATION.key[0], f"{INSTANCES[0]}-tls"))
+    await scene.apply()
+    assert scene.objects.requests[4:8] == ["create Secret", "apply Deployment", "apply Deployment", "write Secret"]
+    assert sorted(scene.objects.secrets) == sorted((instance, "new") for instance in INSTANCES)
 
 
 async def test_rollout_creates_no_grant_when_rules_changed(scene: Scene) -> None:
@@ -251,12 +269,15 @@ async def test_grants_are_applied_despite_refused_object_unless_it_is_the_plan(
     assert scene.objects.requests.count("apply Grant") == grants
 
 
-async def test_instance_without_deployment_gets_no_secret(scene: Scene) -> None:
+async def test_secret_of_refused_deployment_replaces_no_existing_secret(scene: Scene) -> None:
     """The Deployment is refused, for example because its name is taken. The name of the Secret may be taken, too."""
     scene.objects.refused = kinds.DEPLOYMENT
-    with pytest.raises(KubeError, match="no"):
-        await scene.apply()
-    assert scene.objects.secrets == []
+    scene.objects.taken.add((APPLICATION.key[0], f"{INSTANCES[0]}-tls"))
+    for _ in range(2):
+        with pytest.raises(KubeError, match="no"):
+            await scene.apply()
+    assert "write Secret" not in scene.objects.requests
+    assert (INSTANCES[0], "new") not in scene.objects.secrets
     assert "apply Service" in scene.objects.requests, "the refusal does not stop later steps"
 
 

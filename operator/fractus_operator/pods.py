@@ -58,6 +58,7 @@ class PodView:
             empty string.
         unschedulable_since: Time since which the scheduler has found no node for it, if so.
         unschedulable_message: Message of the scheduler.
+        eviction: Message why Kubernetes ends it (drain, taint, preemption), or an empty string.
     """
 
     namespace: str
@@ -76,6 +77,7 @@ class PodView:
     failure: str = ""
     unschedulable_since: datetime | None = None
     unschedulable_message: str = ""
+    eviction: str = ""
 
     @property
     def instance(self) -> str | None:
@@ -102,6 +104,17 @@ class PodView:
         """The component of the pod."""
         return self.labels.get(COMPONENT_LABEL)
 
+    @property
+    def problem(self) -> str:
+        """Why the pod does not run, as a sentence, or an empty string."""
+        if self.failure:
+            return f"{self.instance} failed with {self.failure}"
+        if self.eviction:
+            return f"{self.instance} was evicted from {self.node}: {self.eviction}"
+        if self.unschedulable_since is not None:
+            return f"{self.instance} cannot be scheduled: {self.unschedulable_message}"
+        return ""
+
 
 def parse_pod(body: Body) -> PodView:
     """Parse a Pod."""
@@ -114,6 +127,7 @@ def parse_pod(body: Body) -> PodView:
     scheduled = conditions.get("PodScheduled", {})
     unschedulable = scheduled.get("status") == "False" and scheduled.get("reason") == "Unschedulable"
     since = scheduled.get("lastTransitionTime") if unschedulable else None
+    disrupted = conditions.get("DisruptionTarget", {})
     return PodView(
         namespace=metadata["namespace"],
         name=metadata["name"],
@@ -130,7 +144,8 @@ def parse_pod(body: Body) -> PodView:
         finished_at=_finished_at(labels) if _stops(spec, status) else None,
         failure=_failure(status),
         unschedulable_since=datetime.fromisoformat(since) if since else None,
-        unschedulable_message=scheduled.get("message", "") if unschedulable else "",
+        unschedulable_message=scheduled.get("message", "")[:_MAX_LOG] if unschedulable else "",
+        eviction=_eviction(disrupted) if disrupted.get("status") == "True" else "",
     )
 
 
@@ -176,6 +191,13 @@ def _last_line_first(output: str) -> str:
     text = lines.pop(error).strip()[:_MAX_LOG]
     before = " | ".join(lines)[-_MAX_LOG:].strip(" |")
     return f"{text} (before: {before})" if before else text
+
+
+def _eviction(condition: Body) -> str:
+    """Return why Kubernetes ends a pod. An eviction has no message that names its cause."""
+    if condition.get("reason") == "EvictionByEvictionAPI":
+        return "eviction requested, for example by kubectl drain"
+    return str(condition.get("message") or condition.get("reason") or "")[:_MAX_LOG]
 
 
 def _deployment(metadata: Body) -> str | None:

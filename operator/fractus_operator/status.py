@@ -179,10 +179,10 @@ def mission_record(outcome: Outcome, pods: Sequence[PodView] = ()) -> MissionRec
 
     Args:
         outcome: Outcome of the mission.
-        pods: Pods of the Application. After an incomplete mission, their failures are recorded because the pods are deleted now.
+        pods: Pods of the Application. After an incomplete mission, their problems are recorded because the pods are deleted now.
     """
-    failures = "" if outcome.kind is OutcomeKind.COMPLETE else _failures(pods)
-    message = "; ".join(filter(None, (outcome.reason, str(outcome.waypoints), failures)))
+    problems = "" if outcome.kind is OutcomeKind.COMPLETE else _problems(pods)
+    message = "; ".join(filter(None, (outcome.reason, str(outcome.waypoints), problems)))
     counts = ReportedWaypoints(**asdict(outcome.waypoints)) if str(outcome.waypoints) else None
     return MissionRecord(outcome=_OUTCOMES[outcome.kind], message=message, waypoints=counts)
 
@@ -241,16 +241,19 @@ def deployed(
     if missing:
         more = f" and {len(missing) - _MAX_NAMED} more" if len(missing) > _MAX_NAMED else ""
         message = f"waiting for {', '.join(missing[:_MAX_NAMED])}{more}"
-        failures = _failures(pod for pod in alive if pod.instance in missing and not pod.ready)
+        waiting = [pod for pod in pods if pod.instance in missing and not pod.finished and not pod.ready]
+        failed = any(pod.failure for pod in waiting if not pod.terminating)
+        problems = _problems(pod for pod in waiting if not pod.terminating or pod.eviction)
         named = sorted(name for name in missing if refused.get(name))[:_MAX_NAMED]
         refusals = "; ".join(f"pods of {name} cannot be created: {refused[name]}" for name in named)
-        message += "".join(f"; {text}" for text in (refusals, failures) if text)
+        message += "".join(f"; {text}" for text in (refusals, problems) if text)
         reason = "PodsNotReady"
         if refusals:
             reason = "PodsRefused"
-        elif failures:
+        elif failed:
             reason = "ComponentFailed"
-        readiness = ConditionUpdate("Ready", "False", reason, message, progress=not failures and not refusals)
+        # A pod that was evicted or has no node yet is replaced or placed soon, so no Event reports it.
+        readiness = ConditionUpdate("Ready", "False", reason, message, progress=not failed and not refusals)
     else:
         message = f"all {desired} pods are ready"
         readiness = ConditionUpdate("Ready", "True", "PodsReady", message)
@@ -399,5 +402,5 @@ def _plan_summary(plan: DeploymentPlanSpec) -> str:
     return f"{plan.drone.node} flies; {summary}" if plan.drone is not None else summary
 
 
-def _failures(pods: Iterable[PodView]) -> str:
-    return "; ".join(sorted(f"{pod.instance} failed with {pod.failure}" for pod in pods if pod.failure)[:_MAX_NAMED])
+def _problems(pods: Iterable[PodView]) -> str:
+    return "; ".join(sorted({pod.problem for pod in pods if pod.problem})[:_MAX_NAMED])

@@ -267,6 +267,41 @@ def test_status_reports_exit_code_and_last_log_lines() -> None:
     assert status.mission_record(Outcome(OutcomeKind.COMPLETE, "done"), pods).message == "done"
 
 
+def test_status_names_pods_that_are_evicted_or_cannot_be_scheduled() -> None:
+    body = {
+        "metadata": {"name": "p", "namespace": "ns", "labels": {"fractus.dev/instance": "a-1"}},
+        "spec": {"nodeName": "d"},
+    }
+    drained = {
+        "type": "DisruptionTarget",
+        "status": "True",
+        "reason": "EvictionByEvictionAPI",
+        "message": "Eviction API: evicting",
+    }
+    tainted = drained | {
+        "reason": "DeletionByTaintManager",
+        "message": "Taint manager: deleting due to NoExecute taint",
+    }
+    unplaced = {"type": "PodScheduled", "status": "False", "reason": "Unschedulable", "lastTransitionTime": NOW.isoformat(),
+                "message": "0/6 nodes are available: 1 node(s) had untolerated taint"}  # fmt: skip
+    problems = [parse_pod(body | {"status": {"conditions": [c]}}).problem for c in (drained, tainted, unplaced)]
+    assert problems == [
+        "a-1 was evicted from d: eviction requested, for example by kubectl drain",
+        "a-1 was evicted from d: Taint manager: deleting due to NoExecute taint",
+        "a-1 cannot be scheduled: 0/6 nodes are available: 1 node(s) had untolerated taint",
+    ]
+    leaving = replace(view("a-1", ready=False, terminating=True, eviction="by kubectl drain"), node="d")
+    waiting = view("a-1", ready=False, unschedulable_since=NOW, unschedulable_message="no node")
+    update = status.deployed(PLAN, [view("a-c"), view("a-c"), leaving, waiting], 0)
+    assert update.message == (
+        "waiting for a-1; a-1 cannot be scheduled: no node; a-1 was evicted from d: by kubectl drain"
+    )
+    ready = next(c for c in update.conditions if c.type == "Ready")
+    assert (ready.reason, ready.warning) == ("PodsNotReady", False)
+    lost = status.mission_record(Outcome(OutcomeKind.FAILED, "driver lost"), [leaving])
+    assert lost.message == "driver lost; a-1 was evicted from d: by kubectl drain"
+
+
 def grant(phase: str | None, uid: str = "u1", class_: str = "driver") -> Grant:
     owner = {"namespace": "ns", "name": "app", "uid": uid}
     spec = {"node": "d", "application": owner, "component": "N", "instance": "n", "class": class_}

@@ -20,6 +20,7 @@ Body = dict[str, Any]
 PODS = f"/api/v1/namespaces/{SYSTEM}/pods"
 DAEMON_SETS = f"/apis/apps/v1/namespaces/{SYSTEM}/daemonsets"
 NODE = "/api/v1/nodes/drone-1"
+CLASS_TAINT = {"key": "fractus.dev/class", "value": "drone", "effect": "NoExecute"}
 
 
 @pytest.fixture
@@ -31,6 +32,7 @@ def guarded(world: World, chart: None) -> Iterator[World]:
         if body["kind"] == "DaemonSet":
             world.api.apply(f"{DAEMON_SETS}/{body['metadata']['name']}", body)
     for drone in ("drone-1", "drone-2"):
+        world.api.merge(f"/api/v1/nodes/{drone}", {"spec": {"taints": [CLASS_TAINT]}})
         for part in ("agent", "camera", "mobility"):
             service(world, part, drone)
     wait_for(lambda: refusal(lambda: try_delete(world, f"{PODS}/fractus-mobility-drone-1")), "the policies")
@@ -111,7 +113,16 @@ def attempts(world: World, drone: str) -> dict[str, Callable[[], object]]:
         "change the node's label": lambda: api.merge(
             node + dry, {"metadata": {"labels": {"fractus.dev/class": "edge"}}}
         ),
-        "taint the node": lambda: api.merge(node + dry, {"spec": {"taints": [{"key": "x", "effect": "NoExecute"}]}}),
+        "taint the node": lambda: api.merge(
+            node + dry, {"spec": {"taints": [CLASS_TAINT, {"key": "x", "effect": "NoExecute"}]}}
+        ),
+        "remove the node's taint": lambda: api.merge(node + dry, {"spec": {"taints": []}}),
+        "weaken the node's taint": lambda: api.merge(
+            node + dry, {"spec": {"taints": [{**CLASS_TAINT, "effect": "NoSchedule"}]}}
+        ),
+        "change the value of the node's taint": lambda: api.merge(
+            node + dry, {"spec": {"taints": [{**CLASS_TAINT, "value": "edge"}]}}
+        ),
         "delete the node": lambda: try_delete(world, node),
         "delete the Drone": lambda: try_delete(world, f"{FRACTUS}/drones/{drone}"),
     }
@@ -155,7 +166,7 @@ def test_harmless_changes_are_allowed_in_flight(control_plane: ControlPlane, gua
     dry = "?dryRun=All"
     api.merge(f"{NODE}{dry}", {"spec": {"unschedulable": True}})
     api.merge(f"{NODE}{dry}", {"metadata": {"labels": {"fractus.dev/geohash": "u1"}}})
-    unreachable = [{"key": "node.kubernetes.io/unreachable", "effect": "NoExecute"}]
+    unreachable = [CLASS_TAINT, {"key": "node.kubernetes.io/unreachable", "effect": "NoExecute"}]
     api.merge(f"{NODE}{dry}", {"spec": {"taints": unreachable}})
     api.merge(f"{PODS}/fractus-mobility-drone-1{dry}", {"metadata": {"annotations": {"a": "b"}}})
     template = {"spec": {"template": {"metadata": {"annotations": {"a": "b"}}}}}

@@ -1,7 +1,11 @@
-"""`python -m fractus_operator.uninstall_check`: checks that Fractus can be uninstalled without leaving a drone in the air."""
+"""`python -m fractus_operator.uninstall_check [--drone NAME]`: checks that an uninstall leaves no drone in the air.
+
+With --drone, only this drone is checked, for the chart that contains it. Without it, no Application may exist either.
+"""
 
 from __future__ import annotations
 
+import argparse
 import asyncio
 import sys
 from collections.abc import Sequence
@@ -41,8 +45,8 @@ def objection(applications: Sequence[Body], drones: Sequence[Body]) -> str:
     unsure = [body["metadata"]["name"] for body in watched if _may_take_off(body)]
     if unsure:
         return (
-            f"{_listed(unsure)} may have taken off since {NOT_REPORTED}: wait for its next report, or, if you see it on the "
-            "ground, set its annotation fractus.dev/grounded (docs/upgrades.md), then uninstall"
+            f"{_listed(unsure)} may have taken off since {NOT_REPORTED}: delete its Application and wait for its next report, or, "
+            "if you see it on the ground, set its annotation fractus.dev/grounded (docs/upgrades.md), then uninstall"
         )
     return ""
 
@@ -67,8 +71,11 @@ def _listed(names: Sequence[str], most: int = 5) -> str:
     return named if len(names) <= most else f"{named} and {len(names) - most} more"
 
 
-async def check() -> str:
+async def check(drone: str | None = None) -> str:
     """Return the objection for the current state of the cluster. Waits for up to two reports of drones that have landed.
+
+    Args:
+        drone: Name of the only drone to check. Default: all drones, and all Applications.
 
     Raises:
         Unconfigured: There are no credentials.
@@ -79,7 +86,11 @@ async def check() -> str:
     try:
         async with asyncio.timeout(_REPORTS_S) as waited:
             while True:
-                problem = objection(await _all(store, APPLICATION), await _all(store, DRONE))
+                applications = await _all(store, APPLICATION) if drone is None else []
+                drones = await _all(store, DRONE)
+                if drone is not None:
+                    drones = [body for body in drones if body["metadata"]["name"] == drone]
+                problem = objection(applications, drones)
                 if NOT_REPORTED not in problem:
                     return problem
                 await asyncio.sleep(_PERIOD_S)
@@ -101,8 +112,11 @@ async def _all(store: Store, kind: Kind) -> list[Body]:
 
 def main() -> int:
     """Run the check as a program. Return its exit code."""
+    parser = argparse.ArgumentParser(description="Check that an uninstall leaves no drone in the air.")
+    parser.add_argument("--drone", help="Name of the only drone to check. Default: all drones and Applications.")
+    arguments = parser.parse_args()
     try:
-        problem = asyncio.run(check())
+        problem = asyncio.run(check(arguments.drone))
     except (Unconfigured, KubeError) as error:
         problem = f"cannot check for drones in flight: {error}"
     if problem:

@@ -104,3 +104,21 @@ def test_demo_chart_refuses_invalid_values() -> None:
         result = template("drone=d", value)
         assert result.returncode != 0
         assert named in result.stderr
+
+
+def test_demo_chart_checks_its_drone_before_it_is_deleted() -> None:
+    """Otherwise helm would delete zones, policies and the vehicle in flight before the API server refuses the Drone."""
+    made = objects("drone=d")
+    job = made["Job", "demo-uninstall"]
+    annotations = job["metadata"]["annotations"]
+    assert annotations["helm.sh/hook"] == "pre-delete"
+    assert "hook-failed" not in annotations["helm.sh/hook-delete-policy"], "the log of a failed check must remain"
+    pod = job["spec"]["template"]["spec"]
+    (container,) = pod["containers"]
+    assert [*container["command"], *container["args"]][-3:] == ["fractus_operator.uninstall_check", "--drone", "d"]
+    account = made["ServiceAccount", pod["serviceAccountName"]]
+    assert "annotations" not in account["metadata"], "the account must exist before the hook runs"
+    (rule,) = made["ClusterRole", "demo-uninstall"]["rules"]
+    assert rule == {"apiGroups": ["fractus.dev"], "resources": ["drones"], "verbs": ["list"]}
+    notes = (CHARTS / "fractus-demo" / "templates" / "NOTES.txt").read_text()
+    assert "logs job/{{ .Release.Name }}-uninstall" in notes

@@ -28,7 +28,7 @@ def guarded(world: World, chart: None) -> Iterator[World]:
     """Two drones with their services, and the chart's admission policies. Drone-1 flies."""
     world.add_drone("drone-2")
     world.drone_status("drone-1", "flying")
-    for body in render():
+    for body in (*render(), *render("--set=drone=drone-1", chart="fractus-demo")):
         if body["kind"] == "DaemonSet":
             world.api.apply(f"{DAEMON_SETS}/{body['metadata']['name']}", body)
     for drone in ("drone-1", "drone-2"):
@@ -149,6 +149,18 @@ def together(world: World) -> dict[str, Callable[[], object]]:
         "delete the namespace": lambda: try_delete(world, f"/api/v1/namespaces/{SYSTEM}"),
         "delete the namespace of nodes": lambda: try_delete(world, f"/api/v1/namespaces/{NODES}"),
         "delete all DaemonSets": lambda: try_delete(world, DAEMON_SETS),
+        **{
+            f"delete a DaemonSet with --cascade={policy}": lambda policy=policy: try_delete(
+                world, f"{DAEMON_SETS}/fractus-mobility", propagationPolicy=policy
+            )
+            for policy in ("Orphan", "Foreground")
+        },
+        **{
+            f"delete the demo's vehicle with --cascade={policy}": lambda policy=policy: try_delete(
+                world, f"{DAEMON_SETS}/fractus-demo-vehicle", propagationPolicy=policy
+            )
+            for policy in ("Orphan", "Foreground", "Background")
+        },
     }
 
 

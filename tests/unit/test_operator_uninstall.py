@@ -113,3 +113,16 @@ async def test_uninstall_is_allowed_without_kinds(monkeypatch: pytest.MonkeyPatc
     lists.of["Drone"] = KubeError(403, "Forbidden", "it may not list drones")
     with pytest.raises(KubeError):
         await check()
+
+
+async def test_uninstall_of_one_drone_ignores_other_drones_and_applications(monkeypatch: pytest.MonkeyPatch) -> None:
+    lists = Lists(Application=[application("patrol", "fractus.dev/teardown")], Drone=[drone("other", "flying")])
+
+    async def connect() -> Lists:
+        return lists
+
+    monkeypatch.setattr(Store, "connect", connect)
+    assert await check("drone-1") == ""
+    lists.of["Drone"].append(drone("drone-1", "flying"))
+    assert "Fractus still flies drone-1 (flying)" in await check("drone-1")
+    assert "default/patrol" in await check()

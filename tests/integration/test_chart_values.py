@@ -13,6 +13,7 @@ from chart import CHARTS, render, values_of
 
 VALUES = tuple(values_of("fractus"))
 SCHEMA = json.loads((CHARTS / "fractus" / "values.schema.json").read_text())
+WIPE = ("--set=uninstall.wipeNodes=true", "--is-upgrade")
 EVERYTHING = [
     f"--set={part}.enabled=true" for part in ("view", "metrics.podMonitor", "metrics.rules", "metrics.dashboard")
 ]
@@ -118,3 +119,28 @@ def test_every_fraction_of_values_schema_is_tested() -> None:
             yield from fractions(inner, f"{name}.{key}")
 
     assert set(fractions(SCHEMA, "")) == set(FRACTIONS)
+
+
+IMAGES = {
+    "fractus": ("operator", "agent", "mobility", "camera", "view"),
+    "fractus-demo": ("sim", "example-traffic-monitoring", "operator"),
+}
+
+
+@pytest.mark.parametrize(("chart", "name"), [(chart, name) for chart, names in IMAGES.items() for name in names])
+def test_image_is_selected_by_digest(chart: str, name: str) -> None:
+    digest = "sha256:" + "0123456789abcdef" * 4
+    options = ("--set=view.enabled=true", *WIPE) if chart == "fractus" else ("--set=drone=drone-1",)
+    rendered = str(render(*options, f"--set=image.digests.{name}={digest}", chart=chart))
+    assert f"localhost/fractus/{name}@{digest}" in rendered
+    assert f"localhost/fractus/{name}:" not in rendered, "a workload ignores the digest"
+    for bad in ("sha256:0", "latest"):
+        with pytest.raises(subprocess.CalledProcessError) as refused:
+            render(*options, f"--set=image.digests.{name}={bad}", chart=chart)
+        assert "/image/digests" in refused.value.stderr
+
+
+def test_digest_of_unknown_image_is_refused() -> None:
+    with pytest.raises(subprocess.CalledProcessError) as refused:
+        render(f"--set=image.digests.navigator=sha256:{'0' * 64}")
+    assert "navigator" in refused.value.stderr

@@ -11,7 +11,12 @@
 
 {{/* Image of a part. Argument: (dict "root" $ "part" "sim"). */}}
 {{- define "fractus-demo.image" -}}
-{{- with .root }}{{ .Values.image.registry }}/{{ $.part }}:{{ .Values.image.tag | default .Chart.AppVersion }}{{ end }}
+{{- $image := .root.Values.image }}
+{{- with get ($image.digests | default dict) .part }}
+{{- printf "%s/%s@%s" $image.registry $.part . }}
+{{- else }}
+{{- printf "%s/%s:%s" $image.registry .part ($image.tag | default .root.Chart.AppVersion) }}
+{{- end }}
 {{- end }}
 
 {{/* Name of the node that this release chose as the drone. The choice stays if nodes are added or removed. */}}

@@ -50,7 +50,12 @@ has(request.userInfo.extra) && "authentication.kubernetes.io/node-name" in reque
 
 {{/* Image of a part. Argument: (dict "root" $ "part" "agent"). */}}
 {{- define "fractus.image" -}}
-{{- with .root }}{{ printf "%s/%s:%s" .Values.image.registry $.part (.Values.image.tag | default .Chart.AppVersion) | quote }}{{ end }}
+{{- $image := .root.Values.image }}
+{{- with get ($image.digests | default dict) .part }}
+{{- printf "%s/%s@%s" $image.registry $.part . | quote }}
+{{- else }}
+{{- printf "%s/%s:%s" $image.registry .part ($image.tag | default .root.Chart.AppVersion) | quote }}
+{{- end }}
 {{- end }}
 
 {{- define "fractus.pullSecrets" -}}

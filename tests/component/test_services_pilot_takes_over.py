@@ -11,7 +11,7 @@ from closed_loop import Sky, Wire
 from fractus_core.control import Authority
 from fractus_core.policy.decision_types import TakeoffArgs
 from fractus_runtime.mavlink_codec import Parser
-from mobility_world import end, goto
+from mobility_world import end, goto, spec
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sky_drone import fly, ready, until
 
@@ -58,5 +58,30 @@ def test_pilot_keeps_control_when_taking_over_during_system_mode_change(
             await asyncio.sleep(10.0)
             assert sky.truth.mode == mavlink.COPTER_MODE_LOITER
             assert drone.control.authority is Authority.PILOT
+
+    fly(work, tmp_path)
+
+
+def test_drone_handed_back_just_after_touchdown_does_not_climb_to_a_lower_limit(tmp_path: Path) -> None:
+    """The autopilot has not detected the landing yet, so the drone still counts as flying below the limit."""
+
+    async def work(sky: Sky, directory: Path) -> None:
+        async with ready(sky, directory) as (drone, _):
+            floor = {"type": "LimitControl", "kind": "altitude", "lowerLimit": 5.0}
+            grant = drone.grants.put(spec({"name": "floor", "spec": floor, "zones": []}))
+            await drone.service.arm(grant, 120.0)
+            await end(drone.service.take_off(grant, TakeoffArgs(10.0)))
+            assert sky.craft.vehicle.modes.change(mavlink.COPTER_MODE_LAND)
+            await until(lambda: drone.control.authority is Authority.PILOT, 2.0)
+            await until(lambda: sky.truth.touch_time_s >= 0.5)
+            vehicle = drone.control.autopilot.vehicle
+            assert vehicle.in_air
+            assert sky.craft.vehicle.modes.change(mavlink.COPTER_MODE_GUIDED)
+            await until(lambda: drone.control.authority is Authority.SYSTEM, 2.0)
+            highest_m = 0.0
+            for _ in range(100):
+                await asyncio.sleep(0.1)
+                highest_m = max(highest_m, vehicle.altitude_m)
+            assert highest_m < 1.0
 
     fly(work, tmp_path)

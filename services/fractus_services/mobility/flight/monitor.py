@@ -33,6 +33,9 @@ from fractus_services.mobility.settings import SETTINGS
 log = logging.getLogger(__name__)
 
 
+HANDED_BACK_CLIMB_M = 1.0
+"""Climb after which a drone that a pilot handed back is known to fly."""
+
 Permits = Callable[[Motion | None], Permit]
 """Returns the permit for the commands of a motion."""
 
@@ -66,6 +69,8 @@ class MotionMonitor:
         self._grant: ActiveGrant | None = None
         self._in_force: tuple[tuple[bool, bool], ...] = ()
         self._changed_at = -math.inf
+        self._left_by_pilot_m: float | None = None
+        """Last altitude under a pilot's control, until the drone moves under another control."""
 
     async def run(self) -> None:
         """Monitor until cancelled."""
@@ -105,6 +110,10 @@ class MotionMonitor:
         piloted = control.authority is Authority.PILOT
         compiled = self._constraints() if mode.comes_down or (mode.commanded and not piloted) else None
         verdict, by_system = self._judge(compiled) if compiled is not None else (None, False)
+        untouched = self._stays_where_pilot_left_it(piloted)
+        if verdict is not None and verdict.code == "AltitudeBelowLimit" and untouched:
+            # The pilot may have landed the drone. Until the autopilot detects the landing, a climb would take off again.
+            verdict = None
         problem = control.autopilot.vehicle.position_problem
         if verdict is not None and verdict.code == POSITION_UNKNOWN and problem:
             verdict = replace(verdict, reason=f"the drone's position is not trusted: {problem}")
@@ -138,6 +147,16 @@ class MotionMonitor:
             self._stop(verdict, new_alarm)
         elif new_alarm:
             self._correct(verdict, compiled)
+
+    def _stays_where_pilot_left_it(self, piloted: bool) -> bool:
+        """Return True if the drone has neither moved nor climbed since a pilot handed it back."""
+        altitude_m = self._control.autopilot.vehicle.altitude_m
+        left_m = self._left_by_pilot_m
+        if piloted:
+            self._left_by_pilot_m = altitude_m
+        elif left_m is not None and (self._control.motion is not None or altitude_m > left_m + HANDED_BACK_CLIMB_M):
+            self._left_by_pilot_m = None
+        return self._left_by_pilot_m is not None
 
     def _constraints(self) -> CompiledGrant | None:
         """Return the constraints of the current flight; None if no Grant applies.

@@ -12,6 +12,7 @@ from fractus_core.control import Authority, ControlState, Mission, Outcome, Outc
 from fractus_core.control.actions import (
     Action,
     EndStream,
+    RecordAudit,
     SaveJournal,
     SendEvent,
     StartSystemTask,
@@ -280,3 +281,28 @@ def test_flying_vehicle_returns_home_without_further_events(history: list[events
             state, _ = transition(state, events.SystemTaskEnded(state.task.task_id, finished=True), now)
     answered = state.drives or state.authority is Authority.PILOT or state.starting_motors or state.flight is not None
     assert answered or state.returning or state.touring is not None
+
+
+def test_motors_that_stop_in_flight_are_not_recorded_as_a_landing() -> None:
+    """An autopilot that restarts in flight first loses its position. That is not the reason why the mission fails."""
+    state = FOUND_ON_GROUND
+    recorded: list[RecordAudit] = []
+
+    def after(event: events.Event, now: float) -> None:
+        nonlocal state
+        state, actions = transition(state, event, now)
+        recorded.extend(action for action in actions if isinstance(action, RecordAudit))
+
+    for event in (
+        events.GrantChanged(None, DRIVER), events.StreamOpened(1, "a", "A"), events.GrantControl(1), events.MotorStart(begins=True),
+        events.VehicleObserved(FLYING), events.Heartbeat(), events.MotorStart(begins=False), events.Airborne(),
+        events.PositionLost("the drone's position is unknown"), events.VehicleObserved(replace(GROUND, stopped_in_air=True, silent_s=6.0)),
+        events.Heartbeat(),
+    ):  # fmt: skip
+        after(event, 1.0)
+    assert "landed" not in {entry.action for entry in recorded}
+    assert (recorded[-1].action, recorded[-1].code) == ("stopped", "MotorsStoppedInAir")
+    assert "may have restarted" in recorded[-1].reason
+    after(events.Tick(), 1000.0)
+    assert (recorded[-1].kind, recorded[-1].code) == ("takeover", "MotorsStoppedInAir")
+    assert "motors stopped" in str(state.missions["a"].outcome)

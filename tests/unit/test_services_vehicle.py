@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from fractus_runtime.mavlink_codec import message
+from fractus_runtime.mavlink_codec import Message, message
 from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
 from fractus_services.mobility.mavlink.vehicle import Vehicle
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -160,3 +160,38 @@ def test_smart_rtl_path_survives_service_restart_if_position_is_known(flags: int
     assert vehicle.path_lost is path_lost
     vehicle.take(message("EKF_STATUS_REPORT", flags=POSITIONED), 115.0)
     assert vehicle.path_lost, "after a long silence, the path counts as lost"
+
+
+def heartbeat(*, armed: bool, mode: int = mavlink.COPTER_MODE_GUIDED) -> Message:
+    flags = mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED | (mavlink.MAV_MODE_FLAG_SAFETY_ARMED if armed else 0)
+    return message(
+        "HEARTBEAT", type=mavlink.MAV_TYPE_QUADROTOR, autopilot=mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, base_mode=flags, custom_mode=mode,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("gap_s", [1.0, 8.0])
+@pytest.mark.parametrize(
+    ("landed_state", "altitude_m", "mode", "in_air"),
+    [
+        pytest.param(mavlink.MAV_LANDED_STATE_IN_AIR, 20.0, mavlink.COPTER_MODE_STABILIZE, True, id="restart"),
+        pytest.param(mavlink.MAV_LANDED_STATE_ON_GROUND, 0.1, mavlink.COPTER_MODE_GUIDED, False, id="landed"),
+        pytest.param(mavlink.MAV_LANDED_STATE_LANDING, 5.0, mavlink.COPTER_MODE_LAND, False, id="landed-on-a-hill"),
+        pytest.param(
+            mavlink.MAV_LANDED_STATE_IN_AIR, 20.0, mavlink.COPTER_MODE_RTL, False, id="returned-while-link-was-cut"
+        ),
+    ],
+)
+def test_vehicle_whose_motors_stop_in_flight_has_not_landed(
+    landed_state: int, altitude_m: float, mode: int, in_air: bool, gap_s: float
+) -> None:
+    vehicle = Vehicle(stack=ARDUCOPTER)
+    vehicle.take(heartbeat(armed=True), 10.0)
+    assert not vehicle.stopped_in_air
+    vehicle.altitude_m = altitude_m
+    vehicle.landed_state = landed_state
+    for i in range(2):
+        vehicle.take(heartbeat(armed=False, mode=mode), 10.0 + gap_s + i)
+    assert not vehicle.armed
+    assert vehicle.stopped_in_air == in_air
+    vehicle.take(heartbeat(armed=True), 30.0)
+    assert not vehicle.stopped_in_air

@@ -74,7 +74,7 @@ from fractus_core.control.state import (
     WaypointCounts,
     ended_refusal,
 )
-from fractus_core.control.state_update import DRIVER_LOST, GRANT_REMOVED, StateUpdate
+from fractus_core.control.state_update import DRIVER_LOST, GRANT_REMOVED, POSITION_UNKNOWN, StateUpdate
 from fractus_core.control.vehicle_events import on_arming, on_vehicle
 from fractus_core.exhaustive import exhaustive
 from fractus_core.policy.decision_types import Takeover
@@ -89,9 +89,6 @@ TAKEOVERS: dict[Takeover, tuple[TaskKind, OutcomeKind | None]] = exhaustive(
     },
 )
 """System task and mission outcome of each takeover that a policy can demand."""
-
-POSITION_UNKNOWN = "PositionUnknown"
-"""Code of the reaction to an unknown position: the vehicle hovers until the position is known again."""
 
 UNATTENDED = "NoControlAuthority"
 """Code of the takeover of an armed vehicle that no party controls. Only a fault of the service leads to this state."""

@@ -63,6 +63,7 @@ class VehicleFacts:
         failsafe_text: Last status text about a failsafe.
         failsafe_text_at: Time of that text, by the clock of the events.
         silent_s: Interval between the last two heartbeats, in seconds of the vehicle's clock.
+        stopped_in_air: True if the last report before the motors stopped was from the air.
     """
 
     connected: bool = False
@@ -73,6 +74,7 @@ class VehicleFacts:
     failsafe_text: str = ""
     failsafe_text_at: float = -math.inf
     silent_s: float = 0.0
+    stopped_in_air: bool = False
 
 
 class OutcomeKind(Enum):

@@ -35,6 +35,9 @@ MAX_MISSIONS = 200
 DRIVER_LOST = "driver lost"
 GRANT_REMOVED = "the grant was removed"
 
+POSITION_UNKNOWN = "PositionUnknown"
+"""Code of the reaction to an unknown position: the vehicle hovers until the position is known again."""
+
 
 class StateUpdate:
     """Collects the changes and actions of one event. Nothing is visible outside before the transition is complete.

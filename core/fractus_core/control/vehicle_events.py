@@ -6,6 +6,7 @@ Each change is attributed to the system, to a failsafe of the autopilot, or to a
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import assert_never
 
 from fractus_core.control.actions import SaveJournal, SetStreamRates, WakeWaiters
@@ -23,7 +24,7 @@ from fractus_core.control.events import (
     VehicleObserved,
 )
 from fractus_core.control.state import Authority, FlightMode, ModeKind, OutcomeKind, TaskKind
-from fractus_core.control.state_update import DRIVER_LOST, StateUpdate
+from fractus_core.control.state_update import DRIVER_LOST, POSITION_UNKNOWN, StateUpdate
 
 FAILSAFE_TEXT_S = 3.0
 """A mode change within this many seconds after a status text about a failsafe is attributed to the failsafe."""
@@ -40,6 +41,12 @@ UNCONFIRMED_S = 10.0
 
 The autopilot may have accepted the request while its acknowledgements were lost.
 """
+
+MOTORS_STOPPED = "stopped"
+"""Action of the record that the motors stopped, but no landing was reported."""
+
+STOPPED_IN_AIR = "MotorsStoppedInAir"
+"""Code of this record."""
 
 ARMED_BY_OTHERS = "armed the drone"
 FLEW_HOME_ALONE = "the autopilot returned by itself while the mobility service was not running"
@@ -204,10 +211,31 @@ def _on_disarmed(update: StateUpdate) -> None:
         update.set(authority=Authority.SYSTEM)
         if mission is None or mission.outcome is not None:
             update.set(active=None)
-    update.audit("control", "landed", update.state.controller, "the motors are stopped")
+    if update.state.vehicle.stopped_in_air:
+        _record_stop_in_air(update)
+    else:
+        update.audit("control", "landed", update.state.controller, "the motors are stopped")
     update.act(SaveJournal())
     update.act(SetStreamRates(flying=False))
     update.act(WakeWaiters())
+
+
+def _record_stop_in_air(update: StateUpdate) -> None:
+    """Record that the motors stopped, but no landing was reported.
+
+    The position is then unknown for that reason, so a mission that fails because of its unknown position gets this reason.
+    """
+    silent_s = update.state.vehicle.silent_s
+    reason = "the motors stopped in flight; the autopilot may have restarted, or a station stopped the motors"
+    if silent_s >= LINK_CUT_S:
+        reason = (
+            f"the motors stopped during {silent_s:.0f} s without a report of the autopilot, which was in flight before;"
+            " it may have restarted or landed"
+        )
+    update.audit("control", MOTORS_STOPPED, update.state.controller, reason, STOPPED_IN_AIR)
+    grace = update.state.grace
+    if grace is not None and grace.code == POSITION_UNKNOWN:
+        update.set(grace=replace(grace, reason=reason, code=STOPPED_IN_AIR))
 
 
 def _on_foreign_mode(update: StateUpdate) -> None:

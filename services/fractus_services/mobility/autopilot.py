@@ -83,6 +83,7 @@ class VehicleState:
         status_texts: Number, MAV_SEVERITY and text of recent status texts.
         identity_problem: Reason why it is uncertain which vehicle on the link is the drone's own; empty if it is certain.
         heartbeat_gap_s: Interval between the last two heartbeats.
+        stopped_in_air: True if the last reports before the motors stopped were from a flight, and not from a landing.
         located: True if GPS has an accurate three-dimensional fix. Positions without such a fix are ignored.
         position_problem: Reason why the reported position is not trusted and ignored; empty if it is trusted.
         position_problem_at: Start of the problem with the position. Problems that recur soon count as one.
@@ -135,6 +136,7 @@ class VehicleState:
     failsafe_text_at: float = -math.inf
     identity_problem: str = ""
     heartbeat_gap_s: float = 0.0
+    stopped_in_air: bool = False
     position_problem: str = ""
     position_problem_at: float = -math.inf
     position_trusted_at: float = -math.inf

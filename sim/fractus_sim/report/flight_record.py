@@ -264,8 +264,9 @@ def _time_s(text: str) -> float:
 
 
 def _has_state(entry: Mapping[str, Any]) -> bool:
-    """Return True if an entry contains the position of the drone. It is then a telemetry sample or a landing entry."""
-    return entry.get("kind") == "state" or (entry.get("kind") == "control" and entry.get("action") == "landed")
+    """Return True if an entry contains the position of the drone. It is then a telemetry sample, or the motors stopped."""
+    stops = entry.get("kind") == "control" and entry.get("action") in {"landed", "stopped"}
+    return entry.get("kind") == "state" or stops
 
 
 def _sample(entry: Mapping[str, Any]) -> Sample:

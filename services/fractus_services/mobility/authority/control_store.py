@@ -132,6 +132,7 @@ class ControlStore:
             failsafe_text=vehicle.failsafe_text,
             failsafe_text_at=vehicle.failsafe_text_at,
             silent_s=vehicle.heartbeat_gap_s * self.autopilot.pace,
+            stopped_in_air=vehicle.stopped_in_air,
         )
         self._state = self._state.observed(facts)
         return self._state

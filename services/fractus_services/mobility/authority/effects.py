@@ -29,6 +29,7 @@ from fractus_core.control.actions import (
 from fractus_core.control.events import SystemTaskEnded
 from fractus_core.control.state import SystemTask
 from fractus_core.control.state_update import DRIVER_LOST
+from fractus_core.control.vehicle_events import MOTORS_STOPPED
 from fractus_core.policy.compiled_grant import CompiledGrant
 from fractus_core.policy.decision_types import GotoArgs
 from fractus_runtime.audit import AuditLog
@@ -296,7 +297,7 @@ class EffectRunner:
     def _record(self, entry: RecordAudit) -> None:
         if entry.kind == "takeover" or entry.action in {"returned", DRIVER_LOST}:
             self.takeover_reason = entry.reason or "its driver returned control"
-        elif entry.action in {"granted", "landed"}:
+        elif entry.action in {"granted", "landed", MOTORS_STOPPED}:
             self.takeover_reason = ""
         vehicle = self._autopilot.vehicle
         self._audit.append(

@@ -11,8 +11,8 @@ from typing import Any
 
 from fractus_core.control import Authority
 from fractus_core.control.events import Airborne, PositionFound, PositionLost
-from fractus_core.control.machine import POSITION_UNKNOWN
 from fractus_core.control.state import ModeKind, TaskKind
+from fractus_core.control.state_update import POSITION_UNKNOWN
 from fractus_core.policy.compiled_grant import CompiledGrant
 from fractus_core.policy.decision_types import GotoArgs, SetSpeedArgs, Verdict
 from fractus_core.policy.monitoring import monitor

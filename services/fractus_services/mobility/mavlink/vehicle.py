@@ -40,6 +40,9 @@ The autopilot sends them at least once per second. After a longer silence the es
 STOPPED_S = 0.7
 """Time for which heartbeats (one per second) must report stopped motors in flight before the motors count as stopped."""
 
+IN_FLIGHT_ALTITUDE_M = 3.0
+"""Altitude above home above which a drone whose motors stop has not landed near home."""
+
 STARTED_S = 5.0
 """Time after the start of its motors for which a drone counts as flying, because it may be about to take off.
 
@@ -131,9 +134,20 @@ def _heartbeat(vehicle: Vehicle, message: Message, now: float) -> None:
         # Arming moves home to the position of the vehicle, so the previous home does not apply to this flight.
         vehicle.ground_home = None
         vehicle.started_at = now
+    if armed or vehicle.armed:
+        vehicle.stopped_in_air = not armed and _was_in_flight(vehicle)
     vehicle.armed = armed
     vehicle.path_lost = vehicle.path_lost and vehicle.armed
     vehicle.failsafe = message.integer("system_status") in {mavlink.MAV_STATE_CRITICAL, mavlink.MAV_STATE_EMERGENCY}
+
+
+def _was_in_flight(vehicle: Vehicle) -> bool:
+    """Return True if the last reports before the motors stopped were from a flight above the ground, and not from a landing.
+
+    A drone that landed by itself while the link was cut is still in the mode that brought it down. A restarted autopilot is not.
+    """
+    flying = vehicle.landed_state == mavlink.MAV_LANDED_STATE_IN_AIR and vehicle.altitude_m > IN_FLIGHT_ALTITUDE_M
+    return flying and not vehicle.mode.comes_down
 
 
 def _place(lat_e7: int, lon_e7: int) -> tuple[float, float] | None:

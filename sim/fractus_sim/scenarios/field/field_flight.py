@@ -151,7 +151,7 @@ def _wait_landed(drones: Standalone, drone: RunningDrone, autopilot: Autopilot, 
             report(f"{entry.get('action')}{reason}")
         reported = len(control)
         flown = flown or any(e.get("in_air") for e in log if e.get("kind") == "state")
-        if flown and any(e.get("action") == "landed" for e in control):
+        if flown and any(e.get("action") in {"landed", "stopped"} for e in control):
             return
         waited_s = time.monotonic() - began_s
         if not flown and waited_s > READY_TIMEOUT_S:

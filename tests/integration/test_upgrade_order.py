@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import subprocess
 import urllib.request
 from collections.abc import Iterator
@@ -11,7 +12,7 @@ from pathlib import Path
 import pytest
 from chart import render
 from control_plane import ControlPlane, wait_for
-from fractus_core.api import NodeGrants
+from fractus_core.api import DeploymentPlan, NodeGrants
 from fractus_core.api.crd import crd
 from fractus_runtime.kubernetes import KubeError
 from operator_world import FRACTUS, NODES, SYSTEM, OperatorProcess, World
@@ -79,3 +80,20 @@ def test_chart_is_refused_when_kind_is_missing(world: World, arguments: tuple[st
     with without_kind(world), pytest.raises(subprocess.CalledProcessError) as refused:
         render(*with_lookups(world, *arguments))
     assert "install or upgrade the chart fractus-crds first" in refused.value.stderr
+
+
+def test_chart_is_refused_when_kind_cannot_record_outcomes(world: World) -> None:
+    """The API server would refuse the outcome of a mission, and the operator would then not remove its Grants."""
+    path = KIND.replace("nodegrants", "deploymentplans")
+    older = copy.deepcopy(crd(DeploymentPlan))
+    del older["spec"]["versions"][0]["schema"]["openAPIV3Schema"]["properties"]["spec"]["properties"]["flown"]
+    present = world.api.get(path) or {}
+    older["metadata"]["resourceVersion"] = present["metadata"]["resourceVersion"]
+    world.api.call("PUT", path, older)
+    try:
+        with pytest.raises(subprocess.CalledProcessError) as refused:
+            render(*with_lookups(world, "--is-upgrade"))
+    finally:
+        world.api.apply(path, crd(DeploymentPlan))
+    assert "DeploymentPlan has no field spec.flown: upgrade the chart fractus-crds first" in refused.value.stderr
+    assert render(*with_lookups(world, "--is-upgrade"))

@@ -74,7 +74,7 @@ JERK_MPS3 = 5.0
 """ArduCopter's PSC_JERK_XY. It limits how fast the vehicle can reduce its acceleration."""
 
 
-JUMP_SWERVE_M = 2.0
+JUMP_SWERVE_M = 5.0
 JUMP_SWERVE_MPS = 20.0
 """Distance from docs/mobility.md by which a drone may leave its course when its estimate jumps, without delay and per second of it."""
 

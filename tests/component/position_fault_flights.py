@@ -22,7 +22,7 @@ JUMP_M = (8.0, 80.0)
 REACTION_S = 0.25
 """Share of the latency that is not the round trip of the link."""
 
-SWERVE_M = 2.0
+SWERVE_M = 5.0
 SWERVE_MPS = 20.0
 """Documented distance by which a drone may leave its course after a jump: without delay, and in addition per second of round trip."""
 

@@ -261,7 +261,7 @@ _UNUSED = (ast.Expr, ast.If, ast.While, ast.BoolOp, ast.UnaryOp, ast.Compare, as
 
 def _attributes(kind: type) -> set[str]:
     """Return the names that the constructor of a class sets."""
-    source = inspect.getsource(kind.__init__)  # type: ignore[misc]
+    source = inspect.getsource(kind.__init__)  # type: ignore[misc]  # a subclass may have another __init__, but `kind` is exact
     return {
         node.attr for node in ast.walk(ast.parse(inspect.cleandoc("\n" + source))) if isinstance(node, ast.Attribute)
     }

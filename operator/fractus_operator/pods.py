@@ -28,7 +28,9 @@ FINISHED_DEADLINE_S = 1
 
 The API server accepts no smaller value. The time counts from the start of the pod.
 """
-_CANNOT_START = frozenset({"ImagePullBackOff", "ErrImagePull", "InvalidImageName", "CreateContainerConfigError"})
+_NO_IMAGE = frozenset({"ImagePullBackOff", "ErrImagePull", "ErrImageNeverPull"})
+_CANNOT_START = _NO_IMAGE | {"InvalidImageName", "CreateContainerConfigError"}
+_LOAD_IMAGE = "push the image to a registry that the node can reach, or load it (`fractus cluster load-image` on an embedded cluster)"
 REPLICA_FAILURE = "ReplicaFailure"
 """Condition type of a Deployment whose pods cannot be created (reason REFUSED) or deleted."""
 REFUSED = "FailedCreate"
@@ -172,7 +174,8 @@ def _failure(status: Body) -> str:
             return f"exit code {ended['exitCode']}" + (f": {output}" if output else "")
         waiting = (container.get("state") or {}).get("waiting") or {}
         if waiting.get("reason") in _CANNOT_START:
-            return f"{waiting['reason']}: {waiting.get('message', '')}".rstrip(": ")
+            problem = f"{waiting['reason']}: {waiting.get('message', '')}".rstrip(": ")
+            return f"{problem}; {_LOAD_IMAGE}" if waiting["reason"] in _NO_IMAGE else problem
     return ""
 
 

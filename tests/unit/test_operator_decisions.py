@@ -256,7 +256,8 @@ def test_status_reports_exit_code_and_last_log_lines() -> None:
     well = {"state": {"running": {}}, "lastState": {"terminated": {"exitCode": 0}}}
     body = {"metadata": {"name": "p", "namespace": "ns"}, "spec": {}}
     failures = [parse_pod(body | {"status": {"containerStatuses": [c]}}).failure for c in (restarting, never, well)]
-    assert failures == ["exit code 1: ValueError: no route (before: Traceback)", "ImagePullBackOff: no such image", ""]
+    assert failures[::2] == ["exit code 1: ValueError: no route (before: Traceback)", ""]
+    assert failures[1].startswith("ImagePullBackOff: no such image; push the image to a registry")
     pods = [view("a-c"), view("a-c"), view("a-1", ready=False, failure=failures[0])]
     update = status.deployed(PLAN, pods, 0)
     ready = next(c for c in update.conditions if c.type == "Ready")

@@ -147,7 +147,7 @@ def calls() -> list[dict[str, Any]]:
         _call(
             TAKEOFF_S + 8, DRIVER, "SetSpeed", action="correct", code="SpeedAboveLimit", args={"speed_mps": 12.0},
             policies=["town-speed"], at={"lat": HOME[0], "lon": HOME[1], "alt": 20.0},
-            reason="speed 12.0 m/s is above the limit of policy town-speed; corrected to 10.0 m/s",
+            reason="speed 12.0 m/s is above the limit of policy town-speed; corrected to 9.5 m/s (limit 10.0 less 0.5 for overshoot)",
         ),
         _call(TAKEOFF_S + 9, DRIVER, "Goto", action="allow"),
         _call(

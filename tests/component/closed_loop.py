@@ -52,8 +52,15 @@ HALF_M = 130.0
 
 WATCH_S = 0.05
 HEIGHT_SLACK_M = 2.0
-SPEED_SLACK_MPS = 1.0
-"""Tolerances from docs/policies.md (height) and docs/mobility.md (speed, in wind without gusts)."""
+SPEED_SLACK_MPS = 0.1
+LEVEL_SLACK_M = 0.1
+"""Tolerances from docs/policies.md (height) and docs/mobility.md (speed, and height of a drone below its limit, without gusts).
+
+The vehicle exceeds a commanded speed by up to 0.3 m/s and a commanded height by up to 0.1 m.
+"""
+
+GUST_SHARE = 0.3
+"""Share of the strength of gusts by which they change the speed, and the height, for a moment."""
 
 REACTION_S = 0.4
 """Time until a new rule affects the motion: at most 0.2 s in the service, and 0.2 s in the vehicle."""
@@ -328,6 +335,7 @@ class Oracle:
         self.rules = Rules()
         self.arena = shapely.box(-HALF_M, -HALF_M, HALF_M, HALF_M)
         self._reported: set[str] = set()
+        self._complied_with_m = math.inf
         self._speed_mps = 0.0
         self.speeding_mps2 = 0.0
 
@@ -436,9 +444,22 @@ class Oracle:
         high = height > self.rules.ceiling_m + HEIGHT_SLACK_M
         if high and settled > 4.0 + abs(climb) and (climb > 0.3 or settled > 60.0):
             self._wrong("height", f"{height:.1f} m above a limit of {self.rules.ceiling_m:.1f}")
-        excess = speed - self.rules.top_mps - SPEED_SLACK_MPS - 0.3 * self._sky.weather.gusts_mps
+        gust_mps = GUST_SHARE * self._sky.weather.gusts_mps
+        self._check_overshoot(height, settled, LEVEL_SLACK_M + gust_mps)
+        excess = speed - self.rules.top_mps - SPEED_SLACK_MPS - gust_mps
         if excess > 0.0 and slowed > 5.0 + self.unavoidable_m() / 4.0:
             self._wrong("speed", f"{speed:.1f} m/s above a limit of {self.rules.top_mps:.1f}")
+
+    def _check_overshoot(self, height: float, settled: float, slack_m: float) -> None:
+        """Check that a drone which has been below a known ceiling stays below it, without the tolerance of new ceilings."""
+        ceiling_m = self.rules.ceiling_m
+        known = settled > 10.0
+        if known and self._complied_with_m == ceiling_m and height > ceiling_m + slack_m:
+            self._wrong("overshoot", f"{height:.2f} m above a limit of {ceiling_m:.1f}")
+        if height <= ceiling_m:
+            self._complied_with_m = ceiling_m
+        elif not known:
+            self._complied_with_m = math.inf
 
     def _wrong(self, kind: str, text: str) -> None:
         if kind in self._reported:

@@ -23,7 +23,7 @@ from fractus_services.mobility.mavlink import failsafes
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from parameter_faults import parameter_faults
-from policy_flights import CORNERS, EAST_M, LIMIT, NORTH_M, ZONES, Fleet, Scene, excused, flights
+from policy_flights import CORNERS, EAST_M, LIMIT, NORTH_M, OVERSHOOT_M, ZONES, Fleet, Scene, excused, flights
 from policy_world import HOME, Corners, altitude, ask, at, compiled, exclusion, goto, inclusion, ring, target
 from position_fault_flights import PositionFaultFlights
 from return_flights import ReturnFlights
@@ -208,25 +208,28 @@ def test_altitude_verdicts_match_the_rules_of_the_oracle(
     limits = {k: v for k, v in (("lowerLimit", lower), ("upperLimit", upper)) if v is not None}
     grant = compiled(altitude(action="refuse" if refuse else "enforce", **limits))
     breaks = (upper is not None and requested > upper + 1e-6) or (lower is not None and requested < lower - 1e-6)
-    want = max(
-        min(requested, 120.0, upper if upper is not None else math.inf), lower if lower is not None else -math.inf
-    )
+    top = 120.0 if upper is None else upper
+    bottom = -math.inf if lower is None else lower
+    # The drone overshoots a commanded altitude.
+    want = max(min(requested, top - OVERSHOOT_M), bottom + OVERSHOOT_M)
+    if bottom + OVERSHOOT_M > top - OVERSHOOT_M:
+        want = (bottom + top) / 2
+    corrected = breaks or requested > 120.0 + 1e-6
     for call in (goto(10, 10, requested), Call("Takeoff", TakeoffArgs(requested))):
         verdict = ask(grant, call, at(alt=0.0) if call.method == "Takeoff" else at())
-        low = min(max(requested, lower or 0.0), upper or 120.0) < MIN_LEG_ALTITUDE_M and not any(
-            edge is not None and edge < MIN_LEG_ALTITUDE_M for edge in (lower, upper)
-        )
+        edges = [edge for edge in (lower, top - OVERSHOOT_M) if edge is not None]
+        low = want < MIN_LEG_ALTITUDE_M - 1e-6 and not any(edge < MIN_LEG_ALTITUDE_M for edge in edges)
         if breaks and refuse:
             assert verdict.action == "deny"
         elif low and call.method == "Goto":
             assert verdict.code == "AltitudeTooLow"
-        elif call.method == "Takeoff" and want < MIN_TAKEOFF_ALTITUDE_M:
+        elif call.method == "Takeoff" and corrected and want < MIN_TAKEOFF_ALTITUDE_M:
             assert verdict.code == "ConflictingLimits", "the altitude is below the minimum of a takeoff"
         else:
             assert verdict.permits
             flown = verdict.args.alt if isinstance(verdict.args, GotoArgs) else verdict.args.altitude_m  # type: ignore[union-attr]
             assert math.isclose(flown or 0.0, want, abs_tol=1e-5)
-            assert (verdict.action == "correct") == (abs(want - requested) > 1e-5)
+            assert (verdict.action == "correct") == corrected, "a value inside a limit breaks no limit"
 
 
 @_cases

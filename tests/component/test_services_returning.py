@@ -16,7 +16,7 @@ from policy_world import altitude, at, box, compiled, exclusion, speed, zone
 from virtual_time import fly
 
 OWNED = {"RTL_ALT": 4000.0, "RTL_SPEED": 0.0, "WPNAV_SPEED": 1000.0, "RTL_CLIMB_MIN": 500.0}
-LOW = {"RTL_ALT": 1200.0, "RTL_SPEED": 0.0, "WPNAV_SPEED": 350.0, "RTL_CLIMB_MIN": 0.0}
+LOW = {"RTL_ALT": 1180.0, "RTL_SPEED": 0.0, "WPNAV_SPEED": 332.0, "RTL_CLIMB_MIN": 0.0}
 LIMITS = {"maxAltitude": 12, "maxSpeed": 3.5}
 
 
@@ -31,7 +31,7 @@ def held(world: World) -> dict[str, float]:
 
 def test_return_bounds_use_strictest_limit_between_home_and_operation_area() -> None:
     everywhere = compiled(altitude(upperLimit=30), speed(upperLimit=10))
-    assert return_bounds(at(), everywhere) == ReturnBounds(30.0, 10.0)
+    assert return_bounds(at(), everywhere) == ReturnBounds(29.8, 9.5)
     near = box(20, 20, 40, 40)
     far = box(5000, 5000, 5100, 5100)
     zoned = compiled(
@@ -39,7 +39,7 @@ def test_return_bounds_use_strictest_limit_between_home_and_operation_area() -> 
         altitude("far", [zone("b", far)], upperLimit=3),
         speed("slow", [zone("c", near)], upperLimit=4),
     )
-    assert return_bounds(at(), zoned) == ReturnBounds(30.0, 4.0)
+    assert return_bounds(at(), zoned) == ReturnBounds(29.8, 3.8)
     assert return_bounds(at(), compiled(limits=None)) == ReturnBounds()
 
 
@@ -47,16 +47,16 @@ def test_return_bounds_forbid_climb_if_limit_datum_is_unknown() -> None:
     above_terrain = {"altitudeReference": "terrain"}
     unknown = altitude("terrain", upperLimit=30, **above_terrain)
     assert return_bounds(at(), compiled(unknown, limits=None)).height_m == 0.0
-    assert return_bounds(at(), compiled(unknown, flat_terrain=True, limits=None)).height_m == 30.0
+    assert return_bounds(at(), compiled(unknown, flat_terrain=True, limits=None)).height_m == 29.8
     floor = altitude("floor", lowerLimit=3, **above_terrain)
     assert return_bounds(at(), compiled(floor, limits=None)).height_m == math.inf
-    assert return_bounds(at(), compiled(altitude(upperLimit=20), floor, limits=None)).height_m == 20.0
+    assert return_bounds(at(), compiled(altitude(upperLimit=20), floor, limits=None)).height_m == 19.8
     both = compiled(altitude(upperLimit=20), unknown)
     now = at(alt=25, airframe=Airframe(return_altitude_m=40))
     assert all(height <= 25 for height in return_altitudes_m(now, both, 100.0))
-    assert return_altitudes_m(now, both, 100.0)[0] == 20.0
+    assert return_altitudes_m(now, both, 100.0)[0] == 19.8
     limited = compiled(altitude(upperLimit=20), floor)
-    assert return_altitudes_m(at(alt=10, airframe=Airframe(return_altitude_m=40)), limited, 100.0)[0] == 20.0
+    assert return_altitudes_m(at(alt=10, airframe=Airframe(return_altitude_m=40)), limited, 100.0)[0] == 19.8
 
 
 def test_return_altitudes_include_heights_below_overhead_zones() -> None:
@@ -73,7 +73,7 @@ def test_return_altitudes_include_heights_below_overhead_zones() -> None:
 @pytest.mark.parametrize(
     ("owned", "bounds", "expected"),
     [
-        (OWNED, ReturnBounds(12.0, 3.5), LOW),
+        (OWNED, ReturnBounds(11.8, 3.325), LOW),
         (OWNED, ReturnBounds(60.0, 12.0), OWNED | {"RTL_CLIMB_MIN": 0.0}),
         (OWNED, ReturnBounds(), OWNED | {"RTL_CLIMB_MIN": 0.0}),
         (OWNED, ReturnBounds(12.345678, 0.0), LOW | {"RTL_ALT": 1234.0, "WPNAV_SPEED": 20.0}),
@@ -96,7 +96,7 @@ def test_rtl_limits_are_applied_during_mission_and_restored_after(tmp_path: Path
             grant = world.grants.put(spec(limits=LIMITS))
             await world.up(grant, 8.0)
             assert held(world) == LOW
-            assert world.gate.situation().airframe.return_altitude_m == 12.0
+            assert world.gate.situation().airframe.return_altitude_m == pytest.approx(11.8)
             await end(world.service.goto(grant, goto(0, 30, 8.0), 0))
             if not restarted:
                 await world.control.return_control(grant)
@@ -124,13 +124,14 @@ def test_vehicle_of_release_4_7_is_limited_and_restored_under_its_own_names(tmp_
             grant = world.grants.put(spec(limits=LIMITS))
             await world.up(grant, 8.0)
             flown = {name: value for name, value in plane.parameters.items() if value != owned[name]}
-            assert flown == {
+            limited_to = {
                 "MAV_GCS_SYSID": 244.0,
                 "GUID_TIMEOUT": 1.0,
-                "RTL_ALT_M": 12.0,
-                "WP_SPD": 3.5,
+                "RTL_ALT_M": 11.8,
+                "WP_SPD": 3.325,
                 "RTL_CLIMB_MIN_M": 0.0,
             }
+            assert flown == pytest.approx(limited_to)
             assert plane.parameters.keys() == owned.keys()
             plane.parameters = dict(owned)  # as after PREFLIGHT_STORAGE of another station, without a message
             await world.until(lambda: all(plane.parameters[name] == value for name, value in flown.items()), 12)
@@ -235,7 +236,7 @@ def test_rtl_limits_follow_grant_changes_in_flight(tmp_path: Path) -> None:
             await world.up(grant, 8.0)
             world.grants.put(spec(limited("altitude", 12.0, 50, 50, 60, 60), limited("speed", 3.5, 50, 50, 60, 60)))
             await world.until(lambda: held(world) == LOW, 5)
-            assert world.gate.situation().airframe.return_altitude_m == 12.0
+            assert world.gate.situation().airframe.return_altitude_m == pytest.approx(11.8)
             assert world.control.cruise_mps == 10.0, "the leg is outside the zone of the limits"
             world.plane.parameters["RTL_ALT"] = 3000.0  # changed by another station, without a message to the service
             await world.until(lambda: held(world) == LOW, 15)
@@ -256,7 +257,7 @@ def test_arming_is_refused_if_rtl_speed_cannot_be_limited(tmp_path: Path) -> Non
             await world.drive(grant)
             reason = await refusal(world.service.arm(grant))
             assert reason.verdict.code == "ReturnNotLimited"
-            assert "WPNAV_SPEED cannot be set to 350; it remains 1000" in str(reason)
+            assert "WPNAV_SPEED cannot be set to 332; it remains 1000" in str(reason)
             assert not world.plane.vehicle.armed
             await world.until(lambda: held(world) == OWNED, 30)
 

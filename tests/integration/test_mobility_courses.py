@@ -167,10 +167,10 @@ async def test_check_call_returns_verdict_without_effect(rig: Rig) -> None:
 
     high = await check(goto=pb.GotoRequest(target=place(0, 40, 30)))
     assert high.decision.action == types_pb2.Decision.ACTION_CORRECT
-    assert high.goto.target.altitude_m == pytest.approx(15.0)
+    assert high.goto.target.altitude_m == pytest.approx(14.8)
     into = await check(goto=pb.GotoRequest(target=place(-50, 0)))
     assert (into.decision.action, into.takeover) == (types_pb2.Decision.ACTION_TAKEOVER, "revoke")
-    assert (await check(set_speed=pb.SetSpeedRequest(speed_mps=30))).set_speed.speed_mps == pytest.approx(12.0)
+    assert (await check(set_speed=pb.SetSpeedRequest(speed_mps=30))).set_speed.speed_mps == pytest.approx(11.4)
     passenger = await check(rig.stub(PASSENGER), hover=pb.HoverRequest())
     assert passenger.decision.code == "NotADriver"
     for bad in (

@@ -218,9 +218,9 @@ def test_navigator_flies_path_with_corrections_and_refusals(stage: Stage) -> Non
     heights = [e["alt"] for e in stage.entries() if e["kind"] == "state"]
     assert 48.0 < max(heights) < 51.0
     log = stage.log("navigator")
-    assert "flying at 10.0 m/s: speed 12.0 m/s is above the limit of policy town-speed" in log
+    assert "flying at 9.5 m/s: speed 12.0 m/s is above the limit of policy town-speed" in log
     assert "detour refused, continuing: the target is" in log
-    assert "waypoint 3/5 reached: 50.865633, 4.680631, 50.0 m (corrected: altitude 70.0 m" in log
+    assert "waypoint 3/5 reached: 50.865633, 4.680631, 49.8 m (corrected: altitude 70.0 m" in log
     stage.wait("return of control", lambda: "control returned (mission_complete=True)" in stage.log("navigator"), 10)
     with stage.audit.open("rb") as lines:
         assert not verify(lines).problem

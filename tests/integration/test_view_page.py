@@ -113,7 +113,7 @@ def test_view_page_shows_zones_verdicts_path_and_pictures_of_flight(browser: Bro
         expect(page.locator("#zones")).to_contain_text("school-zone zone, 0 to 30 m above home")
         expect(page.locator("#zones")).to_contain_text("operation area of Navigator")
         verdicts = page.locator("#verdicts")
-        expect(verdicts).to_contain_text("corrected to 15.0 m above home", timeout=TIMEOUT_MS)
+        expect(verdicts).to_contain_text("corrected to 14.8 m above home", timeout=TIMEOUT_MS)
         expect(verdicts.locator(".deny")).to_contain_text("inside zone school-zone of policy school")
         expect(verdicts.locator(".deny")).to_contain_text("policy school")
         expect(page.locator("#drones")).to_contain_text("controller system · mode LAND")

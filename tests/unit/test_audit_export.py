@@ -229,7 +229,7 @@ def test_show_prints_decisions(log: Path) -> None:
     assert len(lines) == 8
     assert lines[0].endswith(
         "mobility  call: Navigator SetSpeed correct: SpeedAboveLimit, speed 12.0 m/s is above the limit of policy town-speed;"
-        " corrected to 10.0 m/s"
+        " corrected to 9.5 m/s (limit 10.0 less 0.5 for overshoot)"
     )
     assert len(run("show", log, "--all").stdout.splitlines()) == len(log.read_text().splitlines())
     after = demo_flight.stamp(demo_flight.TAKEOFF_S + 60)

@@ -37,13 +37,13 @@ def test_permitted_call_is_allowed() -> None:
     assert {k: verdict[k] for k in ("action", "takeover", "reason", "policies")} == {
         "action": "allow", "takeover": None, "reason": "", "policies": [],
     }  # fmt: skip
-    assert verdict["args"] == {**FREE, "reference": "home"}
+    assert verdict["args"] == {**FREE, "reference": "home", "speed_mps": 4.75}, "the speed setpoint is at the limit"
 
 
 def test_violations_are_corrected_denied_or_taken_over() -> None:
     high = check("Goto", {**FREE, "alt": 20})
-    assert (high["action"], high["args"]["alt"], high["policies"]) == ("correct", 15.0, ["low-flight"])
-    assert "15.0 m" in high["reason"]
+    assert (high["action"], high["args"]["alt"], high["policies"]) == ("correct", 14.8, ["low-flight"])
+    assert "limit 15.0 less 0.2 for overshoot" in high["reason"]
     forbidden = check("Goto", INSIDE_ZONE, at="39.370701,22.932303,10")
     assert (forbidden["action"], forbidden["takeover"], forbidden["args"]) == ("takeover", "revoke", None)
     assert forbidden["policies"] == ["keep-away"]
@@ -89,7 +89,7 @@ def test_time_home_and_return_route_are_considered(tmp_path: pathlib.Path) -> No
     before = check("Goto", INSIDE_ZONE, "--time", "2026-06-01T11:59:59Z", *home, at=near, **paths)
     after = check("Goto", INSIDE_ZONE, "--time", "2026-06-01T14:00:00+02:00", *home, at=near, **paths)
     assert (before["action"], after["action"]) == ("takeover", "allow")
-    assert check("Goto", {**FREE, "alt": 20}, *home, **paths)["args"]["alt"] == 15.0
+    assert check("Goto", {**FREE, "alt": 20}, *home, **paths)["args"]["alt"] == 14.8
     behind = {"lat": 39.37055, "lon": 22.93315}
     spot = "39.37000,22.93315,10"
     early = ("--time", "2026-06-01T11:00:00Z", *home)
@@ -101,13 +101,13 @@ def test_arguments_are_accepted_with_and_without_units() -> None:
     for args in ({"north": 1, "east": 0, "hold": 1}, {"north_mps": 1, "east_mps": 0, "hold_s": 1}):
         assert check("SetVelocity", args)["args"]["north_mps"] == 1.0
     assert check("Takeoff", {"altitude": 12}, at="39.37,22.93,0")["args"] == {"altitude_m": 12.0}
-    assert check("SetSpeed", {"speed": 99})["args"] == {"speed_mps": 5.0}
+    assert check("SetSpeed", {"speed": 99})["args"] == {"speed_mps": 4.75}
 
 
 def test_text_output_has_action_arguments_and_policies() -> None:
     text = run("--method", "Goto", "--args", json.dumps({**FREE, "alt": 20}), "--at", POSITION).output
     assert text.splitlines()[0] == "action:   correct"
-    assert "alt=15" in text
+    assert "alt=14.8" in text
     assert "policies: low-flight" in text
 
 

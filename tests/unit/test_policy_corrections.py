@@ -60,7 +60,7 @@ def test_altitude_correction_into_slower_zone_also_corrects_speed() -> None:
     verdict = ask(grant, goto(50, 0, 5, speed_mps=8), at(alt=10))
     assert (verdict.action, verdict.code) == ("correct", "AltitudeBelowLimit")
     assert isinstance(verdict.args, GotoArgs)
-    assert (verdict.args.alt, verdict.args.speed_mps) == (30, 3)
+    assert (verdict.args.alt, verdict.args.speed_mps) == (30.2, pytest.approx(2.85))
     assert verdict.policies == ("altitudes", "slow")
     assert "altitude 5.0 m" in verdict.reason
     assert "speed 8.0 m/s" in verdict.reason
@@ -71,7 +71,7 @@ def test_takeoff_correction_complies_with_limits_of_entered_zone() -> None:
     climb = Call("Takeoff", TakeoffArgs(5))
     ground = at(alt=0.0, in_air=False)
     taller = ask(compiled(altitude(lowerLimit=30), altitude("tall", [high], lowerLimit=40)), climb, ground)
-    assert (taller.action, taller.args) == ("correct", TakeoffArgs(40))
+    assert (taller.action, taller.args) == ("correct", TakeoffArgs(40.2))
     assert taller.policies == ("altitudes", "tall")
     lower = ask(compiled(altitude(lowerLimit=30), altitude("flat", [high], upperLimit=25)), climb, ground)
     assert (lower.action, lower.code, lower.policies) == ("deny", "ConflictingLimits", ("altitudes", "flat"))
@@ -84,7 +84,7 @@ def test_corrections_through_stacked_zones_settle_or_are_denied() -> None:
     climb = Call("Takeoff", TakeoffArgs(5))
     ground = at(alt=0.0, in_air=False)
     short = ask(compiled(altitude(lowerLimit=10), *floors[:4]), climb, ground)
-    assert (short.action, short.args) == ("correct", TakeoffArgs(50))
+    assert (short.action, short.args) == ("correct", TakeoffArgs(50.2))
     endless = ask(compiled(altitude(lowerLimit=10), *floors), climb, ground)
     assert (endless.action, endless.code) == ("deny", "ConflictingLimits")
 

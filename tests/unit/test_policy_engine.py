@@ -178,33 +178,72 @@ def test_altitude_is_corrected_to_enforced_limit() -> None:
     assert (high.action, high.code, high.args.alt, high.policies) == (
         "correct",
         "AltitudeAboveLimit",
-        15,
+        14.8,
         ("altitudes",),
     )
-    assert (low.action, low.code, low.args.alt) == ("correct", "AltitudeBelowLimit", 5)
+    assert (low.action, low.code, low.args.alt) == ("correct", "AltitudeBelowLimit", 5.2)
     assert "20.0" in high.reason
     assert "15.0" in high.reason
-    assert ask(grant, Call("Takeoff", TakeoffArgs(40))).args == TakeoffArgs(15)
-    assert ask(grant, goto(10, 10, 15)).action == "allow"
+    assert ask(grant, Call("Takeoff", TakeoffArgs(40))).args == TakeoffArgs(14.8)
+
+
+@pytest.mark.parametrize("action", ["enforce", "refuse"])
+def test_value_at_limit_is_allowed_and_flown_inside_it_by_the_overshoot(action: str) -> None:
+    grant = compiled(altitude(upperLimit=15, lowerLimit=5, action=action), speed(upperLimit=10, action=action))
+    requests: list[tuple[Call, Any]] = [
+        (goto(10, 10, 15, speed_mps=10), (14.8, 9.5)),
+        (goto(10, 10, 5, speed_mps=9.6), (5.2, 9.5)),
+        (Call("Takeoff", TakeoffArgs(15)), 14.8),
+        (Call("SetSpeed", SetSpeedArgs(10)), 9.5),
+    ]
+    for call, commanded in requests:
+        verdict = ask(grant, call)
+        assert (verdict.action, verdict.code, verdict.reason) == ("allow", "", "")
+        match verdict.args:
+            case GotoArgs():
+                assert (verdict.args.alt, verdict.args.speed_mps) == commanded
+            case TakeoffArgs(altitude_m):
+                assert altitude_m == commanded
+            case SetSpeedArgs(speed_mps):
+                assert speed_mps == commanded
+
+
+def test_leg_without_speed_is_flown_inside_the_limit_of_its_speed_setpoint() -> None:
+    grant = compiled(speed(upperLimit=10))
+    verdict = ask(grant, goto(50, 0, 10), at(speed_setpoint_mps=10.0))
+    assert (verdict.action, verdict.args.speed_mps) == ("allow", 9.5)
+
+
+def test_correction_explains_the_distance_from_the_limit() -> None:
+    verdict = ask(compiled(speed(upperLimit=10)), Call("SetSpeed", SetSpeedArgs(12)))
+    assert verdict.reason == (
+        "speed 12.0 m/s is above the limit of policy speeds; corrected to 9.5 m/s (limit 10.0 less 0.5 for overshoot)"
+    )
+
+
+def test_altitude_between_close_limits_is_their_middle() -> None:
+    grant = compiled(altitude(upperLimit=15.2, lowerLimit=15))
+    for requested_m in (10, 15, 15.1, 15.2, 30):
+        assert ask(grant, goto(10, 10, requested_m)).args.alt == pytest.approx(15.1)
 
 
 def test_altitude_beyond_refusing_limit_is_denied() -> None:
     grant = compiled(altitude(upperLimit=15, action="refuse"), altitude("lax", upperLimit=10, action="enforce"))
     assert ask(grant, goto(10, 10, 20)).action == "deny"
     assert ask(grant, goto(10, 10, 20)).policies == ("altitudes",)
-    assert ask(grant, goto(10, 10, 12)).args.alt == 10
+    assert ask(grant, goto(10, 10, 12)).args.alt == 9.8
 
 
 def test_altitude_is_corrected_to_most_restrictive_limit() -> None:
     grant = compiled(altitude("a", upperLimit=30), altitude("b", upperLimit=12), altitude("c", upperLimit=20))
     verdict = ask(grant, goto(10, 10, 50))
-    assert verdict.args.alt == 12
+    assert verdict.args.alt == 11.8
     assert verdict.policies == ("b", "c", "a")
 
 
 def test_limits_of_the_drone_are_enforced() -> None:
-    assert ask(compiled(), goto(10, 10, 500)).args.alt == 120
-    assert ask(compiled(), Call("SetSpeed", SetSpeedArgs(99))).args == SetSpeedArgs(15)
+    assert ask(compiled(), goto(10, 10, 500)).args.alt == 119.8
+    assert ask(compiled(), Call("SetSpeed", SetSpeedArgs(99))).args == SetSpeedArgs(14.25)
 
 
 def test_contradicting_limits_deny() -> None:
@@ -217,7 +256,7 @@ def test_contradicting_limits_deny() -> None:
 def test_zone_limit_applies_to_every_leg_that_touches_the_zone() -> None:
     grant = compiled(altitude(zones=[zone("low", box(40, -20, 60, 20))], upperLimit=15))
     assert ask(grant, goto(0, 100, 50)).action == "allow"
-    assert ask(grant, goto(100, 0, 50)).args.alt == 15
+    assert ask(grant, goto(100, 0, 50)).args.alt == 14.8
     high = ask(grant, goto(50, 0, 10), at(alt=30))
     assert (high.action, high.code) == ("deny", "AltitudeAboveLimit"), "the drone would enter the zone at 30 m"
     assert ask(grant, goto(45, 0, 10), at(50, 0, alt=30)).action == "allow", (
@@ -227,7 +266,7 @@ def test_zone_limit_applies_to_every_leg_that_touches_the_zone() -> None:
 
 def test_altitude_limit_above_sea_level_is_converted() -> None:
     grant = compiled(altitude(upperLimit=130, altitudeReference="amsl"))
-    assert ask(grant, goto(10, 10, 50)).args.alt == pytest.approx(30)
+    assert ask(grant, goto(10, 10, 50)).args.alt == pytest.approx(29.8)
     amsl = ask(grant, goto(10, 10, 120, reference="amsl"))
     assert amsl.action == "allow"
     assert (amsl.args.alt, amsl.args.reference) == (pytest.approx(20), "home")
@@ -236,7 +275,7 @@ def test_altitude_limit_above_sea_level_is_converted() -> None:
 def test_terrain_altitude_is_unknown_without_flat_terrain() -> None:
     limit = altitude(upperLimit=15, altitudeReference="terrain")
     assert ask(compiled(limit), goto(10, 10, 10)).code == "TerrainUnknown"
-    assert ask(compiled(limit, flat_terrain=True), goto(10, 10, 20)).args.alt == 15
+    assert ask(compiled(limit, flat_terrain=True), goto(10, 10, 20)).args.alt == 14.8
     assert ask(compiled(), goto(10, 10, 10, reference="terrain")).code == "TerrainUnknown"
     flat = ask(compiled(flat_terrain=True), goto(10, 10, 10, reference="terrain"))
     assert flat.action == "allow"
@@ -245,11 +284,11 @@ def test_terrain_altitude_is_unknown_without_flat_terrain() -> None:
 
 def test_speed_is_corrected_or_denied_by_limits() -> None:
     grant = compiled(speed(upperLimit=8, lowerLimit=2), speed("slow", [zone("s", box(40, -20, 60, 20))], upperLimit=3))
-    assert ask(grant, Call("SetSpeed", SetSpeedArgs(10))).args == SetSpeedArgs(8)
+    assert ask(grant, Call("SetSpeed", SetSpeedArgs(10))).args == SetSpeedArgs(7.6)
     assert ask(grant, Call("SetSpeed", SetSpeedArgs(1))).args == SetSpeedArgs(2)
-    assert ask(grant, Call("SetSpeed", SetSpeedArgs(7)), at(50, 0)).args == SetSpeedArgs(3)
+    assert ask(grant, Call("SetSpeed", SetSpeedArgs(7)), at(50, 0)).args.speed_mps == pytest.approx(2.85)
     leg = ask(grant, goto(100, 0))
-    assert (leg.action, leg.code, leg.args.speed_mps) == ("correct", "SpeedAboveLimit", 3)
+    assert (leg.action, leg.code, leg.args.speed_mps) == ("correct", "SpeedAboveLimit", pytest.approx(2.85))
     assert ask(grant, goto(0, 100)).args.speed_mps is None
     assert ask(compiled(speed(upperLimit=4, action="refuse")), goto(0, 100)).code == "SpeedAboveLimit"
 

@@ -129,11 +129,11 @@ def test_monitor_corrects_altitude_and_speed() -> None:
     high = monitor(at(alt=18), grant)
     assert high is not None
     assert isinstance(high.args, GotoArgs)
-    assert (high.action, high.args.alt, high.policies) == ("correct", 15, ("altitudes",))
+    assert (high.action, high.args.alt, high.policies) == ("correct", 14.8, ("altitudes",))
     assert monitor(at(alt=15.5), grant) is None, "the excess is within the tolerance"
     fast = monitor(at(north_mps=9), grant)
     assert fast is not None
-    assert fast.args == SetSpeedArgs(5)
+    assert fast.args == SetSpeedArgs(4.75)
     assert monitor(at(north_mps=5.5), grant) is None
 
 
@@ -194,7 +194,7 @@ def test_monitor_ignores_lower_limits_while_landing() -> None:
     low = monitor(at(alt=4), grant)
     assert low is not None
     assert isinstance(low.args, GotoArgs)
-    assert (low.action, low.code, low.args.alt) == ("correct", "AltitudeBelowLimit", 8)
+    assert (low.action, low.code, low.args.alt) == ("correct", "AltitudeBelowLimit", 8.2)
     assert monitor(at(alt=4, vertical=True), grant) is None
     assert monitor(at(alt=7), grant) is None, "the deviation is within the tolerance of the autopilot"
 

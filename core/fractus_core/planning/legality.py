@@ -139,7 +139,8 @@ class RouteJudge:
         elif key not in self._known:
             # The time of each leg is unknown, so a policy counts if it applies at any time of the mission.
             during = UncertainTime(time_s + mission.needed_min * 60, time_s)
-            cruise_mps = min(self._settings.cruise_speed_mps, mobility.max_speed)
+            airframe = Airframe(retraces=True)
+            cruise_mps = min(self._settings.cruise_speed_mps, airframe.highest_command_mps(mobility.max_speed))
             now = Situation(
                 during,
                 home.lat,
@@ -147,7 +148,7 @@ class RouteJudge:
                 home=Home(home.lat, home.lon, base or 0.0),
                 armed=True,
                 speed_setpoint_mps=cruise_mps,
-                airframe=Airframe(retraces=True),
+                airframe=airframe,
             )
             granted = flight_grant(self._application, drone, self._inventory, self._area)
             grant = compile_grant(granted, home, self._settings.flat_terrain)

@@ -19,6 +19,7 @@ from fractus_core.exhaustive import exhaustive
 from fractus_core.geo import LocalFrame, center_of, distance_m
 from fractus_core.planning.inventory import Flight, Settings
 from fractus_core.planning.operation_area import OperationArea, control_routes
+from fractus_core.policy.decision_types import Airframe
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +63,7 @@ class MissionEstimator:
         speed = self._settings.cruise_speed_mps
         available = 0.0
         if mobility is not None:
-            speed = min(speed, mobility.max_speed)
+            speed = min(speed, Airframe().highest_command_mps(mobility.max_speed))
             available = remaining_minutes(drone) - self._settings.battery_reserve * mobility.max_flight_time
         needed = (distance / speed + climb / self._settings.climb_speed_mps) / 60 + self._stay_min
         return Estimate(distance, approach, top, needed, available)

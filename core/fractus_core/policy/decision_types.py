@@ -156,6 +156,8 @@ class Airframe:
         jerk_mps3: Rate of change of the acceleration.
         return_altitude_m: Altitude above home of return to launch.
         tracking_m: Largest deviation from a straight leg, sideways and in altitude.
+        overshoot_share: Largest share by which the ground speed exceeds a commanded speed.
+        overshoot_m: Largest height by which the drone climbs or sinks past a commanded altitude.
         retraces: True if the autopilot returns along the path it flew (ArduPilot's SmartRTL) instead of in a straight
             line. A target is then legal if any legal route home exists.
     """
@@ -166,7 +168,13 @@ class Airframe:
     jerk_mps3: float = 5.0
     return_altitude_m: float = 15.0
     tracking_m: float = 1.0
+    overshoot_share: float = 0.05
+    overshoot_m: float = 0.2
     retraces: bool = False
+
+    def highest_command_mps(self, limit_mps: float) -> float:
+        """Return the highest speed to command under a speed limit."""
+        return limit_mps * (1.0 - self.overshoot_share)
 
 
 @dataclass(frozen=True, slots=True)

@@ -212,12 +212,8 @@ def _within_limits(request: _Request, leg: Leg, aim: _Aim, notes: list[Correctio
             f"a leg ends at least {MIN_LEG_ALTITUDE_M:.0f} m above home, not at {height.value:.1f} m; use Land to descend",
         )
     requested_mps = request.args.speed_mps if aim.speed_mps is None else aim.speed_mps
-    speed = clamp(
-        "Speed",
-        "m/s",
-        now.speed_setpoint_mps if requested_mps is None else requested_mps,
-        speed_bounds(grant, now, air, now.height_margin_m),
-    )
+    unchanged_mps = now.speed_setpoint_mps if requested_mps is None else requested_mps
+    speed = clamp("Speed", "m/s", unchanged_mps, speed_bounds(grant, now, air, now.height_margin_m))
     altitudes = (now.altitude_m, stop_altitude_m(now))
     problem = check_altitude_on_entry(shapely.points(request.position), altitudes, bounds, now.height_margin_m)
     if problem is not None:
@@ -225,7 +221,8 @@ def _within_limits(request: _Request, leg: Leg, aim: _Aim, notes: list[Correctio
     if isinstance(speed, Verdict):
         return speed
     notes.extend(note for note in (height, speed) if note.code)
-    return _Aim(aim.target, height.value, speed.value if speed.code or requested_mps is not None else None)
+    keeps_speed = requested_mps is None and speed.value == unchanged_mps
+    return _Aim(aim.target, height.value, None if keeps_speed else speed.value)
 
 
 def check_return(target: XY, altitude_m: float, now: Situation, grant: CompiledGrant) -> Verdict | None:

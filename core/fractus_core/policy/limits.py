@@ -2,6 +2,9 @@
 
 Enforced limits correct a value, and other limits deny it. A corrected value is judged again until no further correction
 is needed.
+
+The autopilot overshoots a commanded speed or altitude. The command therefore stays inside a limit by the overshoot. A
+requested value between this command and the limit breaks no limit: the call is allowed with the value of the command.
 """
 
 from __future__ import annotations
@@ -43,8 +46,15 @@ class Bound:
     """A limit in force: altitudes above home, or speeds.
 
     Attributes:
+        name: Policy; empty for a limit of the drone.
+        priority: Priority of the policy.
+        lower: Lower limit of the actual value.
+        upper: Upper limit of the actual value.
+        refuses: True if the limit denies a value instead of correcting it.
         shape: Ground of the zone in which the limit applies. None means everywhere.
         band_m: Floor and ceiling of this zone above home, infinite if missing or unknown.
+        lowest: Lowest value to command.
+        highest: Highest value to command.
     """
 
     name: str
@@ -54,6 +64,26 @@ class Bound:
     refuses: bool
     shape: BaseGeometry | None = None
     band_m: tuple[float, float] = (-math.inf, math.inf)
+    lowest: float | None = None
+    highest: float | None = None
+
+
+def altitude_bound(
+    name: str, priority: int, lower: float | None, upper: float | None, now: Situation, *, refuses: bool
+) -> Bound:
+    """Return an altitude limit. Commands stay inside it by the drone's overshoot."""
+    room_m = now.airframe.overshoot_m
+    lowest = None if lower is None else lower + room_m
+    highest = None if upper is None else upper - room_m
+    return Bound(name, priority, lower, upper, refuses, lowest=lowest, highest=highest)
+
+
+def speed_bound(
+    name: str, priority: int, lower: float | None, upper: float | None, now: Situation, *, refuses: bool
+) -> Bound:
+    """Return a speed limit. A lower limit applies to the commanded speed, because each drone starts and stops."""
+    highest = None if upper is None else now.airframe.highest_command_mps(upper)
+    return Bound(name, priority, lower, upper, refuses, lowest=lower, highest=highest)
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +116,7 @@ def altitude_bounds(
     bounds = []
     unknown = list[Rule]()
     if grant.max_altitude_m is not None:
-        bounds.append(Bound("", 0, None, grant.max_altitude_m, refuses=False))
+        bounds.append(altitude_bound("", 0, None, grant.max_altitude_m, now, refuses=False))
     limits = grant.altitude_limits
     for rule, zone in _in_force(limits, now, limiting_zones(limits, grant, now, air, height_margin_m)):
         spec = rule.spec
@@ -102,7 +132,8 @@ def altitude_bounds(
                 break
             edges.append(height)
         else:
-            bound = Bound(rule.name, spec.priority, edges[0], edges[1], _REFUSES[spec.limit_action])
+            refuses = _REFUSES[spec.limit_action]
+            bound = altitude_bound(rule.name, spec.priority, edges[0], edges[1], now, refuses=refuses)
             if zone is not None:
                 band_m = band_limits_m(zone.band, now.home, grant.flat_terrain)
                 bound = replace(bound, shape=zone.shape, band_m=band_m)
@@ -111,11 +142,11 @@ def altitude_bounds(
 
 
 def lowest_ceiling_m(bounds: Sequence[Bound], unknown: Sequence[Rule], present_m: float) -> float:
-    """Return the lowest upper limit above home.
+    """Return the highest altitude above home to command under upper limits.
 
     If an upper limit has a datum of unknown height, the result is at most `present_m`, so the drone does not climb.
     """
-    ceiling = min((bound.upper for bound in bounds if bound.upper is not None), default=math.inf)
+    ceiling = min((bound.highest for bound in bounds if bound.highest is not None), default=math.inf)
     return min(ceiling, present_m) if any(rule.spec.upper_limit is not None for rule in unknown) else ceiling
 
 
@@ -146,12 +177,13 @@ def speed_bounds(grant: CompiledGrant, now: Situation, air: AirVolume, height_ma
     """Return the speed limits, in metres per second, that apply in a volume, or within a margin above and below it."""
     bounds = []
     if grant.max_speed_mps is not None:
-        bounds.append(Bound("", 0, None, grant.max_speed_mps, refuses=False))
+        bounds.append(speed_bound("", 0, None, grant.max_speed_mps, now, refuses=False))
     # No drone is trapped by a speed limit, so the limit applies even if the drone is already too close to the zone.
     zones = grant.speed_limits.near(air.extended(height_margin_m), now, grant.flat_terrain)
     for rule, _ in _in_force(grant.speed_limits, now, zones):
         spec = rule.spec
-        bounds.append(Bound(rule.name, spec.priority, spec.lower_limit, spec.upper_limit, _REFUSES[spec.limit_action]))
+        refuses = _REFUSES[spec.limit_action]
+        bounds.append(speed_bound(rule.name, spec.priority, spec.lower_limit, spec.upper_limit, now, refuses=refuses))
     return bounds
 
 
@@ -202,8 +234,8 @@ def clamp(quantity: str, unit: str, value: float, bounds: list[Bound]) -> Correc
         bounds: Limits in force.
 
     Returns:
-        The nearest value that every limit permits, or a denial. A denial results from a limit that refuses, from limits
-        that contradict each other, and from limits that no motion can keep.
+        The nearest value to command, or a denial. The correction has a code only if the requested value breaks a limit. A
+        denial results from a limit that refuses, from limits that contradict each other, and from limits that no motion can keep.
     """
     # Negated `<=` and `>=`, so that a limit that is NaN counts as broken.
     above = sorted(
@@ -213,7 +245,7 @@ def clamp(quantity: str, unit: str, value: float, bounds: list[Bound]) -> Correc
         (b for b in bounds if b.lower is not None and not value >= b.lower - ROUNDING_SLACK), key=_strictest_lower
     )
     if not above and not below:
-        return Correction(value)
+        return Correction(commanded_value(value, bounds))
     violated, side = (above, "Above") if above else (below, "Below")
     code = f"{quantity}{side}Limit"
     names = distinct(b.name for b in violated)
@@ -235,16 +267,41 @@ def clamp(quantity: str, unit: str, value: float, bounds: list[Bound]) -> Correc
     problem = check_contradiction(quantity, unit, bounds)
     if problem is not None:
         return problem
-    highest = _highest(bounds)
-    lowest = _lowest(bounds)
-    corrected_value = min(max(value, lowest), highest)
+    corrected_value = commanded_value(value, bounds)
     word = "above" if above else "below"
-    return Correction(
-        corrected_value,
-        code,
-        f"{quantity.lower()} {value:.1f} {unit} is {word} the limit of {_source(violated[0])}; corrected to {corrected_value:.1f} {unit}",
-        names,
+    room = _describe_room(corrected_value, _highest(bounds) if above else _lowest(bounds))
+    reason = (
+        f"{quantity.lower()} {value:.1f} {unit} is {word} the limit of {_source(violated[0])};"
+        f" corrected to {corrected_value:.1f} {unit}{room}"
     )
+    return Correction(corrected_value, code, reason, names)
+
+
+def _describe_room(value: float, limit: float) -> str:
+    if abs(value - limit) <= ROUNDING_SLACK:
+        return ""
+    return f" (limit {limit:.1f} {'less' if value < limit else 'plus'} {abs(limit - value):.1f} for overshoot)"
+
+
+def command_range(bounds: Sequence[Bound]) -> tuple[float, float]:
+    """Return the lowest and the highest value to command under limits.
+
+    Between limits that are closer to each other than the overshoot, only their middle is commanded.
+    """
+    lowest = max((b.lowest for b in bounds if b.lowest is not None), default=-math.inf)
+    highest = min((b.highest for b in bounds if b.highest is not None), default=math.inf)
+    if lowest > highest and _lowest(bounds) <= _highest(bounds):
+        middle = (_lowest(bounds) + _highest(bounds)) / 2
+        return middle, middle
+    return lowest, highest
+
+
+def commanded_value(value: float, bounds: Sequence[Bound]) -> float:
+    """Return the value to command that is nearest to a requested value."""
+    lowest, highest = command_range(bounds)
+    if lowest - ROUNDING_SLACK <= value <= highest + ROUNDING_SLACK:
+        return value
+    return min(max(value, lowest), highest)
 
 
 def is_achievable(quantity: str, limit: float | None) -> bool:
@@ -271,11 +328,11 @@ def check_contradiction(quantity: str, unit: str, bounds: list[Bound]) -> Verdic
     )
 
 
-def _highest(bounds: list[Bound]) -> float:
+def _highest(bounds: Sequence[Bound]) -> float:
     return min((b.upper for b in bounds if b.upper is not None), default=float("inf"))
 
 
-def _lowest(bounds: list[Bound]) -> float:
+def _lowest(bounds: Sequence[Bound]) -> float:
     return max((b.lower for b in bounds if b.lower is not None), default=float("-inf"))
 
 
@@ -287,9 +344,9 @@ def strictest_bound(bounds: list[Bound], *, above: bool) -> Bound | None:
 
 
 def allows_low_altitude(bounds: list[Bound]) -> bool:
-    """Return True if an altitude limit in force permits altitudes below `MIN_LEG_ALTITUDE_M`."""
+    """Return True if an altitude limit in force permits or requires altitudes below `MIN_LEG_ALTITUDE_M`."""
     return any(
-        edge is not None and edge < MIN_LEG_ALTITUDE_M for bound in bounds for edge in (bound.lower, bound.upper)
+        edge is not None and edge < MIN_LEG_ALTITUDE_M for bound in bounds for edge in (bound.lower, bound.highest)
     )
 
 
@@ -398,7 +455,7 @@ def choose_objection(problem: Verdict, requested: Verdict | None, correction: Ve
         correction: Correction of the call.
     """
     if requested is None:
-        return deny_conflict((correction,), problem)
+        return deny_conflict((correction,), problem) if correction.code else problem
     # A drone is taken over for requested arguments only, never for corrected ones.
     return requested if problem.action == "takeover" else problem
 

@@ -32,6 +32,7 @@ from fractus_core.policy.kinematics import (
 from fractus_core.policy.limits import (
     Bound,
     altitude_bounds,
+    command_range,
     deny_unknown_datum,
     is_achievable,
     speed_bounds,
@@ -416,7 +417,8 @@ def _check_altitude(
     if over is not None and over.upper is not None and high > over.upper + share * slack and not sinks_back:
         moves = "climbs to" if now.down_mps < -CLIMBING_MPS else "is at"
         reason = f"the drone {moves} {high:.1f} m, above the limit of {over.upper:.1f} m"
-        return _altitude_correction(_LimitViolation(over, over.upper, "AltitudeAboveLimit", reason), now, grant, stop)
+        target_m = command_range(bounds)[1]
+        return _altitude_correction(_LimitViolation(over, target_m, "AltitudeAboveLimit", reason), now, grant, stop)
     if unknown:
         sinking = now.down_mps > -SINKING_MPS
         return None if sinking else replace(deny_unknown_datum(unknown[0]), takeover="hover")
@@ -425,7 +427,8 @@ def _check_altitude(
             return None
         moves = "sinks to" if now.down_mps > CLIMBING_MPS else "is at"
         reason = f"the drone {moves} {low:.1f} m, below the limit of {under.lower:.1f} m"
-        return _altitude_correction(_LimitViolation(under, under.lower, "AltitudeBelowLimit", reason), now, grant, stop)
+        target_m = command_range(bounds)[0]
+        return _altitude_correction(_LimitViolation(under, target_m, "AltitudeBelowLimit", reason), now, grant, stop)
     return None
 
 
@@ -458,10 +461,10 @@ def _check_speed(now: Situation, grant: CompiledGrant, start: XY) -> Verdict | N
     bounds = speed_bounds(grant, now, AirVolume(shapely.points(start), 0.0, now.altitude_m, now.altitude_m))
     over = strictest_bound(bounds, above=True)
     # Gusts push a drone beyond its speed setpoint for a moment, so a tenth and 1 m/s are tolerated.
-    if over is None or over.upper is None or speed <= over.upper * 1.1 + 1.0:
+    if over is None or over.upper is None or over.highest is None or speed <= over.upper * 1.1 + 1.0:
         return None
     reason = f"the drone flies at {speed:.1f} m/s, above the limit of {over.upper:.1f} m/s"
     names = (over.name,) if over.name else ()
     if not is_achievable("Speed", over.upper):
         return Verdict("deny", None, "SpeedAboveLimit", f"{reason}; the motion is stopped", names, "hover")
-    return Verdict("correct", SetSpeedArgs(over.upper), "SpeedAboveLimit", reason, names)
+    return Verdict("correct", SetSpeedArgs(over.highest), "SpeedAboveLimit", reason, names)

@@ -48,7 +48,7 @@ def return_altitudes_m(now: Situation, grant: CompiledGrant, worthwhile_m: float
     altitudes = []
     for ground in (lane, shapely.points(position), shapely.Point()):
         bounds, unknown = altitude_bounds(grant, now, AirVolume(ground, now.margin_m, -math.inf, math.inf))
-        lowest = max((b.lower for b in bounds if b.lower is not None), default=-math.inf)
+        lowest = max((b.lowest for b in bounds if b.lowest is not None), default=-math.inf)
         highest = lowest_ceiling_m(bounds, unknown, now.altitude_m)
         altitudes += [min(max(altitude_m, lowest), highest) for altitude_m in (best, now.altitude_m)]
     below = [lower for lower in _altitudes_below_zones_m(lane, now, grant) if lowest <= lower <= min(highest, best)]
@@ -75,8 +75,8 @@ class ReturnBounds:
     """Altitude and speed limits of a return by an autopilot that knows neither zones nor policies.
 
     Attributes:
-        height_m: Highest altitude above home.
-        speed_mps: Highest speed.
+        height_m: Highest altitude above home to command.
+        speed_mps: Highest speed to command.
     """
 
     height_m: float = math.inf
@@ -84,7 +84,7 @@ class ReturnBounds:
 
 
 def return_bounds(now: Situation, grant: CompiledGrant) -> ReturnBounds:
-    """Return the strictest limits of altitude and speed in force anywhere between home and the operation area.
+    """Return the strictest commands of altitude and speed that the limits between home and the operation area permit.
 
     If the datum of a limit is unknown, the drone must not climb. The altitude is then 0, with which an autopilot
     returns at its present altitude.
@@ -92,8 +92,8 @@ def return_bounds(now: Situation, grant: CompiledGrant) -> ReturnBounds:
     anywhere = shapely.box(-MAX_FRAME_REACH_M, -MAX_FRAME_REACH_M, MAX_FRAME_REACH_M, MAX_FRAME_REACH_M)
     air = AirVolume(anywhere if grant.flight_area is None else grant.flight_area, now.margin_m, -math.inf, math.inf)
     return ReturnBounds(
-        lowest_ceiling_m(*altitude_bounds(grant, now, air), present_m=0.0),
-        min((bound.upper for bound in speed_bounds(grant, now, air) if bound.upper is not None), default=math.inf),
+        max(lowest_ceiling_m(*altitude_bounds(grant, now, air), present_m=0.0), 0.0),
+        min((bound.highest for bound in speed_bounds(grant, now, air) if bound.highest is not None), default=math.inf),
     )
 
 

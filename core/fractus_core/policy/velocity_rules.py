@@ -32,6 +32,7 @@ from fractus_core.policy.limits import (
     check_contradiction,
     choose_objection,
     clamp,
+    command_range,
     correction_verdict,
     deny_unknown_datum,
     speed_bounds,
@@ -133,13 +134,14 @@ def _correct_speed(setpoint: _Setpoint) -> Verdict | None:
     requested = math.hypot(args.north_mps, args.east_mps)
     now = setpoint.now
     limits = speed_bounds(setpoint.grant, now, setpoint.air, _height_margin_m(now))
-    bounds = [replace(b, lower=None) for b in limits]
+    bounds = [replace(b, lower=None, lowest=None) for b in limits]
     speed = clamp("Speed", "m/s", requested, bounds)
     if isinstance(speed, Verdict):
         return speed
-    if speed.code:
+    if speed.value < requested:
         share = max(speed.value, 0.0) / requested
         setpoint.args = replace(args, north_mps=args.north_mps * share, east_mps=args.east_mps * share)
+    if speed.code:
         setpoint.notes.append(speed)
     return None
 
@@ -157,13 +159,13 @@ def _correct_altitude(setpoint: _Setpoint) -> Verdict | None:
     if problem is not None:
         return problem
     floor = -math.inf if allows_low_altitude(bounds) else min(MIN_LEG_ALTITUDE_M, now.altitude_m)
-    ground = Bound("", 0, floor, None, refuses=False)
+    ground = Bound("", 0, floor, None, refuses=False, lowest=floor)
     for above in (True, False):
         every = bounds if above else [*bounds, ground]
         bound = strictest_bound(every, above=above)
         if bound is not None:
             requested = setpoint.args
-            problem = _lead_back(setpoint, bound, above=above)
+            problem = _lead_back(setpoint, bound, command_range(every)[above], above=above)
             if problem is None and not above and setpoint.args != requested:
                 problem = _no_room(setpoint, bound, strictest_bound(bounds, above=True))
             if problem is not None:
@@ -181,19 +183,27 @@ def _no_room(setpoint: _Setpoint, lower: Bound, upper: Bound | None) -> Verdict 
     return deny("AltitudeAboveLimit", f"{reason}; stop it first, then use Goto", names)
 
 
-def _lead_back(setpoint: _Setpoint, bound: Bound, *, above: bool) -> Verdict | None:
-    """Scale the vertical part so that the drone comes to rest within a limit, or turn it back toward the limit."""
-    edge = (bound.upper if above else bound.lower) or 0.0
+def _lead_back(setpoint: _Setpoint, bound: Bound, edge: float, *, above: bool) -> Verdict | None:
+    """Scale the vertical part so that the drone comes to rest within a limit, or turn it back toward the limit.
+
+    Args:
+        setpoint: Setpoint to correct.
+        bound: Strictest limit.
+        edge: Altitude to command at the limit, which is inside the limit by the overshoot.
+        above: True for an upper limit.
+    """
+    limit = (bound.upper if above else bound.lower) or 0.0
     args = setpoint.args
     if not _exceeds_limit(setpoint, args, edge, above=above):
         return None
+    breaks = _exceeds_limit(setpoint, args, limit, above=above)
     word, side = ("Above", "above") if above else ("Below", "below")
     default_source = "the drone" if above else "the ground"
     source = f"policy {bound.name}" if bound.name else default_source
     names = (bound.name,) if bound.name else ()
     toward = args.down_mps < 0 if above else args.down_mps > 0
-    reason = f"the drone would come {side} the limit of {edge:.1f} m of {source}"
-    if bound.refuses and toward:
+    reason = f"the drone would come {side} the limit of {limit:.1f} m of {source}"
+    if bound.refuses and toward and breaks:
         return deny(f"Altitude{word}Limit", f"{reason} (action refuse)", names)
     back = RETURN_CLIMB_MPS if above else -RETURN_CLIMB_MPS
     strays_m = setpoint.now.airframe.tracking_m
@@ -205,12 +215,15 @@ def _lead_back(setpoint: _Setpoint, bound: Bound, *, above: bool) -> Verdict | N
         new = (
             level if _exceeds_limit(setpoint, level, edge, above=above) else _scaled_climb(setpoint, edge, above=above)
         )
-    elif _exceeds_limit(setpoint, level, edge, above=above):
+    elif _exceeds_limit(setpoint, level, limit, above=above):
         new = replace(args, down_mps=back)
+    elif _exceeds_limit(setpoint, level, edge, above=above):
+        new = level
     else:
         new = _scaled_climb(setpoint, edge, above=above)
     if new.down_mps != args.down_mps:
         setpoint.args = new
+    if breaks and new.down_mps != args.down_mps:
         note = f"{reason}; its vertical speed is corrected from {args.down_mps:.1f} to {new.down_mps:.1f} m/s down"
         setpoint.notes.append(Correction(new.down_mps, f"Altitude{word}Limit", note, names))
     return None

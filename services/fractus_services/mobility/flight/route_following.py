@@ -166,7 +166,7 @@ async def _first_leg(
 
 
 def limited_mps(speed_mps: float, leg: GotoArgs, now: Situation, grant: CompiledGrant) -> float:
-    """Return the highest speed that the limits along a leg allow, at most the requested one.
+    """Return the highest speed to command under the limits along a leg, at most the requested one.
 
     Minimum speeds are ignored, and no limit refuses the leg, because the system must return even from where a driver may not fly.
 
@@ -184,7 +184,7 @@ def limited_mps(speed_mps: float, leg: GotoArgs, now: Situation, grant: Compiled
     ground = shapely.points(at) if at == target else shapely.linestrings((at, target))
     air = AirVolume(ground, now.margin_m, min(heights), max(heights))
     bounds = speed_bounds(grant, now, air, now.height_margin_m)
-    return min([speed_mps, *(bound.upper for bound in bounds if bound.upper is not None)])
+    return min([speed_mps, *(bound.highest for bound in bounds if bound.highest is not None)])
 
 
 class RouteFollower:

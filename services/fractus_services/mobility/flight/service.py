@@ -118,6 +118,8 @@ class MobilityService:
             speed = min(legal_mps, requested_mps) if replace(rest.args, speed_mps=requested_mps) == leg else speed
         if speed >= requested_mps:
             return verdict, requested_mps
+        if rest.action == "allow" and not rest.brake_first and speed > motion.speed_mps:
+            return replace(verdict, args=SetSpeedArgs(speed)), speed  # Within the overshoot of a limit along the leg.
         reason = f"the current leg is flown with {speed:.1f} m/s: {rest.reason or 'it is not legal faster'}"
         return Verdict("correct", SetSpeedArgs(speed), rest.code or "SpeedAboveLimit", reason, rest.policies), speed
 

@@ -781,7 +781,7 @@ def _request_all(fleet: Fleet, tally: Tally, permitted: list[str], rng: np.rando
         if verdict.permits and not _flies_faster(fleet, i, verdict, now):
             text = f"{call} in {now} -> {verdict}"
             tally.wrong += [f"{defect}: {text}" for defect in _defects(verdict, now, place)]
-            if _strays(verdict, now, place):
+            if strays(verdict, now, place):
                 tally.wrong.append(f"leads from one inclusion zone through uncovered air to another: {text}")
             # SetSpeed does not start a motion.
             moves = not isinstance(verdict.args, SetSpeedArgs)
@@ -853,7 +853,7 @@ def _request(rng: np.random.Generator, place: Scene) -> Call:
     return Call("SetVelocity", VelocityArgs(float(north), float(east), down, hold_s=float(rng.uniform(0.1, 2.0))))
 
 
-def _strays(verdict: Verdict, now: Situation, place: Scene) -> bool:
+def strays(verdict: Verdict, now: Situation, place: Scene) -> bool:
     """Return True if the leg of a hovering drone outside all inclusion zones leads away from the zones at its altitude.
 
     The distance to these zones may not grow before the drone is inside a zone that permits all altitudes of the leg.

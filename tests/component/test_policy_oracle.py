@@ -15,7 +15,7 @@ import policy_flights
 import pytest
 from depth import cells, examples
 from fractus_core.policy import free_space, goto_rules
-from fractus_core.policy.decision_types import Call, GotoArgs, Situation, TakeoffArgs
+from fractus_core.policy.decision_types import Call, GotoArgs, Situation, TakeoffArgs, Verdict
 from fractus_core.policy.engine import MIN_TAKEOFF_ALTITUDE_M
 from fractus_core.policy.limits import MIN_LEG_ALTITUDE_M
 from fractus_core.policy.monitoring import monitor
@@ -23,7 +23,21 @@ from fractus_services.mobility.mavlink import failsafes
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from parameter_faults import parameter_faults
-from policy_flights import CORNERS, EAST_M, LIMIT, NORTH_M, OVERSHOOT_M, ZONES, Fleet, Scene, excused, flights
+from policy_flights import (
+    CORNERS,
+    EAST_M,
+    INCLUSION,
+    LIMIT,
+    NORTH_M,
+    OVERSHOOT_M,
+    ZONES,
+    Fleet,
+    Floats,
+    Scene,
+    excused,
+    flights,
+    strays,
+)
 from policy_world import HOME, Corners, altitude, ask, at, compiled, exclusion, goto, inclusion, ring, target
 from position_fault_flights import PositionFaultFlights
 from return_flights import ReturnFlights
@@ -300,6 +314,45 @@ def test_oracle_accepts_drones_that_start_beyond_an_altitude_limit() -> None:
     fleet.gust[:] = 0
     fleet.place[1:, 2] = 21.5, 39.5, 42
     assert excused(fleet)[:, 0].tolist() == [True, False, False, True]
+
+
+def two_zones(kind: int, bands: Floats, limits: Floats) -> Scene:
+    """Return a scene with one square around home and another 36 m east of it."""
+    rings = np.full((ZONES, CORNERS, 2), 1e6)
+    for slot, west in ((0, -20.0), (1, 56.0)):
+        corners = [(west, -20.0), (west + 40, -20.0), (west + 40, 20.0), (west, 20.0)]
+        rings[slot] = corners + corners[-1:] * (CORNERS - 4)
+    kinds = np.array([kind] * 2 + [0] * (ZONES - 2))
+    return Scene(compiled(), rings, kinds, bands, limits, (-np.inf, 120.0), 15.0)
+
+
+def test_oracle_detects_leg_through_uncovered_air_to_another_inclusion_zone() -> None:
+    bands = np.tile([-np.inf, np.inf], (ZONES, 1))
+    bands[0, 1] = 20.0
+    scene = two_zones(INCLUSION, bands, bands.copy())
+
+    def wrong(start: Situation, call: Call) -> bool:
+        return strays(Verdict("allow", call.args), start, scene)
+
+    assert wrong(at(20.05, 0, alt=10), goto(70, 0, 30))
+    assert wrong(at(0, 0, alt=20.5), goto(70, 0, 30))
+    assert not wrong(at(20.05, 0, alt=10), goto(0, 0, 10)), "the drone returns into the zone"
+    assert not wrong(at(50, 0, alt=10), goto(70, 0, 30)), "the other zone is nearer"
+    assert not wrong(at(50, 0, alt=40), goto(70, 0, 30))
+
+
+def test_oracle_detects_altitude_limit_only_within_the_altitudes_of_its_zone() -> None:
+    bands = np.tile([-np.inf, np.inf], (ZONES, 1))
+    bands[0, 1] = 25.0
+    limits = np.tile([-np.inf, np.inf], (ZONES, 1))
+    limits[0, 1] = 15.0
+    fleet = Fleet(np.random.default_rng(1), [two_zones(LIMIT, bands, limits)] * 3)
+    fleet.place[:] = (0, 0, 10)
+    fleet.place[1:, 2] = 24.0, 26.0
+    fleet.gust[:] = fleet.error[:] = fleet.settled[:] = 0.0
+    fleet._estimated = None
+    fleet.speed[:] = 1.0
+    assert fleet.trespassing()[:, 0].tolist() == [False, True, False]
 
 
 @pytest.fixture

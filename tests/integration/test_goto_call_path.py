@@ -26,7 +26,7 @@ from fractus_services.options import MobilityOptions
 from mobility_rig import DRIVER, FRAME, NODE, Rig, altitude_limit, fence, grant
 
 MAX_FILES = 38
-MAX_FUNCTIONS = 120  # the timing of telemetry changes the number by a few
+MAX_FUNCTIONS = 126  # the timing of telemetry changes the number by a few
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 VALUE_METHODS = frozenset({"__init__", "__new__", "__post_init__", "__eq__", "__hash__", "__bool__", "__len__"})

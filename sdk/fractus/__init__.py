@@ -1,6 +1,6 @@
 """SDK for components of Fractus applications: drone, camera, and requests between components."""
 
-from typing import TYPE_CHECKING, Any
+import typing
 
 from fractus import sync as sync
 from fractus.control import Control as Control
@@ -74,11 +74,11 @@ from fractus.values import TourProgress as TourProgress
 from fractus.values import Velocity as Velocity
 from fractus.values import VelocityResult as VelocityResult
 
-if TYPE_CHECKING:
+if typing.TYPE_CHECKING:
     from fractus.survey_lines import survey as survey
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> typing.Any:
     # Most components need no geometry. The import of shapely and numpy would double their memory.
     if name != "survey":
         raise AttributeError(f"module fractus has no attribute {name!r}")

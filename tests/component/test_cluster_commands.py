@@ -280,7 +280,7 @@ PROBLEMS: list[tuple[str, Any, str, str]] = [
     (f"{ADMISSION}/validatingadmissionpolicies", [], "error", "fractus-flight-pods"),
     (f"{ADMISSION}/validatingadmissionpolicybindings", [], "error", "fractus-flight-pods"),
     ("/api/v1/namespaces/fractus-system/pods", [WAITING], "error", "imagePullSecrets"),
-    (AUTHORITY, None, "error", "the certificate authority does not exist yet"),
+    (AUTHORITY, None, "error", "the certificate of the authority, does not exist"),
     (AUTHORITY, authority(10), "warning", "the certificate authority expires"),
     (AUTHORITY, authority(-1), "error", "the certificate authority expires"),
     (AUTHORITY, {"data": {"ca.crt": base64.b64encode(b"x").decode()}}, "error", "invalid certificate authority"),

@@ -120,22 +120,6 @@ def test_velocity_setpoint_expires_directly_after_hover(tmp_path: Path) -> None:
     fly(flight)
 
 
-def test_velocity_setpoint_ends_when_driver_opens_second_stream(tmp_path: Path) -> None:
-    async def flight() -> None:
-        async with World(tmp_path) as world:
-            grant = world.grants.put(spec())
-            await world.up(grant)
-            await world.service.set_velocity(grant, VelocityArgs(4.0, 0.0, hold_s=2.0))
-            await world.drive(grant)
-            await asyncio.sleep(0.3)
-            assert world.plane.velocity_setpoint == (0.0, 0.0, 0.0), "the setpoint of the first stream ends"
-            assert world.control.motion is None
-            await world.service.set_velocity(grant, VelocityArgs(0.0, 2.0, hold_s=0.5))
-            assert world.plane.velocity_setpoint == (2.0, 0.0, 0.0)
-
-    fly(flight)
-
-
 def test_failed_velocity_setpoint_stops_previous_setpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:

@@ -10,8 +10,6 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
 
-from fractus_core.api.names import component_name
-
 DEBUG = 1
 INFO = 2
 WARNING = 3
@@ -150,9 +148,9 @@ def level_of(entry: Mapping[str, Any]) -> int:
 
 def component_of(entry: Mapping[str, Any]) -> str:
     """Return the component that made the call, or an empty string for an action of the system."""
-    caller = str(entry.get("caller") or "")
-    component = component_name(caller)
-    return component if component != caller else ""
+    # Not `fractus_core.api.names.component_name`, whose import of pydantic would delay `fractus audit`.
+    _, separator, rest = str(entry.get("caller") or "").partition("/component/")
+    return rest.partition("/")[0] if separator else ""
 
 
 def parse_time_ns(value: object) -> int | None:

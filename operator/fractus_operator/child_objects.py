@@ -219,10 +219,10 @@ class ChildObjects:
         self._record(kind, desired, applied)
 
     async def _create(self, kind: Kind, desired: Body, body: Body) -> Body | None:
-        """Create an object without a prior GET. If its name is taken, return the existing object.
+        """Create an object, normally without a prior GET. If its name is taken, return the existing object.
 
-        A name that was taken before is looked up first, because each failed creation counts against the quota of the
-        namespace.
+        Only a name that was taken at an earlier attempt is looked up first, because each failed creation counts against the
+        quota of the namespace.
         """
         key = key_of(desired)
         if (kind, key) in self._taken:
@@ -255,7 +255,7 @@ class ChildObjects:
     # -- deleting --
 
     async def prune(self, application: Application, desired: Mapping[Kind, Sequence[Body]]) -> None:
-        """Delete child objects that are no longer desired, in the reverse order of their application."""
+        """Delete child objects that are no longer desired, in the reverse of the order in which they are applied."""
         for kind in reversed(kinds.CHILDREN):
             names = {body["metadata"]["name"] for body in desired[kind]}
             for child in self.of(application.key, kind):

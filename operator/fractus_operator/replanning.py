@@ -18,7 +18,7 @@ UNSCHEDULABLE_GRACE = timedelta(seconds=5)
 """Time for which a pod may wait for its planned node before the node counts as unusable."""
 
 _OPTIONAL = frozenset({"NodeCordoned", "NodesAppeared"})
-"""Reasons for a new plan that are ignored if there is no other plan."""
+"""Reasons to plan again after which the present plan is kept if there is no better one."""
 
 
 @dataclass(frozen=True, slots=True)

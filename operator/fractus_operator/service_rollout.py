@@ -36,8 +36,8 @@ class ServicesOfNode:
 
     Attributes:
         outdated: Pods of another revision than their DaemonSet requires.
-        starting: Pods of the required revision that are not ready: by DaemonSet, the name of the pod, or the name of the
-            DaemonSet if it has not created the pod yet.
+        starting: Pods of the required revision that are not ready. Keys: DaemonSets. Values: names of their pods, or of the
+            DaemonSet while it has not created the pod.
         obstacle: Reason and message why nothing may be replaced at present, if so.
         starting_s: Seconds for which `starting` has been unchanged.
     """

@@ -307,7 +307,7 @@ def apply_failed(reported: Mapping[str, Any], reason: str, error: str) -> Status
     """
     message = f"cannot apply child objects, retrying: {error}"
     known = (Condition.model_validate(c) for c in reported.get("conditions") or ())
-    # Stages that were reached stay in the status. Other stages may be reached by now, so their conditions are removed.
+    # A stage that was reached stays reached. For the other stages the present state is unknown, so their conditions are removed.
     kept = [
         ConditionUpdate(c.type, c.status, c.reason, c.message)
         for c in known

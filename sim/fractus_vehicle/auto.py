@@ -94,7 +94,7 @@ class AutoFlight(Flight):
             self._announce(v)
 
     def _reset(self) -> None:
-        """Forget the progress of the mission. It was reset when the motors stopped."""
+        """Reset the progress of this mode. The mission itself was reset when the motors stopped."""
         self._started = False
         self._announced = False
         self._item = self._leg = self._returning = None

@@ -67,8 +67,8 @@ def mode_title(mode: int) -> str:
 _TITLES = {mavlink.COPTER_MODE_SMART_RTL: "SMARTRTL", mavlink.COPTER_MODE_AUTO_RTL: "AUTO RTL"}
 
 
-# Frames by the reference of their altitude: mean sea level, terrain, or (in GLOBAL_FRAMES) also home. The deprecated
-# *_INT frames are equivalent.
+# Frames by the reference of their altitude: mean sea level, or terrain. GLOBAL_FRAMES contains both, and the frames
+# relative to home. The deprecated *_INT frames are equivalent.
 ABSOLUTE_FRAMES = frozenset({mavlink.MAV_FRAME_GLOBAL, mavlink.MAV_FRAME_GLOBAL_INT})
 TERRAIN_FRAMES = frozenset({mavlink.MAV_FRAME_GLOBAL_TERRAIN_ALT, mavlink.MAV_FRAME_GLOBAL_TERRAIN_ALT_INT})
 GLOBAL_FRAMES = (

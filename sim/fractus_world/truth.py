@@ -54,7 +54,7 @@ class Seen:
 
 @dataclass(frozen=True, slots=True)
 class SeenFace:
-    """A photographed face in a picture.
+    """A face on a billboard of the world, as it appears in one picture.
 
     Attributes:
         id: Identical in every picture.

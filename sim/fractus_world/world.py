@@ -47,7 +47,7 @@ class World:
 
     @classmethod
     def on(cls, ground: Ground, seed: int = 7) -> World:
-        """Create a world on a ground from the user.
+        """Create a world on a ground picture of the user.
 
         It has billboards near the origin, but no traffic, because its roads are unknown.
         """

@@ -1,4 +1,4 @@
-"""Throttling: long computations and many calls must not delay motion monitor, watchdog and heartbeats."""
+"""Fairness of the event loop: long computations and many calls must not delay motion monitor, watchdog and heartbeats."""
 
 from __future__ import annotations
 

@@ -164,7 +164,7 @@ class ReportedWaypoints(OpenModel):
     corrected: int = Field(ge=0, description="Reached waypoints whose target or speed a policy corrected.")
 
 
-_WAYPOINTS = "Waypoints of the mission, after its end. Missing if none were counted."
+_WAYPOINTS = "Numbers of reached, skipped and corrected waypoints, after the end of the mission. Missing if the service has not reported them."
 
 
 class GrantStatus(OpenModel):

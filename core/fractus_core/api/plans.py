@@ -133,7 +133,8 @@ class MissionRecord(Model):
     )
     message: str | None = Field(default=None, description="Human-readable explanation of the outcome.")
     waypoints: ReportedWaypoints | None = Field(
-        default=None, description="Waypoints of the mission. Missing if none were counted."
+        default=None,
+        description="Numbers of reached, skipped and corrected waypoints. Missing if the node has not reported them.",
     )
     landed: bool = Field(
         default=False, description="True if the drone was on the ground at the outcome, or has landed since."

@@ -188,8 +188,8 @@ def _on_heartbeat(update: StateUpdate) -> None:
 
 
 def _on_armed(update: StateUpdate) -> None:
-    # If another party started the motors, failsafes, fence, home and limits were not prepared. A driver on the ground
-    # therefore loses control.
+    # The service prepares failsafes, fence, home and limits before it starts the motors. If another party started them,
+    # nothing is prepared, so a driver on the ground loses control.
     state = update.state
     # In a pilot's mode, the pilot started the motors, even if the system had requested a start before.
     late = update.now < state.start_unconfirmed_until and state.vehicle.mode.commanded

@@ -1,9 +1,9 @@
 """Receding-horizon planner for the peer of the drone's direct link.
 
 The plan maximises the sum over time of the score of the best usable path. It uses dynamic programming over the steps
-of the horizon, with one state for "no link" and one state for each peer. Leaving a link is free. Connecting takes the
-time to come up and to be measured, during which traffic is on the cloud path (make before break, Fig. 8.13), and has a
-fixed cost, so that small gains cause no switch. Complexity: O(steps x peers).
+of the horizon, with one state for "no link" and one state for each peer. Leaving a link is free. A new
+link takes time until it is up and measured, and until then traffic stays on the cloud path (make before break, thesis
+Fig. 8.13). Each connection also has a fixed cost, so that small gains cause no switch. Complexity: O(steps x peers).
 
 Only the first move of the plan is executed. The plan is made again whenever something changes (level-triggered).
 """

@@ -21,7 +21,7 @@ RATE_SMOOTHING = 0.3
 RANGE_MARGIN = 1.02
 """A link that works at a distance is also expected to work at the distance multiplied by this factor."""
 RECOVERY_SHARE = 0.98
-"""A beacon from at least this share of the distance at which a link broke shows that the range was not the cause."""
+"""If a beacon is received at this share of the distance at which a link broke, or farther, the range did not cause the break."""
 
 FIRST_RETRY_S = 1.0
 MAX_RETRY_S = 60.0

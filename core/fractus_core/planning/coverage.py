@@ -31,7 +31,7 @@ _TILT_RAD = math.atan((math.sqrt(5) - 1) / 2)
 _BATCH = 256
 """Number of outdated bounds that one numpy call updates. One call per bound would be slower."""
 _CHUNK = 2048
-"""Number of candidates whose runs are computed at once; limits the memory of a step."""
+"""Number of candidates whose runs of covered samples are computed by one numpy call. The number limits the memory."""
 _TABLE = 2_000_000
 """Maximum lattice size for a table of ranks. Larger lattices use binary search."""
 _REMEMBERED = 4_000_000

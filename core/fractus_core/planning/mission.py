@@ -234,7 +234,7 @@ def remaining_flight(flight: Flight, position: Position, radius_m: float) -> Fli
 
 
 def misses(application: Application, flight: Flight, radius_m: float) -> int | None:
-    """Return the index of the first point of interest that a flight does not visit, or None if the flight can be shared."""
+    """Return the index of the first point of interest that a flight does not visit. None: the flight visits all of them."""
     poi = application.spec.points_of_interest
     if poi is None:
         return 0

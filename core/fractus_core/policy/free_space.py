@@ -56,7 +56,7 @@ class FreeSpace:
         return cls(now, moving, lower_m, upper_m, now.margin_m + room_m, slack, tuple(required_areas))
 
     def blockers(self, line: BaseGeometry) -> list[PolicyZone | int]:
-        """Return the obstacles of a line: zones to keep out of, and indexes of areas to stay in."""
+        """Return what a line violates: the zones that it enters, and the indexes of the areas that it leaves."""
         flat = self.grant.flat_terrain
         air = AirVolume(line, self.margin_m, self.lower_m, self.upper_m).extended(self.height_margin_m)
         obstacles: list[PolicyZone | int] = list(self.grant.exclusions.near(air, self.now, flat))

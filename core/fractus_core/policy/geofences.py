@@ -185,7 +185,7 @@ def _area_breach(reason: str, enters: bool) -> Breach:
 def _check_exclusion(
     zone: PolicyZone, leg: Leg, now: Situation, grant: CompiledGrant, air: AirVolume
 ) -> Iterator[Breach]:
-    """Check a zone within the margin of a leg. A drone that is already inside or too close may leave the zone."""
+    """Check a leg that is closer to a zone than the margin. A drone that is already inside or too close may leave the zone."""
     margin_m = air.margin_m
     shape = zone.shape
     certain = _certain_path(leg, now)
@@ -272,8 +272,8 @@ def _leaves_height(zone: PolicyZone, leg: Leg, now: Situation, grant: CompiledGr
     def gap_m(lower_m: float, upper_m: float) -> float:
         return band_gap_m(zone.band, lower_m, upper_m, now.home, grant.flat_terrain)
 
-    # The altitude that is farther from the zone is the end of the leg, because the leg passes all altitudes at which
-    # the drone could come to rest.
+    # A leg passes all altitudes at which the drone could come to rest. So of its lowest and highest altitude, the one that
+    # is farther from the zone is where the leg ends.
     end_m, rest_m = (max(map(gap_m, heights, heights)) for heights in ((leg.lower_m, leg.upper_m), present))
     closest_m = gap_m(leg.lower_m, leg.upper_m)
     return 0.0 < closest_m >= gap_m(*present) - 1e-6 and end_m >= height_margin_m and end_m > rest_m + 1e-6

@@ -74,7 +74,7 @@ def _import(node: Node, archive: IO[bytes]) -> None:
 def _attempt(node: Node, archive: IO[bytes]) -> str:
     """Import an archive. Return the error message, or an empty string on success."""
     argv = node.exec_command([*_CTR, "images", "import", "-"])
-    with open(f"/proc/self/fd/{archive.fileno()}", "rb") as stream:  # noqa: PTH123  (a separate read position)
+    with open(f"/proc/self/fd/{archive.fileno()}", "rb") as stream:  # noqa: PTH123 - opened again, because each node reads from its own position
         try:
             done = subprocess.run(
                 argv, stdin=stream, capture_output=True, text=True, timeout=_IMPORT_TIMEOUT_S, check=False

@@ -144,9 +144,9 @@ class PlannedFault:
 def create_schedule(
     seed: int, fault_time_s: float, durations: Mapping[str, tuple[float, float]]
 ) -> tuple[PlannedFault, ...]:
-    """Return the faults of a run: repeatedly all types in random order, with pauses or overlaps.
+    """Return the faults of a run: all types in random order, again and again, with pauses or overlaps.
 
-    A fault type never overlaps itself, and all faults end before the run.
+    A fault type never overlaps itself, and all faults end before the end of the run.
 
     Args:
         seed: Seed of all random values. The same seed gives the same schedule.

@@ -98,7 +98,7 @@ class RtlParameters:
             log.info("rtl: parameter set (name=%s, value=%g)", name, value)
 
     def _update_leg_speed(self) -> None:
-        """Set the owner's speed as the speed of legs, because the vehicle's parameter contains the limited speed of the return."""
+        """Use the owner's speed for legs. The same parameter of the vehicle now contains the limited speed of the return."""
         self._parameters.leg_speed = {
             name: value for name, value in self._owned.items() if name in self._stack.leg_speed
         }

@@ -51,7 +51,9 @@ have landed.
 """
 
 TRUSTED_AGAIN_S = 30.0
-"""Time for which the position must be trusted before the next sign of a wrong position counts as another problem.
+"""Time for which the position must have been trusted, so that a further sign of a wrong position begins a new problem.
+
+A sign before this time continues the previous problem.
 
 It is in seconds of the vehicle's clock.
 """

@@ -280,8 +280,32 @@ def test_driver_that_repeats_its_error_without_a_waypoint_ends_its_mission(error
         state, _ = apply_events(*again, state=lost_state)
     outcome = state.missions["a"].outcome
     assert outcome is not None
-    assert outcome.reason.endswith(f", {times} times without a further waypoint")
+    assert outcome.reason.endswith(f"{times} times without a further waypoint")
     assert (state.returning, state.grace, state.drives) == (True, None, False)
+
+
+def test_driver_that_is_interrupted_for_changing_reasons_ends_its_mission() -> None:
+    state, _ = apply_events(*FLY, events.StreamClosed(1))
+    for attempt in range(8):
+        assert state.missions["a"].outcome is None
+        state = demand_hover(state, 2 + attempt, f"Code{attempt % 2}")
+    state, _ = apply_events(events.StreamOpened(10, "a", "A"), events.GrantControl(10), state=state)
+    state, _ = apply_events(events.StreamClosed(10), state=state)
+    assert state.missions["a"].outcome == Outcome(
+        OutcomeKind.FAILED, "driver lost; the driver was interrupted 10 times without a further waypoint"
+    )
+    assert state.returning
+
+
+def test_landing_continues_if_the_last_permitted_loss_ends_the_mission() -> None:
+    state, _ = apply_events(*FLY)
+    state = replace(state, missions={"a": replace(state.missions["a"], interruptions=9)})
+    landing = events.VehicleObserved(replace(FLYING, mode=LAND)), events.Heartbeat()
+    began = events.ModeChangeBegan(LAND), events.MotionBegan(1, "Land"), *landing
+    state, _ = apply_events(*began, events.ModeChangeEnded(LAND, GUIDED, done=True, refused=False), state=state)
+    state, _ = apply_events(events.StreamClosed(1), state=state)
+    assert state.missions["a"].outcome is not None
+    assert (state.task is not None and state.task.kind, state.attended) == (TaskKind.LAND, True)
 
 
 def test_takeovers_on_the_ground_are_not_counted() -> None:

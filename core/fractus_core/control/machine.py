@@ -107,8 +107,8 @@ After a takeover with the action `hover`, or of a driver that hangs, the driver 
 control. A driver that then repeats its error would otherwise keep the vehicle in the air until its battery is empty.
 """
 
-MAX_REPEATED_LOSSES = 10
-"""Number of broken streams in flight, without a further waypoint, at which the mission ends.
+MAX_INTERRUPTIONS = 10
+"""Number of takeovers and broken streams in flight, for any reasons, without a further waypoint, at which the mission ends.
 
 It is higher than `MAX_REPEATED_TAKEOVERS`, because a driver may lose its connection without an error of its own.
 """
@@ -216,6 +216,7 @@ def _count_waypoints(update: StateUpdate, event: WaypointsDone) -> None:
             waypoints=event.waypoints,
             leg_flown=mission.leg_flown or event.leg,
             takeovers=0,
+            interruptions=0,
             counts=counts,
             legs=0,
             corrected_legs=0,
@@ -282,6 +283,7 @@ def _return_control(update: StateUpdate, event: ControlReturned) -> None:
         points_done=mission.points_done + 1,
         waypoints=0,
         takeovers=0,
+        interruptions=0,
         counts=counts,
         legs=0,
         corrected_legs=0,
@@ -318,12 +320,11 @@ def _close_stream(update: StateUpdate, event: StreamClosed) -> None:
     if mission is None or not (lease.granted or lease.transit):
         return
     update.audit("control", DRIVER_LOST, lease.identity, "its stream broke")
-    losses = _count_takeover(update, lease.key, DRIVER_LOST) if lease.granted else 0
-    reason = DRIVER_LOST
-    if losses >= MAX_REPEATED_LOSSES:
-        reason = f"{DRIVER_LOST}, {losses} times without a further waypoint"
+    repeated = _count_interruption(update, lease.key) if lease.granted else ""
+    reason = f"{DRIVER_LOST}; {repeated}" if repeated else DRIVER_LOST
+    if repeated:
         update.audit("takeover", TaskKind.RETURN.value, "system", reason, "DriverLost")
-    _leave_driver(update, lease.key, "the driver's stream broke", reason, ends=losses >= MAX_REPEATED_LOSSES)
+    _leave_driver(update, lease.key, "the driver's stream broke", reason, ends=bool(repeated))
 
 
 def _drop_unresponsive_driver(update: StateUpdate, event: DriverUnresponsive) -> None:
@@ -333,36 +334,42 @@ def _drop_unresponsive_driver(update: StateUpdate, event: DriverUnresponsive) ->
         return
     update.mission(lease.key, lease.identity)
     reason = f"the driver's program did not respond for {event.waited_s:g} s"
-    takeovers = _count_takeover(update, lease.key, "DriverUnresponsive")
-    ends = takeovers >= MAX_REPEATED_TAKEOVERS
-    if ends:
-        reason = f"{reason}, {takeovers} times without a further waypoint"
-    kind = TaskKind.RETURN if ends else TaskKind.HOVER
+    repeated = _count_interruption(update, lease.key, "DriverUnresponsive")
+    if repeated:
+        reason = f"{reason}; {repeated}"
+    kind = TaskKind.RETURN if repeated else TaskKind.HOVER
     update.audit("takeover", kind.value, "system", reason, "DriverUnresponsive")
     update.drop_lease()
     remedy = "do not block its event loop: use asyncio.sleep and asyncio.to_thread"
     update.act(SendEvent(lease.lease_id, ControlEvent(StreamState.LOST, reason=f"{reason}; {remedy}")))
-    _leave_driver(update, lease.key, reason, reason, ends=ends)
+    _leave_driver(update, lease.key, reason, reason, ends=bool(repeated))
 
 
-def _count_takeover(update: StateUpdate, key: str, cause: str) -> int:
+def _count_interruption(update: StateUpdate, key: str, cause: str = "") -> str:
     """Count a takeover in flight, or the loss of a driver.
 
     Args:
         update: State before the takeover.
         key: Key of the mission.
-        cause: Text that is equal for equal causes.
+        cause: Text that is equal for equal causes of takeovers; empty for the loss of a driver.
 
     Returns:
-        Number of takeovers for this cause without a further waypoint; 0 on the ground.
+        Reason why the mission ends, or an empty string if the driver may continue.
     """
     mission = update.state.missions.get(key)
     if mission is None or not update.state.vehicle.armed:
-        return 0
-    takeovers = mission.takeovers + 1 if mission.takeover == cause else 1
-    update.update_mission(mission, takeover=cause, takeovers=takeovers)
+        return ""
+    interruptions = mission.interruptions + 1
+    takeovers = mission.takeovers
+    if cause:
+        takeovers = takeovers + 1 if mission.takeover == cause else 1
+    update.update_mission(mission, takeover=cause or mission.takeover, takeovers=takeovers, interruptions=interruptions)
     update.act(SaveJournal())
-    return takeovers
+    if cause and takeovers >= MAX_REPEATED_TAKEOVERS:
+        return f"the driver caused this takeover {takeovers} times without a further waypoint"
+    if interruptions >= MAX_INTERRUPTIONS:
+        return f"the driver was interrupted {interruptions} times without a further waypoint"
+    return ""
 
 
 def _leave_driver(update: StateUpdate, key: str, stopped: str, reason: str, *, ends: bool) -> None:
@@ -383,7 +390,9 @@ def _leave_driver(update: StateUpdate, key: str, stopped: str, reason: str, *, e
     returns = motion is not None and motion.kind == "ReturnToLaunch"
     lands = motion is not None and motion.kind == "Land" and update.state.vehicle.mode.comes_down
     update.stop_motion(StopKind.LOST, "ControlLost", stopped)
-    if update.state.vehicle.armed and not lands:
+    if lands and ends:
+        update.follow_descent(TaskKind.LAND)
+    elif update.state.vehicle.armed and not lands:
         update.start(TaskKind.RETURN if returns or ends else TaskKind.HOVER)
     if not ends:
         update.begin_grace(mission, reason)
@@ -469,11 +478,11 @@ def _take_over(update: StateUpdate, event: TakeoverDemanded) -> None:
     reason = event.reason
     mission = update.state.mission
     if outcome is None and mission is not None and update.state.drives:
-        takeovers = _count_takeover(update, mission.key, " ".join((event.code, *event.policies)))
-        if takeovers >= MAX_REPEATED_TAKEOVERS:
+        repeated = _count_interruption(update, mission.key, " ".join((event.code, *event.policies)))
+        if repeated:
             kind = TaskKind.RETURN
             outcome = OutcomeKind.FAILED
-            reason = f"{reason}; the driver caused this takeover {takeovers} times without a further waypoint"
+            reason = f"{reason}; {repeated}"
     update.seize(kind, event.code, reason, event.policies, outcome)
 
 

@@ -155,6 +155,7 @@ class Mission:
         takeover: Cause of the last takeover in flight after which the driver may continue: code and policies.
         takeovers: Number of these takeovers in succession. A further waypoint, or a takeover for another reason, starts
             the count again.
+        interruptions: Number of takeovers for any reason, and of lost drivers, in flight since the last waypoint.
         counts: Waypoints of all control points so far.
         legs: Legs that ended since the last completed waypoint.
         corrected_legs: Number of these legs that a policy corrected.
@@ -170,6 +171,7 @@ class Mission:
     leg_flown: bool = False
     takeover: str = ""
     takeovers: int = 0
+    interruptions: int = 0
     counts: WaypointCounts = WaypointCounts()
     legs: int = 0
     corrected_legs: int = 0

@@ -252,7 +252,7 @@ class Control:
                     self._held = True
                     self._granted.set()
                 elif event.state == _Event.STATE_PING:
-                    # A failed answer is not repeated. If the service still expects one, it sends the next request a second later.
+                    # A failed answer is not repeated, because the service repeats the request a second later.
                     with contextlib.suppress(grpc.aio.AioRpcError):
                         answer = mobility_pb2.ConfirmAliveRequest(ping=event.ping)
                         await stub.ConfirmAlive(answer, timeout=CONFIRM_TIMEOUT_S)

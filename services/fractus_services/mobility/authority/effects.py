@@ -70,9 +70,10 @@ class Lease:
         self._events.put_nowait(event)
 
     def next_ping(self) -> ControlEvent:
-        """Return a liveness request, which the driver has to answer."""
-        self._ping += 1
-        self.responded = False
+        """Return a liveness request, which the driver has to answer. An unanswered request is returned again."""
+        if self.responded:
+            self._ping += 1
+            self.responded = False
         return ControlEvent(StreamState.PING, ping=self._ping)
 
     def confirm(self, ping: int) -> None:

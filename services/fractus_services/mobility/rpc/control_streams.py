@@ -75,9 +75,9 @@ class ControlStreams:
             control.close_lease(lease)
 
     async def _events(self, lease: Lease, response_timeout_s: float) -> AsyncGenerator[ControlEvent, None]:
-        """Yield the events of a lease until its end, and a liveness request whenever the previous one was answered.
+        """Yield the events of a lease until its end, and a liveness request in every interval without an event.
 
-        The waiting time is counted in completed intervals and not read from a clock. An answer that arrived while the service
+        A request is repeated until it is answered, because the answer may be lost. The waiting time is counted in completed intervals and not read from a clock. An answer that arrived while the service
         itself was suspended is therefore noticed in time.
         """
         waited_s = 0.0
@@ -90,9 +90,10 @@ class ControlStreams:
                     continue
                 if lease.responded:
                     waited_s = 0.0
-                    yield lease.next_ping()
-                elif waited_s >= response_timeout_s:
+                if waited_s >= response_timeout_s:
                     self._control.drop_unresponsive_driver(lease, waited_s)
+                else:
+                    yield lease.next_ping()
                 continue
             if event is None:
                 return

@@ -337,7 +337,7 @@ class MavlinkAutopilot(AutopilotLink):
         self._rates.take(incoming.name)
         if incoming.name == "PARAM_VALUE":
             self.vehicle_parameters.take(incoming)
-        elif incoming.name == "PARAM_ERROR":
+        elif incoming.name == "PARAM_ERROR" and incoming.integer("target_system") in {0, self._sysid}:
             self.vehicle_parameters.take_error(incoming)
         elif incoming.name == "COMMAND_ACK":
             self._acknowledgements.take(incoming, self.now)

@@ -119,7 +119,7 @@ class Parameters:
             self._on_change(name)
 
     def take_error(self, message: Message) -> None:
-        """Process a PARAM_ERROR: a request for a parameter was refused."""
+        """Process a PARAM_ERROR for this station: a request for a parameter was refused."""
         name = message.text("param_id")
         self._number += 1
         self._errors[name] = self._number
@@ -148,7 +148,8 @@ class Parameters:
 
         def fresh(names: Spellings) -> bool:
             received = any(self._received.get(name, 0) > begun for name in names)
-            return received or all(self._errors.get(name, 0) > begun for name in names)
+            # Every other error proves that the parameter exists.
+            return received or all(self._errors.get(name, 0) > begun and name in self._absent for name in names)
 
         unanswered = await self._request_by_name(expected, fresh, ATTEMPTS_BEFORE_LIST)
         unknown = [" or ".join(names) for names in unanswered if not self._known(names)]

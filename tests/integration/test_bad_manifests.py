@@ -164,6 +164,7 @@ BAD: list[tuple[str, Body, str]] = [
     ("two ports with one name", app(CLOUD | {"container": {"image": "app", "ports": [{"port": 1, "name": "a"}, {"port": 2, "name": "a"}]}}), "port names must be unique"),
     ("reserved environment variable", app(CLOUD | {"container": {"image": "app", "env": [{"name": "FRACTUS_NODE"}]}}), "names that begin with FRACTUS_ are reserved"),
     ("unknown resource", resources(requests={"disk": 1}), "a resource must be cpu, memory"),
+    ("component named like a controller", app(DRIVER | {"name": "Pilot"}), "a drone is also controlled by a pilot or by the system"),
     ("memory without unit", resources(limits={"memory": 128}), "memory must be at least 4Mi"),
     ("memory in thousandths of a byte", resources(requests={"memory": "128m"}), "memory must be at least 4Mi"),
     ("request above the limit", resources(requests={"cpu": 2}, limits={"cpu": "1500m"}), "a request must not be above the limit"),

@@ -89,6 +89,7 @@ class VehicleState:
         position_problem_at: Start of the problem with the position. Problems that recur soon count as one.
         position_trusted_at: Time at which the latest problem with the position ended.
         expected_place: Latitude and longitude at which the vehicle is expected while its position is not trusted; None if unknown.
+        expected_error_m: Distance from this place that the vehicle may have flown during interruptions.
     """
 
     lat: float | None = None
@@ -141,6 +142,7 @@ class VehicleState:
     position_problem_at: float = -math.inf
     position_trusted_at: float = -math.inf
     expected_place: tuple[float, float] | None = None
+    expected_error_m: float = 0.0
 
     @property
     def reports_on_ground(self) -> bool:

@@ -250,7 +250,8 @@ class ReturnFlight:
         vehicle = self._control.autopilot.vehicle
         if now.lat is None and vehicle.expected_place is not None:
             lat, lon = vehicle.expected_place
-            now = replace(now, lat=lat, lon=lon, position_error_m=vehicle.position_error_m, latency_s=0.0)
+            error_m = vehicle.position_error_m + vehicle.expected_error_m
+            now = replace(now, lat=lat, lon=lon, position_error_m=error_m, latency_s=0.0)
         return descent_enters_fence(now, self._control.for_transit(grant))
 
     def _blind(self) -> bool:

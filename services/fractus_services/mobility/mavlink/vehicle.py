@@ -191,6 +191,7 @@ def _position(vehicle: Vehicle, message: Message, now: float) -> None:
     plausible = _check_position(vehicle, now)
     expected = vehicle.position_checks.expected
     vehicle.expected_place = (expected.position.lat, expected.position.lon) if expected is not None else None
+    vehicle.expected_error_m = expected.unseen_m if expected is not None else 0.0
     located = vehicle.located and now - vehicle.gps_at <= STATUS_MAX_AGE_S / vehicle.pace
     if not plausible or not located or not vehicle.estimator_positioned(now):
         return

@@ -471,6 +471,13 @@ class Component(Model):
         return slug(self.name)
 
     @rule(
+        "!(self.name.lowerAscii() in ['pilot', 'system'])",
+        "a drone is also controlled by a pilot or by the system; choose another name",
+    )
+    def _not_a_controller(self) -> Violation:
+        return "name" if self.name.lower() in {"pilot", "system"} else None
+
+    @rule(
         "self.placement == 'drone' ? has(self.class) : !has(self.class)",
         "class (driver or passenger) is required for placement drone, and not allowed otherwise",
     )

@@ -349,9 +349,8 @@ def test_phase_follows_drone(world: World, operator: OperatorProcess, namespace:
     assert "flies" not in status["message"]
     assert "drone-1 is on the ground, its mission has not begun" in status["message"]
     assert world.condition(namespace, "MissionComplete")["reason"] == "MissionWaiting"
-    navigator = f"spiffe://fractus.dev/ns/{namespace}/app/traffic/component/Navigator/instance/traffic-navigator"
     path = f"{FRACTUS}/drones/drone-1/status"
-    world.api.merge(path, {"status": {"flightState": "takingOff", "controller": navigator}})
+    world.api.merge(path, {"status": {"flightState": "takingOff", "controller": "Navigator"}})
     assert world.phase(namespace, "TakingOff")["controller"] == "Navigator"
     world.drone_status("drone-1", "flying")
     assert world.condition(namespace, "MissionComplete")["reason"] == "MissionBegun"

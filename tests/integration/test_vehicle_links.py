@@ -65,7 +65,13 @@ def test_vehicle_sends_only_heartbeats_until_streams_are_requested():
         while time.monotonic() < end:
             message = client.link.recv_match(blocking=True, timeout=0.1)
             names |= {message.get_type()} if message is not None else set()
-        assert names <= {"HEARTBEAT", "STATUSTEXT", "HOME_POSITION", "PARAM_VALUE"}  # PARAM_VALUE: ground pressure
+        assert names <= {
+            "HEARTBEAT",
+            "STATUSTEXT",
+            "HOME_POSITION",
+            "GPS_GLOBAL_ORIGIN",
+            "PARAM_VALUE",
+        }  # PARAM_VALUE: ground pressure
         rates = {"ATTITUDE": (30, 50), "LOCAL_POSITION_NED": (32, 10), "GLOBAL_POSITION_INT": (33, 1)}
         for number, rate_hz in rates.values():
             client.interval(number, rate_hz)

@@ -66,12 +66,12 @@ E2E_IMAGES = $(if $(filter current,$(FRACTUS_E2E_CLUSTER)),,$(RUN) python -m fra
 E2E_WORKERS = $(if $(filter current,$(FRACTUS_E2E_CLUSTER)),0,2)
 
 .PHONY: test
-test: packages env lint ## Run the checks that every change must pass: lint, types, unit, component, integration, attack and kill tests, and a mission on an embedded cluster (20 min)
+test: packages env lint ## Run the checks that every change must pass: lint, types, unit, component, integration, attack and kill tests, and a mission on an embedded cluster (30 min)
 	$(RUN) fractus cluster binaries
 	$(PYTEST) $(UNIT) -m "not slow" tests/component tests/unit
 	@# Integration tests mostly wait. Meanwhile the images are built, with a lower priority and with out/images.log as output.
 	mkdir -p $(OUT); nice $(E2E_IMAGES) > $(OUT)/images.log 2>&1 & build=$$!; tests=0; \
-	$(PYTEST) -n 4 $(GROUPS) -m "not slow" tests/integration || tests=$$?; \
+	$(PYTEST) -n 3 $(GROUPS) -m "not slow" tests/integration || tests=$$?; \
 	wait $$build || { cat $(OUT)/images.log >&2; exit 1; }; exit $$tests
 	$(PYTEST) -n $(E2E_WORKERS) $(GROUPS) -m "not slow" tests/e2e
 

@@ -90,7 +90,7 @@ class Stage:
                     chunks = [chunk async for chunk in self.camera.RetrieveImage(request, timeout=20)]
                 except grpc.aio.AioRpcError as error:
                     # The service refuses the picture, because the measured attitude changed after the capture.
-                    assert "ask again" in (error.details() or ""), error
+                    assert "request it again" in (error.details() or ""), error
                     await asyncio.sleep(PACE_S)
                     continue
                 await self.camera.DeleteImage(camera_pb2.DeleteImageRequest(name=capture.image.name), timeout=5)

@@ -87,8 +87,7 @@ def test_traffic_returns_to_the_cloud_within_a_second_after_link_loss(world: Wor
     drone = start_drone(world, edge)
     client = world.client(drone, 100_000, 0.02)
     until(lambda: client.last_server == "e1", "a reply over the link", world)
-    servers = [response[1] for response in client.responses]
-    assert "FAILED" not in servers, "the planned switch to the link lost a call"
+    assert not client.failed, f"the planned switch to the link lost a call: {client.failed}"
     switched = []
     gaps = []
     # The loss is detected after 0.6 s, and the switch takes a millisecond. Measure several losses on a busy machine.

@@ -87,6 +87,7 @@ def report(
     if audit and not manifests:
         raise click.UsageError("--audit also needs the manifest of the Application (--filename)")
     with command_errors():
+        _check_folder(folder, audit)
         folder.mkdir(parents=True, exist_ok=True)
         remove_report(folder, OBJECTS, "events.json")
         shutil.rmtree(folder / PICTURES, ignore_errors=True)
@@ -100,6 +101,20 @@ def report(
         write_mission_report(FlightRecord.read(folder), folder)
     Console().print(Markdown((folder / PAGE).read_text()))
     click.echo(f"report: {folder / PAGE}")
+
+
+def _check_folder(folder: Path, audit: Sequence[Path]) -> None:
+    """Refuse a folder in which the report would replace files that are no earlier report.
+
+    Raises:
+        ExperimentError: The folder contains other files, or the audit logs to read.
+    """
+    if folder.is_dir() and any(folder.iterdir()) and not (folder / OBJECTS).exists():
+        raise ExperimentError(f"{folder} contains files and no earlier report; specify a new folder with --out")
+    if any(path.resolve().is_relative_to((folder / AUDIT).resolve()) for path in audit):
+        raise ExperimentError(
+            f"--audit is inside {folder}, which the report replaces; specify another folder with --out"
+        )
 
 
 def _kube(kubeconfig: Path | None) -> Kube:

@@ -84,6 +84,20 @@ def test_report_is_written_from_manifests_and_audit_log(files: tuple[Path, Path]
     assert {"map.png", "altitude.png", "flight.geojson", "report.json"} <= {path.name for path in out.iterdir()}
 
 
+def test_report_replaces_only_an_earlier_report(files: tuple[Path, Path], tmp_path: Path) -> None:
+    manifests, audit = files
+    arguments: list[str | Path] = ["traffic-monitoring", "-f", manifests, "--audit", audit, "--out"]
+    before = (audit / "mobility.jsonl").read_bytes()
+    code, output = run(*arguments, tmp_path)
+    assert code == 1
+    assert "contains files and no earlier report" in output
+    (tmp_path / "objects.json").write_text("{}")
+    code, output = run(*arguments, tmp_path)
+    assert code == 1
+    assert "--audit is inside" in output
+    assert (audit / "mobility.jsonl").read_bytes() == before
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

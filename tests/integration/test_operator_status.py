@@ -182,7 +182,7 @@ def test_outcome_of_older_release_is_kept(world: World, operator: OperatorProces
     wait_for(lambda: ((world.api.get(plan) or {})["spec"].get("flown") or {}).get("outcome") == "Failed", operator.log)
     status = world.phase(namespace, "Failed")
     assert (status["drone"], status["message"]) == ("drone-1", "driver lost")
-    assert not world.grants(namespace)
+    wait_for(lambda: not world.grants(namespace), "the Grants to be deleted")
 
 
 # -- the certificate of the authority --

@@ -12,11 +12,12 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 from fractus_sim import command_line, experiment_command
-from fractus_sim.experiment.definition import Experiment, parse
+from fractus_sim.errors import ExperimentError
+from fractus_sim.experiment.definition import Experiment, Program, parse
 from fractus_sim.interruption import uninterrupted
 from fractus_sim.report.report_files import write_page
 from fractus_sim.report.track import Place, Sample
-from fractus_sim.runner import Outcome, experiment_report, experiment_runner
+from fractus_sim.runner import ExperimentRun, Outcome, experiment_report, experiment_runner, run
 from fractus_sim.runner.telemetry_recording import Flight
 from fractus_sim.testbeds import process_guard
 from fractus_sim.testbeds.testbed import Findings, Moment, Testbed
@@ -44,7 +45,10 @@ class EmptyTestbed(Testbed):
     def tick(self) -> Moment:
         raise AssertionError("never reached")
 
-    begin = collect = set_up
+    def begin(self, program: Program | None = None) -> None:
+        """Start nothing."""
+
+    collect = set_up
 
     def set_link(self, vehicle: str, *, connected: bool) -> None:
         """Ignore the call."""
@@ -99,11 +103,45 @@ def test_testbed_is_closed_if_the_disk_is_full_at_the_end(
 ) -> None:
     resource = testbed.keep(Resource())
     monkeypatch.setattr(experiment_runner, "_create_testbed", lambda *_: testbed)
-    monkeypatch.setattr(experiment_runner, "_run_session", lambda _: "")
     monkeypatch.setattr(experiment_runner, "McapLog", lambda _: Resource(disk_full()))
-    with pytest.raises(OSError, match="No space left"):
-        experiment_runner.run(experiment, tmp_path)
+    with pytest.raises(OSError, match="No space left"), ExperimentRun(experiment, tmp_path):
+        pass
     assert resource.closed
+
+
+def test_run_that_is_advanced_in_steps_equals_a_whole_run(tmp_path: Path) -> None:
+    task = [{"do": "takeoff", "alt": 3}, {"do": "land"}]
+    vehicle = {"name": "d", "home": {"lat": 50.0, "lon": 4.0}, "readyAfter": 1, "task": task}
+    experiment = parse({"name": "test", "settle": 0, "vehicles": [vehicle], "checks": [{"check": "landed"}]})
+    with ExperimentRun(experiment, tmp_path / "steps") as stepped:
+        stepped.start()
+        stepped.begin()
+        assert stepped.advance(1.0)
+        assert stepped.now_s == pytest.approx(1.0, abs=0.03)
+        assert not stepped.over
+        while stepped.advance(2.5):
+            assert stepped.flights["d"].samples[-1].time_s <= stepped.now_s
+        assert stepped.result().holds
+    assert run(experiment, tmp_path / "whole").holds
+    logs = [(tmp_path / name / "logs" / "test.mcap").read_bytes() for name in ("steps", "whole")]
+    assert logs[0] == logs[1]
+
+
+def test_run_is_aborted_at_its_timeout_in_any_step(experiment: Experiment, tmp_path: Path) -> None:
+    grounded = parse({**experiment.to_dict(), "timeout": 3, "settle": 30})
+    with ExperimentRun(grounded, tmp_path) as stepped:
+        stepped.start()
+        stepped.begin()
+        assert stepped.advance(2.0)
+        assert not stepped.advance(2.0)
+        outcome = stepped.result()
+    assert outcome.problem == "not completed within 3 s"
+    assert not outcome.holds
+
+
+def test_grants_cannot_be_reissued_without_services(testbed: EmptyTestbed) -> None:
+    with pytest.raises(ExperimentError, match="cannot be reissued in mode vehicles; use mode standalone"):
+        testbed.reissue([])
 
 
 @pytest.fixture

@@ -14,6 +14,8 @@ if TYPE_CHECKING:
 
 PAGE = "summary.md"
 RESULTS = "report.json"
+EXPERIMENT_FILES = (RESULTS, "tracks.geojson", "map.png", "profile.png")
+"""Files of the report of an experiment, in addition to the page."""
 
 
 @dataclass(frozen=True, slots=True)

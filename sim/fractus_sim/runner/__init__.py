@@ -7,7 +7,7 @@ Run an experiment file and require that all its checks hold:
 """
 
 from fractus_sim.progress import Progress
-from fractus_sim.runner.experiment_runner import run
+from fractus_sim.runner.experiment_runner import ExperimentRun, run
 from fractus_sim.runner.outcome import Outcome
 
-__all__ = ["Outcome", "Progress", "run"]
+__all__ = ["ExperimentRun", "Outcome", "Progress", "run"]

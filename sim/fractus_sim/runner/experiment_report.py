@@ -21,7 +21,6 @@ from fractus_sim.report.track import Track
 from fractus_sim.runner.fault_injection import Occurrence
 from fractus_sim.runner.outcome import Event, Outcome
 
-FILES = (RESULTS, "tracks.geojson", "map.png", "profile.png")
 _MAX_EVENTS = 40
 _MAX_TEXTS = 25
 _MAX_VEHICLES_WITH_MODES = 3

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Callable, Generator, Sequence
-from contextlib import closing
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
+from typing import Self
 
 from fractus_sim.errors import ExperimentError
-from fractus_sim.experiment.definition import Experiment
+from fractus_sim.experiment.definition import Experiment, Program
 from fractus_sim.progress import Progress
-from fractus_sim.report.flight_record import JudgedCall, policy_decisions
-from fractus_sim.report.report_files import remove_report
+from fractus_sim.report.flight_record import policy_decisions
+from fractus_sim.report.report_files import EXPERIMENT_FILES, remove_report
 from fractus_sim.runner.check_evaluation import Evidence, Verdict, evaluate_check
-from fractus_sim.runner.experiment_report import FILES, write_outcome
 from fractus_sim.runner.fault_injection import FaultInjector
 from fractus_sim.runner.outcome import Event, Outcome
 from fractus_sim.runner.task_execution import TaskFailed, fly_task
@@ -127,6 +128,156 @@ class _Session:
         return self.now_s - self.calm_since_s >= self.experiment.settle
 
 
+class ExperimentRun:
+    """An experiment that its caller advances step by step. Use it as a context manager.
+
+        with ExperimentRun(experiment, Path("out/hello")) as run:
+            run.start()
+            run.begin()
+            while not run.over:
+                run.advance(1.0)
+            outcome = run.result()
+
+    Attributes:
+        experiment: Experiment that runs.
+        out: Output folder.
+        testbed: Vehicles and their environment.
+        flights: Recordings by vehicle, up to the current time.
+        over: True if the experiment has completed or was aborted.
+        problem: Reason why the experiment was aborted. Empty while it runs and if it completed.
+    """
+
+    def __init__(
+        self, experiment: Experiment, out: Path, *, base: Path | None = None, progress: Progress | None = None
+    ) -> None:
+        """Prepare the output folder without starting anything.
+
+        Args:
+            experiment: Experiment to run. `fractus_sim.experiment.load` reads a file.
+            out: Output folder. Files of an earlier run are overwritten.
+            base: Base directory of relative paths in the experiment. Default: the working directory.
+            progress: Callbacks for progress.
+
+        Raises:
+            ExperimentError: The experiment is invalid.
+            OSError: A file could not be written.
+        """
+        self.experiment = experiment
+        self.out = out
+        self.over = False
+        self.problem = ""
+        self._progress = progress or Progress()
+        self._began_s = time.monotonic()
+        self._shown_s = 0.0
+        out.mkdir(parents=True, exist_ok=True)
+        (out / "logs").mkdir(exist_ok=True)
+        remove_report(out, *EXPERIMENT_FILES)
+        with ExitStack() as resources:
+            self.testbed = _create_testbed(experiment, out, base or Path.cwd(), self._progress)
+            resources.enter_context(closing(self.testbed))
+            log = resources.enter_context(closing(McapLog(out / "logs" / f"{experiment.name}.mcap")))
+            self._resources = resources.pop_all()
+        self.flights = {setup.name: Flight(setup.name) for setup in experiment.setups()}
+        self._session = _Session(experiment, self.testbed, self.flights, log, self._progress)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @property
+    def now_s(self) -> float:
+        """Seconds since all vehicles were ready."""
+        return self._session.now_s
+
+    @property
+    def events(self) -> Sequence[Event]:
+        """Events of tasks and faults so far, in order."""
+        return self._session.events
+
+    def start(self) -> None:
+        """Start all parts, and wait until the vehicles are ready. Tasks and faults begin.
+
+        Raises:
+            ExperimentError: A part did not start, or a vehicle was not ready in time.
+        """
+        self.testbed.set_up()
+        for name, endpoint in self.testbed.endpoints.items():
+            self._progress.report(f"{name}: connect QGroundControl, Mission Planner or MAVProxy to {endpoint}")
+        _wait_ready(self._session)
+        self._session.begin()
+
+    def begin(self, program: Program | None = None) -> None:
+        """Start one program, or by default all programs and Applications. An error aborts the experiment."""
+        with self._aborted_by_errors():
+            self.testbed.begin(program)
+
+    def advance(self, seconds: float) -> bool:
+        """Run for an experiment time, or until the experiment is over.
+
+        Args:
+            seconds: Seconds of the experiment. The clock of the vehicles may run faster or slower than real time.
+
+        Returns:
+            True while the experiment is not over.
+        """
+        end_s = self.now_s + seconds
+        with self._aborted_by_errors():
+            while not self.over and self.now_s < end_s:
+                if self.now_s >= self.experiment.timeout:
+                    self._abort(f"not completed within {self.experiment.timeout:g} s")
+                    break
+                self._session.poll()
+                self._session.injector.step(self.now_s)
+                self._session.step_tasks()
+                self.over = self._session.over()
+                self._show_status()
+        return not self.over
+
+    def report(self, vehicle: str, text: str) -> None:
+        """Record an event. `vehicle` is empty for an event of the whole experiment."""
+        self._session.report(vehicle, text)
+
+    def in_experiment_time(self, unix_s: float) -> float:
+        """Convert Unix time to seconds of the experiment."""
+        return (unix_s - self._session.start.unix_us / 1e6) * (self.experiment.pace or 1.0)
+
+    def result(self) -> Outcome:
+        """Stop all parts, collect the results, and evaluate the checks. The run is over after this call.
+
+        Raises:
+            OSError: A log could not be written or read.
+        """
+        self.over = True
+        for vehicle, title in self._session.injector.missed:
+            self.report(vehicle, f"{title}: not injected, because the experiment ended earlier")
+        self.testbed.collect()
+        self.close()
+        return _outcome(self, self._session, time.monotonic() - self._began_s)
+
+    def close(self) -> None:
+        """Stop all parts. A run that was not completed leaves its logs."""
+        self._resources.close()
+
+    @contextmanager
+    def _aborted_by_errors(self) -> Iterator[None]:
+        try:
+            yield
+        except ExperimentError as error:
+            self.report("", str(error))
+            self._abort(str(error))
+
+    def _abort(self, problem: str) -> None:
+        self.problem = problem
+        self.over = True
+
+    def _show_status(self) -> None:
+        if time.monotonic() - self._shown_s > SHOW_INTERVAL_S:
+            self._shown_s = time.monotonic()
+            self._progress.show(_status_line(self._session))
+
+
 def run(experiment: Experiment, out: Path, *, base: Path | None = None, progress: Progress | None = None) -> Outcome:
     """Run an experiment, and write logs, tracks, figures and the report to a folder.
 
@@ -140,19 +291,14 @@ def run(experiment: Experiment, out: Path, *, base: Path | None = None, progress
         ExperimentError: The experiment could not be set up. The message says what to do.
         OSError: A file could not be written.
     """
-    progress = progress or Progress()
-    out.mkdir(parents=True, exist_ok=True)
-    (out / "logs").mkdir(exist_ok=True)
-    remove_report(out, *FILES)
-    began_s = time.monotonic()
-    with (
-        closing(_create_testbed(experiment, out, base or Path.cwd(), progress)) as testbed,
-        closing(McapLog(out / "logs" / f"{experiment.name}.mcap")) as log,
-    ):
-        flights = {setup.name: Flight(setup.name) for setup in experiment.setups()}
-        session = _Session(experiment, testbed, flights, log, progress)
-        problem = _run_session(session)
-    outcome = _outcome(session, out, problem, time.monotonic() - began_s)
+    # matplotlib is imported here, because it takes a second and not every caller of ExperimentRun draws figures.
+    from fractus_sim.runner.experiment_report import write_outcome  # noqa: PLC0415
+
+    with ExperimentRun(experiment, out, base=base, progress=progress) as experiment_run:
+        experiment_run.start()
+        experiment_run.begin()
+        experiment_run.advance(math.inf)
+        outcome = experiment_run.result()
     write_outcome(outcome)
     return outcome
 
@@ -174,33 +320,6 @@ def _create_testbed(experiment: Experiment, out: Path, base: Path, progress: Pro
     return testbed(experiment, out, base, progress.report)
 
 
-def _run_session(session: _Session) -> str:
-    """Set up the testbed, wait until the vehicles are ready, and fly.
-
-    Returns:
-        The reason why the experiment was aborted, or an empty string.
-
-    Raises:
-        ExperimentError: The experiment could not be set up.
-    """
-    testbed = session.testbed
-    testbed.set_up()
-    for name, endpoint in testbed.endpoints.items():
-        session.progress.report(f"{name}: connect QGroundControl, Mission Planner or MAVProxy to {endpoint}")
-    _wait_ready(session)
-    session.begin()
-    try:
-        testbed.begin()
-        problem = _run_until_over(session)
-    except ExperimentError as error:
-        problem = str(error)
-        session.report("", problem)
-    for vehicle, title in session.injector.missed:
-        session.report(vehicle, f"{title}: not injected, because the experiment ended earlier")
-    testbed.collect()
-    return problem
-
-
 def _wait_ready(session: _Session) -> None:
     """Poll until every vehicle is ready to arm.
 
@@ -219,21 +338,6 @@ def _wait_ready(session: _Session) -> None:
             raise ExperimentError(f"{waiting[0]} was not ready to arm within {timeout_s:.0f} s: {detail}")
 
 
-def _run_until_over(session: _Session) -> str:
-    """Run tasks and faults until the experiment is over. Return an error message if it did not complete in time."""
-    shown_s = 0.0
-    while session.now_s < session.experiment.timeout:
-        session.poll()
-        session.injector.step(session.now_s)
-        session.step_tasks()
-        if session.over():
-            return ""
-        if time.monotonic() - shown_s > SHOW_INTERVAL_S:
-            shown_s = time.monotonic()
-            session.progress.show(_status_line(session))
-    return f"not completed within {session.experiment.timeout:g} s"
-
-
 def _status_line(session: _Session) -> str:
     parts = [f"{session.now_s:5.0f} s"]
     observers = session.testbed.observers
@@ -245,7 +349,7 @@ def _status_line(session: _Session) -> str:
     return "   ".join(parts)
 
 
-def _outcome(session: _Session, out: Path, problem: str, wall_s: float) -> Outcome:
+def _outcome(experiment_run: ExperimentRun, session: _Session, wall_s: float) -> Outcome:
     findings = session.testbed.findings
     experiment = session.experiment
     zones = {zone.name: zone for zone in experiment.zones}
@@ -255,19 +359,17 @@ def _outcome(session: _Session, out: Path, problem: str, wall_s: float) -> Outco
     ]
     return Outcome(
         experiment,
-        out,
+        experiment_run.out,
         session.flights,
         tuple(session.injector.occurrences),
         tuple(verdicts),
         findings,
         tuple(session.events),
-        tuple(_in_experiment_time(call, session) for call in policy_decisions(findings.calls)),
+        tuple(
+            replace(call, time_s=experiment_run.in_experiment_time(call.time_s))
+            for call in policy_decisions(findings.calls)
+        ),
         session.now_s,
         wall_s,
-        problem,
+        experiment_run.problem,
     )
-
-
-def _in_experiment_time(call: JudgedCall, session: _Session) -> JudgedCall:
-    """Return a call with its time converted from Unix time to seconds of the experiment."""
-    return replace(call, time_s=(call.time_s - session.start.unix_us / 1e6) * (session.experiment.pace or 1.0))

@@ -12,7 +12,7 @@ from typing import Any
 from fractus_cluster.spec import ClusterSpec, NodeSpec, VehicleHardware, load_spec
 
 from fractus_sim.errors import ExperimentError
-from fractus_sim.experiment.definition import ClusterPart, Experiment, VehicleSetup
+from fractus_sim.experiment.definition import ClusterPart, Experiment, Program, VehicleSetup
 from fractus_sim.testbeds.embedded_cluster import (
     FractusCluster,
     cluster_errors,
@@ -76,7 +76,7 @@ class ClusterTestbed(Testbed):
         time.sleep(TICK_S)
         return Moment(time.monotonic() - self._began_s, time.time_ns() // 1000)
 
-    def begin(self) -> None:
+    def begin(self, program: Program | None = None) -> None:
         """Apply the Applications.
 
         Raises:

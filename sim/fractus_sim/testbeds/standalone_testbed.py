@@ -60,9 +60,7 @@ class StandaloneTestbed(Testbed):
             if drone.world_url is not None:
                 truths = self.folder / "logs" / f"{setup.name}-truth.jsonl"
                 self._watches.append(self.keep(TruthWatch(drone.world_url, truths)))
-        for spec in grants:
-            if spec.node in self._drones.drones:
-                self._identities[spec.component] = self._drones.grant(grant_manifest(spec))
+        self.reissue(grants)
         self._began_s = time.monotonic()
 
     def tick(self) -> Moment:
@@ -75,15 +73,21 @@ class StandaloneTestbed(Testbed):
         self._drones.check()
         return Moment((time.monotonic() - self._began_s) * self.experiment.pace, time.time_ns() // 1000)
 
-    def begin(self) -> None:
-        """Start the programs as their components."""
+    def begin(self, program: Program | None = None) -> None:
+        """Start a program as its component, or all programs."""
         addresses = {
-            program.component: f"127.0.0.1:{program.port}"
-            for program in self.experiment.programs
-            if program.component is not None and program.port is not None
+            each.component: f"127.0.0.1:{each.port}"
+            for each in self.experiment.programs
+            if each.component is not None and each.port is not None
         }
-        for program in self.experiment.programs:
-            self._start_program(program, addresses)
+        for each in self.experiment.programs if program is None else (program,):
+            self._start_program(each, addresses)
+
+    def reissue(self, grants: Iterable[GrantSpec]) -> None:
+        """Sign Grants of the drones of this experiment, and replace those of the same instances."""
+        for spec in grants:
+            if spec.node in self._drones.drones:
+                self._identities[spec.component] = self._drones.grant(grant_manifest(spec))
 
     @property
     def required_flights(self) -> list[str]:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import sys
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
+
+from fractus_core.api.grants import GrantSpec
 
 from fractus_sim.errors import ExperimentError
 from fractus_sim.experiment.definition import Experiment, Program, VehicleSetup
@@ -130,8 +132,26 @@ class Testbed(ABC):
         """
 
     @abstractmethod
-    def begin(self) -> None:
-        """Start programs or apply Applications. Called when the vehicles are ready."""
+    def begin(self, program: Program | None = None) -> None:
+        """Start a program of the experiment. Called when the vehicles are ready.
+
+        Args:
+            program: Program to start. None: all programs, or all Applications in mode cluster.
+
+        Raises:
+            ExperimentError: The program cannot be started.
+        """
+
+    def reissue(self, grants: Iterable[GrantSpec]) -> None:
+        """Replace Grants in flight. A drone whose Grant is not replaced keeps it.
+
+        Args:
+            grants: Compiled Grants of this experiment's applications.
+
+        Raises:
+            ExperimentError: The mode has no Grants, or its operator issues them.
+        """
+        raise ExperimentError(f"Grants cannot be reissued in mode {self.experiment.mode}; use mode standalone")
 
     @property
     def busy(self) -> bool:

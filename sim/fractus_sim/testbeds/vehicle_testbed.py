@@ -15,7 +15,7 @@ from fractus_vehicle.simulation import Craft, Simulation
 from fractus_vehicle.state import CONTROL_STEP_S, REPEATABLE_EPOCH_US, VehicleConfig
 
 from fractus_sim.errors import ExperimentError
-from fractus_sim.experiment.definition import Experiment, VehicleSetup
+from fractus_sim.experiment.definition import Experiment, Program, VehicleSetup
 from fractus_sim.testbeds.ground_station import ChannelLink, Link, Station, TcpLink
 from fractus_sim.testbeds.link_tap import LinkTap
 from fractus_sim.testbeds.local_processes import Processes
@@ -77,12 +77,12 @@ class VehicleTestbed(Testbed):
         time.sleep(STEPS_PER_TICK * CONTROL_STEP_S / max(self._pace, 1.0))
         return Moment(self._simulation.time_s, time.time_ns() // 1000)
 
-    def begin(self) -> None:
-        """Start the programs."""
-        for program in self.experiment.programs:
-            link = self._program_links[program.name]
-            environment = {**os.environ, "PYTHONUNBUFFERED": "1", "FRACTUS_VEHICLE": link, **program.environment}
-            self._programs.start(program.name, program_command(program), environment, self.base)
+    def begin(self, program: Program | None = None) -> None:
+        """Start a program, or all programs."""
+        for each in self.experiment.programs if program is None else (program,):
+            link = self._program_links[each.name]
+            environment = {**os.environ, "PYTHONUNBUFFERED": "1", "FRACTUS_VEHICLE": link, **each.environment}
+            self._programs.start(each.name, program_command(each), environment, self.base)
 
     @property
     def required_flights(self) -> list[str]:

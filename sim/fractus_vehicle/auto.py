@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
+from fractus_services.mavlink_server.mission_items import LANDINGS, TAKEOFFS, Item
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fractus_vehicle.breadcrumbs import Point
@@ -12,7 +13,6 @@ from fractus_vehicle.descent import descend
 from fractus_vehicle.flight import Flight
 from fractus_vehicle.leg import Leg
 from fractus_vehicle.mission_commands import MissionCommands, item_target, title
-from fractus_vehicle.mission_items import LANDINGS, TAKEOFFS, Item
 from fractus_vehicle.rtl import ReturnToLaunch
 from fractus_vehicle.spline import SplineLeg
 from fractus_vehicle.state import CONTROL_STEP_S, VehicleState

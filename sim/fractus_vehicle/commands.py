@@ -6,6 +6,14 @@ import math
 from collections.abc import Callable
 
 from fractus_runtime.mavlink_codec import Message
+from fractus_services.mavlink_server.channel import Channel
+from fractus_services.mavlink_server.coordinates import (
+    ABSOLUTE_FRAMES,
+    ALTITUDE_MAX_M,
+    GLOBAL_FRAMES,
+    valid_coordinates,
+)
+from fractus_services.mavlink_server.mission_items import Item
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fractus_vehicle.accessories import (
@@ -14,22 +22,17 @@ from fractus_vehicle.accessories import (
     SWITCH_LOW,
     SWITCHED_MODES,
 )
-from fractus_vehicle.channel import Channel
 from fractus_vehicle.copter import (
-    ABSOLUTE_FRAMES,
     FORCE_ARM_MAGIC,
     FORCE_MAGIC,
-    GLOBAL_FRAMES,
     GUIDED_MODES,
     SUPPORTED_MODES,
     TAKEOFF_MODES,
     UNAVAILABLE,
 )
-from fractus_vehicle.earth import ALTITUDE_MAX_M, valid_coordinates
 from fractus_vehicle.guided import GuidedFlight
 from fractus_vehicle.home import set_home_at, set_home_to_position
 from fractus_vehicle.mission_commands import item_target, switch_fence
-from fractus_vehicle.mission_items import Item
 from fractus_vehicle.mission_orders import (
     begin_landing_sequence,
     begin_return_path,

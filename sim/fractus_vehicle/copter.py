@@ -67,16 +67,6 @@ def mode_title(mode: int) -> str:
 _TITLES = {mavlink.COPTER_MODE_SMART_RTL: "SMARTRTL", mavlink.COPTER_MODE_AUTO_RTL: "AUTO RTL"}
 
 
-# Frames by the reference of their altitude: mean sea level, or terrain. GLOBAL_FRAMES contains both, and the frames
-# relative to home. The deprecated *_INT frames are equivalent.
-ABSOLUTE_FRAMES = frozenset({mavlink.MAV_FRAME_GLOBAL, mavlink.MAV_FRAME_GLOBAL_INT})
-TERRAIN_FRAMES = frozenset({mavlink.MAV_FRAME_GLOBAL_TERRAIN_ALT, mavlink.MAV_FRAME_GLOBAL_TERRAIN_ALT_INT})
-GLOBAL_FRAMES = (
-    ABSOLUTE_FRAMES
-    | TERRAIN_FRAMES
-    | {mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT, mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT_INT}
-)
-
 # Second parameter of MAV_CMD_COMPONENT_ARM_DISARM: disarm in flight, and arm despite failed checks.
 FORCE_MAGIC = 21196
 FORCE_ARM_MAGIC = 2989

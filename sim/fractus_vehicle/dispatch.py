@@ -6,9 +6,10 @@ import math
 from collections.abc import Callable
 
 from fractus_runtime.mavlink_codec import Message
+from fractus_services.mavlink_server.channel import Channel
+from fractus_services.mavlink_server.stream_groups import ALL_GROUPS, GROUPS
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from fractus_vehicle.channel import Channel
 from fractus_vehicle.commands import handle_command, set_mode_number
 from fractus_vehicle.earth import Place, valid_place
 from fractus_vehicle.flight import Flight
@@ -18,7 +19,6 @@ from fractus_vehicle.mission_orders import set_current
 from fractus_vehicle.report_units import UNKNOWN_U16
 from fractus_vehicle.state import VehicleState
 from fractus_vehicle.status_reports import mission_current
-from fractus_vehicle.streams import ALL_GROUPS, GROUPS
 from fractus_vehicle.targets import attitude_target, global_target, guided_item, local_target
 from fractus_vehicle.telemetry import send, send_parameter
 from fractus_vehicle.vehicle import Vehicle

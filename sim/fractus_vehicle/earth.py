@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from fractus_services.mavlink_server.coordinates import ALTITUDE_MAX_M, valid_coordinates
+
 METRES_PER_UNIT = 0.011131884502145034
 UNIT = 1e-7
 
@@ -45,15 +47,6 @@ class Place:
         )
 
 
-# ArduPilot rejects positions above this altitude.
-ALTITUDE_MAX_M = 83_000.0
-
-
 def valid_place(lat_e7: int, lon_e7: int, alt_m: float) -> bool:
     """Return True if the coordinates are valid and the altitude is plausible."""
     return valid_coordinates(lat_e7, lon_e7) and abs(alt_m) <= ALTITUDE_MAX_M
-
-
-def valid_coordinates(lat_e7: int, lon_e7: int) -> bool:
-    """Return True if latitude and longitude are in range."""
-    return abs(lat_e7) <= 900_000_000 and abs(lon_e7) <= 1_800_000_000

@@ -15,7 +15,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from fractus_vehicle.channel import Channel
+from fractus_services.mavlink_server.channel import Channel
+
 from fractus_vehicle.simulation import Craft
 
 READ_SIZE = 16 * 1024

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from fractus_services.mavlink_server.mission_items import TAKEOFFS, Item, ItemStore, home_item
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fractus_vehicle.earth import Place
-from fractus_vehicle.mission_items import TAKEOFFS, Item, ItemStore, home_item
 
 
 class Mission:
@@ -112,6 +112,6 @@ class Mission:
 
     def set_home(self, home: Place) -> None:
         """Update item 0 to the home position."""
-        self.store.home = home_item(home)
+        self.store.home = home_item(home.lat_e7, home.lon_e7, home.alt_m)
         if self.items:
             self.items[0] = self.store.home

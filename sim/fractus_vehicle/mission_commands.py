@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from collections import deque
 
+from fractus_services.mavlink_server.mission_items import Item
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fractus_vehicle.accessories import set_relay, set_servo
 from fractus_vehicle.home import set_home_at, set_home_to_position
-from fractus_vehicle.mission_items import Item
 from fractus_vehicle.shaping import wrap_pi
 from fractus_vehicle.state import VehicleState
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 
+from fractus_services.mavlink_server.channel import Channel
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fractus_vehicle.auto import AutoFlight
-from fractus_vehicle.channel import Channel
 from fractus_vehicle.guided import GuidedFlight
 from fractus_vehicle.orders import Command
 from fractus_vehicle.telemetry import send

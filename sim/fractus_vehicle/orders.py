@@ -6,9 +6,8 @@ import math
 from dataclasses import dataclass
 
 from fractus_runtime.mavlink_codec import Message
+from fractus_services.mavlink_server.mission_items import Item
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
-
-from fractus_vehicle.mission_items import Item
 
 # Commands whose fifth and sixth parameters are degrees. In other commands these parameters are plain integers.
 PLACED = frozenset(

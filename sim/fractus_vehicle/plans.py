@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from fractus_services.mavlink_server.coordinates import valid_coordinates
+from fractus_services.mavlink_server.mission_items import Item, ItemStore, home_item
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from fractus_vehicle.earth import Place, valid_coordinates
+from fractus_vehicle.earth import Place
 from fractus_vehicle.fence import FenceItem, FenceShapeError, build_shapes
-from fractus_vehicle.mission_items import Item, ItemStore, home_item
 from fractus_vehicle.state import VehicleState
 
 
@@ -45,7 +46,7 @@ def _accept(v: VehicleState, kind: int, items: list[Item]) -> int:
     match kind:
         case mavlink.MAV_MISSION_TYPE_MISSION:
             if items and v.home is not None:
-                items[0] = home_item(v.home)
+                items[0] = home_item(v.home.lat_e7, v.home.lon_e7, v.home.alt_m)
             v.params.assign("MIS_TOTAL", len(items))
         case mavlink.MAV_MISSION_TYPE_FENCE:
             try:

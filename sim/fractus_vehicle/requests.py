@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
+from fractus_services.mavlink_server.channel import Channel
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fractus_vehicle.accessories import (
@@ -17,7 +18,6 @@ from fractus_vehicle.accessories import (
     set_servo,
     start_motor_test,
 )
-from fractus_vehicle.channel import Channel
 from fractus_vehicle.copter import VERSION_TEXT
 from fractus_vehicle.orders import Command
 from fractus_vehicle.state import VehicleState

@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from fractus_services.mavlink_server.mission_items import Item
+
 from fractus_vehicle.earth import Place
-from fractus_vehicle.mission_items import Item
 from fractus_vehicle.state import VehicleState
 
 

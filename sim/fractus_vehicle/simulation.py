@@ -8,12 +8,12 @@ from dataclasses import replace
 from typing import BinaryIO
 
 from fractus_runtime.mavlink_codec import Message
+from fractus_services.mavlink_server.channel import Channel
+from fractus_services.mavlink_server.stream_groups import ALL_GROUPS, GROUPS
 
-from fractus_vehicle.channel import Channel
 from fractus_vehicle.dispatch import dispatch
 from fractus_vehicle.plans import restore
 from fractus_vehicle.state import CONTROL_STEP_S, VehicleConfig
-from fractus_vehicle.streams import ALL_GROUPS, GROUPS
 from fractus_vehicle.vehicle import Vehicle
 
 # Messages about a link itself, which are never forwarded.

@@ -9,20 +9,20 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from fractus_runtime.mavlink_codec import Value
+from fractus_services.mavlink_server.channel import Channel
+from fractus_services.mavlink_server.coordinates import ABSOLUTE_FRAMES, GLOBAL_FRAMES, TERRAIN_FRAMES
+from fractus_services.mavlink_server.mission_items import ItemStore
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fractus_vehicle.body import Airframe, Body, Wind
 from fractus_vehicle.breadcrumbs import Breadcrumbs
-from fractus_vehicle.channel import Channel
 from fractus_vehicle.control import Control
-from fractus_vehicle.copter import ABSOLUTE_FRAMES, GLOBAL_FRAMES, TERRAIN_FRAMES
 from fractus_vehicle.earth import Place
 from fractus_vehicle.estimator import FULL_START_S, Estimator
 from fractus_vehicle.fence import Fence
 from fractus_vehicle.gimbal import Gimbal
 from fractus_vehicle.heading import Heading
 from fractus_vehicle.mission import Mission
-from fractus_vehicle.mission_items import ItemStore
 from fractus_vehicle.params import Parameters
 from fractus_vehicle.receiver import Receiver
 from fractus_vehicle.sensors import Battery, Gps

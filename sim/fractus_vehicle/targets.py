@@ -6,13 +6,14 @@ import math
 from typing import NamedTuple
 
 from fractus_runtime.mavlink_codec import Message
+from fractus_services.mavlink_server.coordinates import GLOBAL_FRAMES, valid_coordinates
+from fractus_services.mavlink_server.mission_items import item_from
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from fractus_vehicle.copter import GLOBAL_FRAMES, IGNORE_ACCELERATION, IGNORE_POSITION, IGNORE_VELOCITY
-from fractus_vehicle.earth import Place, valid_coordinates
+from fractus_vehicle.copter import IGNORE_ACCELERATION, IGNORE_POSITION, IGNORE_VELOCITY
+from fractus_vehicle.earth import Place
 from fractus_vehicle.flight import Flight
 from fractus_vehicle.guided import GuidedFlight
-from fractus_vehicle.mission_items import item_from
 from fractus_vehicle.shaping import clamp, wrap_pi
 from fractus_vehicle.state import VehicleState
 

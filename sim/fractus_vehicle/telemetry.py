@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from fractus_vehicle.channel import PARAMETERS_PER_TICK, Channel
+from fractus_services.mavlink_server.channel import PARAMETERS_PER_TICK, Channel
+from fractus_services.mavlink_server.stream_groups import ALL_GROUPS, GROUPS
+
 from fractus_vehicle.state import VehicleState
-from fractus_vehicle.streams import ALL_GROUPS, BUILDERS, GROUPS
+from fractus_vehicle.streams import BUILDERS
 
 MAX_RATE_HZ = 100.0
 

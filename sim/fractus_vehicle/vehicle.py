@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 
+from fractus_services.mavlink_server.channel import Channel
+from fractus_services.mavlink_server.mission_transfer import Transfers
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fractus_vehicle.accessories import end_motor_test
-from fractus_vehicle.channel import Channel
 from fractus_vehicle.estimator import HOME_SET_S
 from fractus_vehicle.failsafes import Failsafes
 from fractus_vehicle.home import set_home
@@ -19,7 +20,6 @@ from fractus_vehicle.report_units import UNKNOWN_U16
 from fractus_vehicle.settings import LIMIT_PREFIXES, accelerometers_differ, set_battery, set_fence, set_limits, set_wind
 from fractus_vehicle.state import CONTROL_STEP_S, VehicleConfig, VehicleState
 from fractus_vehicle.telemetry import attach, follow_rate, send_on_all, send_parameter, serve
-from fractus_vehicle.transfers import Transfers
 
 # Modes that disarm immediately after landing.
 _LANDING_MODES = frozenset({mavlink.COPTER_MODE_LAND, mavlink.COPTER_MODE_RTL, mavlink.COPTER_MODE_SMART_RTL})

@@ -9,10 +9,10 @@ import struct
 import pytest
 from depth import examples
 from fractus_runtime.mavlink_codec import Endpoint, message_class
+from fractus_services.mavlink_server.mission_items import SUPPORTED
 from fractus_vehicle.commands import HANDLERS as COMMAND_HANDLERS
 from fractus_vehicle.copter import SUPPORTED_MODES
 from fractus_vehicle.dispatch import HANDLERS
-from fractus_vehicle.mission_items import SUPPORTED
 from fractus_vehicle.state import VehicleState
 from mavlink_frames import values_of
 from pymavlink.dialects.v20 import ardupilotmega as mavlink

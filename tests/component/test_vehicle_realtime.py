@@ -8,8 +8,8 @@ import socket
 
 import pytest
 from fractus_runtime.mavlink_codec import Endpoint, Parser
+from fractus_services.mavlink_server.channel import Channel
 from fractus_vehicle import __main__ as realtime
-from fractus_vehicle.channel import Channel
 from fractus_vehicle.links import Hub
 from fractus_vehicle.simulation import Craft, Simulation
 from vehicle_world import CONFIG

@@ -5,8 +5,9 @@ from __future__ import annotations
 import itertools
 
 import pytest
-from fractus_vehicle.channel import OUTBOX_LIMIT, Channel
-from fractus_vehicle.streams import ALL_GROUPS, BUILDERS, GROUPS
+from fractus_services.mavlink_server.channel import OUTBOX_LIMIT, Channel
+from fractus_services.mavlink_server.stream_groups import ALL_GROUPS, GROUPS
+from fractus_vehicle.streams import BUILDERS
 from fractus_vehicle.telemetry import send
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from vehicle_world import airborne, alone

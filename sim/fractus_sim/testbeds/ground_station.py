@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 from fractus_runtime.mavlink_codec import Endpoint, Message, Value, enum_names, message_id
-from fractus_vehicle.channel import Channel
+from fractus_services.mavlink_server.channel import Channel
 from fractus_vehicle.simulation import Craft
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 

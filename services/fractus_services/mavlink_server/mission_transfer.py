@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from fractus_runtime.mavlink_codec import Message, Value
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from fractus_vehicle.channel import Channel
-from fractus_vehicle.mission_items import Item, ItemStore, item_from, validate_item, validate_parameters
+from fractus_services.mavlink_server.channel import Channel
+from fractus_services.mavlink_server.mission_items import Item, ItemStore, item_from, validate_item, validate_parameters
 
 # Capacity of the autopilot's storage.
 MAX_ITEMS = {

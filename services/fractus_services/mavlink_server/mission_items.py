@@ -10,8 +10,7 @@ from dataclasses import dataclass, field
 from fractus_runtime.mavlink_codec import Message
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from fractus_vehicle.copter import GLOBAL_FRAMES
-from fractus_vehicle.earth import ALTITUDE_MAX_M, Place, valid_coordinates
+from fractus_services.mavlink_server.coordinates import ALTITUDE_MAX_M, GLOBAL_FRAMES, valid_coordinates
 
 # Commands whose fourth parameter (heading) may be NaN. No other parameter may be NaN.
 NAN_HEADINGS = frozenset(
@@ -117,11 +116,9 @@ class Item:
         )
 
 
-def home_item(home: Place) -> Item:
+def home_item(lat_e7: int, lon_e7: int, amsl_m: float) -> Item:
     """Return item 0 of every mission: the home position."""
-    return Item(
-        mavlink.MAV_CMD_NAV_WAYPOINT, frame=mavlink.MAV_FRAME_GLOBAL, x=home.lat_e7, y=home.lon_e7, z=home.alt_m
-    )
+    return Item(mavlink.MAV_CMD_NAV_WAYPOINT, frame=mavlink.MAV_FRAME_GLOBAL, x=lat_e7, y=lon_e7, z=amsl_m)
 
 
 @dataclass(slots=True)

@@ -14,12 +14,15 @@ import grpc
 import grpc.aio
 
 from fractus.environment import Endpoint
-from fractus.errors import NotConfigured, Unavailable, translate
+from fractus.errors import NotConfigured, Unavailable, decision_of, translate
 from fractus.tracing import traced
 
 CALL_TIMEOUT_S = 10.0
 RECONNECT_TIMEOUT_S = 30.0
 """Time for which a call retries while the service restarts. After its start, the service gives a driver 15 s to reconnect."""
+
+SUSPENDED = "Suspended"
+"""Code of a motion that is refused while the drone flies to a target that a geofence corrected, for at most 60 s."""
 
 MAX_RETRY_DELAY_S = 2.0
 """Longest delay between two attempts."""
@@ -227,6 +230,8 @@ class Retries:
     async def pause(self, error: grpc.aio.AioRpcError | None = None) -> None:
         """Wait before the next attempt.
 
+        While a corrected leg suspends the driver, attempts continue until the leg ends, because the service responds.
+
         Args:
             error: Failure of the last attempt; None if the service ended the stream.
 
@@ -235,6 +240,9 @@ class Retries:
         """
         now = asyncio.get_running_loop().time()
         delay = next(self._delays)
+        decision = decision_of(error) if error is not None else None
+        if decision is not None and decision.code == SUSPENDED:
+            self._give_up = None
         self._give_up = self._give_up or now + self._channel.reconnect_timeout_s
         transient = error is None or self._channel.transient(error)
         if not (transient and self._retried) or now + delay > self._give_up:

@@ -238,7 +238,8 @@ def translate(error: Any, method: str, address: str) -> FractusError:
     if code in {grpc.StatusCode.INVALID_ARGUMENT, grpc.StatusCode.NOT_FOUND, grpc.StatusCode.OUT_OF_RANGE}:
         return InvalidRequest(f"{method}: {text}")
     if code in {grpc.StatusCode.UNAVAILABLE, grpc.StatusCode.DEADLINE_EXCEEDED}:
-        return Unavailable(f"{method}: no response from {address} ({text or code.name}){_remedy(text)}")
+        answer = text if decision is not None else f"no response from {address} ({text or code.name}){_remedy(text)}"
+        return Unavailable(f"{method}: {answer}")
     if code is grpc.StatusCode.RESOURCE_EXHAUSTED:
         return Busy(f"{method}: {text or code.name}", _retry_after_s(error))
     return FractusError(f"{method}: {text or code.name}{_remedy(text)}")

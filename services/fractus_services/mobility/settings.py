@@ -137,6 +137,15 @@ class MobilitySettings:
 
     # Methods and motions
 
+    binding_timeout_s: float = 60.0
+    """Longest time for which a leg that a geofence corrected suspends further motions of its driver."""
+
+    suspended_retry_after_s: float = 1.0
+    """Suggested delay before a suspended motion is requested again."""
+
+    suspended_rest_s: float = 0.1
+    """Pause of a driver's calls after a suspended motion, because each of them is written to the audit log."""
+
     min_acceptance_radius_m: float = 0.3
     """Smallest acceptance radius of a goto."""
 

@@ -193,6 +193,15 @@ class ControlStore:
         return motion
 
     @property
+    def suspension(self) -> Verdict | None:
+        """Correction that suspends the driver: the verdict on a leg that must be completed first; None if there is none."""
+        active = self._state.motion
+        motion = self.motion
+        if active is None or motion is None or active.hover_at is not None:
+            return None
+        return motion.binding if self.autopilot.now < motion.binding_until else None
+
+    @property
     def constraints(self) -> FlightConstraints | None:
         """Constraints of the current system flight, or None."""
         flight = self._state.flight

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import itertools
 import logging
+import math
 from collections.abc import Coroutine, Sequence
 from dataclasses import dataclass, field
 from typing import Any, assert_never
@@ -31,7 +32,7 @@ from fractus_core.control.state import SystemTask
 from fractus_core.control.state_update import DRIVER_LOST
 from fractus_core.control.vehicle_events import MOTORS_STOPPED
 from fractus_core.policy.compiled_grant import CompiledGrant
-from fractus_core.policy.decision_types import GotoArgs
+from fractus_core.policy.decision_types import GotoArgs, Verdict
 from fractus_runtime.audit import AuditLog
 
 from fractus_services.background import Background
@@ -110,6 +111,9 @@ class Motion:
         leg: Leg being flown; None if there is none.
         under_way: True if the autopilot acknowledged the leg.
         speed_mps: Speed of the leg.
+        binding: Verdict whose geofences corrected the target; None if no geofence did. Until the target is reached, the
+            driver may only hover, land or return.
+        binding_until: Time at which the driver may request other motions even if the target was not reached.
     """
 
     kind: str
@@ -118,6 +122,8 @@ class Motion:
     leg: GotoArgs | None = None
     under_way: bool = False
     speed_mps: float | None = None
+    binding: Verdict | None = None
+    binding_until: float = -math.inf
     _refusal: Refused | None = None
 
     def stop(self, refusal: Refused) -> None:

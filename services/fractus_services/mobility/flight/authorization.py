@@ -46,6 +46,9 @@ DRIVER_METHODS = frozenset(
 )
 """Methods that only a driver may call."""
 
+SUSPENDED_METHODS = frozenset({"Takeoff", "Goto", "SetVelocity"})
+"""Motions that are refused while the drone flies to a target that a geofence corrected."""
+
 
 class PolicyGate:
     """Judges calls in the current situation.
@@ -234,11 +237,19 @@ class CallAuthorizer:
     def allow_motion(self, call: Call, grant: ActiveGrant, known: Verdict | None = None) -> Verdict:
         """Judge a call that moves the drone, of a driver that has control. Dispatch a takeover that the verdict demands.
 
+        Args:
+            call: Method and arguments.
+            grant: Grant of the caller.
+            known: Last verdict on the same motion; None for a new call. Only new calls can be suspended.
+
         Raises:
-            Refused: A policy forbids the call, or the caller does not have control.
+            Refused: A policy forbids the call, the driver is suspended, or the caller does not have control.
         """
         if grant.spec.class_ != "driver":
             raise denied(self._deny_passenger(call, grant))
+        suspension = self._control.suspension
+        if suspension is not None and known is None and call.method in SUSPENDED_METHODS and self._has_control(grant):
+            raise self._suspend(call, grant, suspension)
         verdict = self._judge(call, grant, known=known)
         if verdict.code == "MethodNotGranted":
             raise denied(verdict)
@@ -255,6 +266,17 @@ class CallAuthorizer:
                 self._control.brake(verdict)
             raise denied(verdict)
         return verdict
+
+    def _suspend(self, call: Call, grant: ActiveGrant, suspension: Verdict) -> Unavailable:
+        """Record the refusal of a motion while a corrected leg is flown, and return it."""
+        reason = (
+            f"the drone first completes its corrected leg ({suspension.reason});"
+            " repeat the call when it has arrived, or call Hover, Land or ReturnToLaunch"
+        )
+        verdict = Verdict("deny", None, "Suspended", reason, suspension.policies)
+        self._gate.record(call, grant.identity, verdict, self._gate.situation())
+        self._free_at[True] = max(self._free_at[True], self._control.autopilot.now + SETTINGS.suspended_rest_s)
+        return Unavailable(verdict.code, reason, verdict=verdict, retry_after_s=SETTINGS.suspended_retry_after_s)
 
     def _judge(self, call: Call, grant: ActiveGrant, *, kind: str = "call", known: Verdict | None = None) -> Verdict:
         has_control = self._has_control(grant)

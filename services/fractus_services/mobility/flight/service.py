@@ -184,12 +184,23 @@ class MobilityService:
         if reached_m > 0:
             radius_m = min(max(reached_m, SETTINGS.min_acceptance_radius_m), SETTINGS.max_acceptance_radius_m)
 
+        binding_until = self._autopilot.now + SETTINGS.binding_timeout_s / self._autopilot.pace
+
+        def bind(motion: Motion, current: Verdict) -> None:
+            """Suspend the driver if the verdict moves the target, which only geofences do."""
+            result = current.args
+            moved = isinstance(result, GotoArgs) and (result.lat, result.lon) != (args.lat, args.lon)
+            motion.binding = current if moved else None
+            motion.binding_until = binding_until
+
         async def steps(motion: Motion) -> AsyncGenerator[Progress, None]:
             permit = self._control.driver_permit(grant, motion)
             call = Call("Goto", args)
             final = verdict
+            bind(motion, final)
             for _ in range(SETTINGS.max_judgements):
                 final = await self._settle(call, grant, final, motion, permit)
+                bind(motion, final)
                 target = final.args if isinstance(final.args, GotoArgs) else args
                 leg = replace(target, speed_mps=target.speed_mps or self._control.cruise_mps)
                 judged = self._rejudging_permit(call, grant, final, permit)

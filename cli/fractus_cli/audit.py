@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 from fractus_runtime.files import read_file
-from fractus_services.recording.messages import parse_time_ns, sentence
+from fractus_services.recording.messages import controller_of, parse_time_ns, sentence
 
 from fractus_cli.audit_logs import Window, entries, find_logs, is_decision, verify_log
 from fractus_cli.output import output_option, printable
@@ -117,7 +117,8 @@ def _line(entry: dict[str, Any]) -> str:
     if entry.get("kind") != "state":
         return f"{entry.get('kind')}: {sentence(entry)}"
     names = ("lat", "lon", "alt", "speed", "mode", "controller", "battery", "in_air")
-    return "state: " + ", ".join(f"{name}={entry[name]}" for name in names if name in entry)
+    shown = entry | {"controller": controller_of(entry)} if "controller" in entry else entry
+    return "state: " + ", ".join(f"{name}={shown[name]}" for name in names if name in shown)
 
 
 @audit.command()

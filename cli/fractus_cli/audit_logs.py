@@ -11,7 +11,7 @@ from typing import Any
 
 import click
 from fractus_runtime.audit_chain import ChainEntry, Finding, logs, read_lines, verify
-from fractus_services.recording.messages import component_of, parse_time_ns
+from fractus_services.recording.messages import component_of, controller_of, parse_time_ns
 
 Entry = dict[str, Any]
 
@@ -139,4 +139,4 @@ def is_decision(entry: Entry) -> bool:
 
 def actor(entry: Entry) -> str:
     """Return the component that an entry concerns, or the controller if it concerns no component."""
-    return component_of(entry) or str(entry.get("controller") or "system")
+    return component_of(entry) or (controller_of(entry) or "system")

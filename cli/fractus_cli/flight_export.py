@@ -15,7 +15,15 @@ from fractus_core.api import Zone
 from fractus_core.geo import cut_path
 from fractus_core.geo.formats.kml import kml_document, zone_placemark
 from fractus_services.recording.map_features import Feature, to_feature
-from fractus_services.recording.messages import audit_records, component_of, finite_number, location, sentence, zones
+from fractus_services.recording.messages import (
+    audit_records,
+    component_of,
+    controller_of,
+    finite_number,
+    location,
+    sentence,
+    zones,
+)
 from fractus_services.recording.segment_writer import McapWriter
 
 from fractus_cli.audit_logs import Entry, actor, is_decision
@@ -220,7 +228,12 @@ def write_csv(export: Export, out: IO[bytes]) -> None:
         policies = entry.get("policies")
         renamed = {"alt_m": entry.get("alt"), "amsl_m": entry.get("amsl"), "speed_mps": entry.get("speed")}
         names = " ".join(map(str, policies)) if isinstance(policies, list) else ""
-        computed = {"component": component_of(entry), "policies": names, "time": _iso(entry["time_ns"])}
+        computed = {
+            "component": component_of(entry),
+            "controller": controller_of(entry),
+            "policies": names,
+            "time": _iso(entry["time_ns"]),
+        }
         writer.writerow({key: value for key, value in (entry | renamed | computed).items() if _is_scalar(value)})
     text.detach()
 

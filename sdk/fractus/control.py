@@ -76,7 +76,7 @@ class Control:
         self._interrupted = False
         self._cancellations = 0
         self.control_point = 0
-        """Index of the control point, from 0."""
+        """Index of the control point, from 0. Log lines number control points from 1."""
         self.task = ControlPoint("")
         """Path or region of the control point, as declared by the application. Valid after control was granted."""
         self.waypoints_reached = 0

@@ -103,10 +103,17 @@ class Wind:
 
 @dataclass(frozen=True, slots=True)
 class StatusText:
-    """A text message of the autopilot (STATUSTEXT)."""
+    """A text message of the autopilot (STATUSTEXT).
+
+    Attributes:
+        severity: Severity.
+        text: The text.
+        time: Time at which the service received the text, UTC.
+    """
 
     severity: Severity
     text: str
+    time: datetime
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,8 +195,14 @@ class Telemetry:
             health=Health(message.ready, message.not_ready_reason, message.autopilot_connected),
             wind=Wind(message.wind.from_deg, message.wind.speed_mps) if message.HasField("wind") else None,
             gimbal=Attitude.from_proto(message.gimbal) if message.HasField("gimbal") else None,
-            texts=tuple(StatusText(Severity(min(t.severity, Severity.DEBUG)), t.text) for t in message.texts),
+            texts=tuple(_status_text(text, message) for text in message.texts),
         )
+
+
+def _status_text(text: mobility_pb2.StatusText, message: mobility_pb2.Telemetry) -> StatusText:
+    # Services of earlier releases send texts without a time.
+    time = text.time if text.HasField("time") else message.time
+    return StatusText(Severity(min(text.severity, Severity.DEBUG)), text.text, time.ToDatetime(tzinfo=UTC))
 
 
 def _gps(message: mobility_pb2.Telemetry, error_m: float | None) -> Gps | None:
@@ -203,7 +216,7 @@ def _gps(message: mobility_pb2.Telemetry, error_m: float | None) -> Gps | None:
 class Watch:
     """Changes of one part of the drone's state: `async for gps in drone.watch.gps()`.
 
-    Each iteration starts with the current value and continues after a restart of the service. The component needs the
+    Each iteration but `status_texts` starts with the current value, and continues after a restart of the service. The component needs the
     method GetPosition.
     """
 
@@ -235,11 +248,18 @@ class Watch:
         return self._changes(interval_s, lambda sample: sample.wind)
 
     async def status_texts(self, interval_s: float = 0.5) -> AsyncGenerator[StatusText, None]:
-        """Yield texts of the autopilot, starting with recent ones."""
+        """Yield the texts that the autopilot sends from now on.
+
+        The first sample of `Mobility.telemetry` contains earlier texts.
+        """
+        last: datetime | None = None
         async with aclosing(self._telemetry(interval_s)) as samples:
             async for sample in samples:
                 for text in sample.texts:
-                    yield text
+                    # The stream repeats recent texts after a restart of the service. If the clock was set back, times say nothing.
+                    if last is not None and (text.time > last or sample.time < last):
+                        yield text
+                last = sample.time
 
     async def _changes(self, interval_s: float, of: Callable[[Telemetry], T | None]) -> AsyncGenerator[T, None]:
         last: T | None = None

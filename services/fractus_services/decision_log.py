@@ -6,6 +6,8 @@ import logging
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+from fractus_core.api.names import component_name
+
 log = logging.getLogger(__name__)
 
 
@@ -21,7 +23,7 @@ def log_decision(entry: Mapping[str, Any]) -> None:
             log.log(
                 logging.WARNING if kind == "takeover" else logging.INFO,
                 "control: %s (kind=%s controller=%s code=%s policies=%s reason=%s)",
-                entry["action"], kind, entry["controller"], entry["code"] or "-", _join(entry["policies"]),
+                entry["action"], kind, component_name(entry["controller"]), entry["code"] or "-", _join(entry["policies"]),
                 entry["reason"] or "-",
             )  # fmt: skip
 

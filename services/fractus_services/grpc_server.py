@@ -12,6 +12,7 @@ from contextlib import AbstractContextManager, asynccontextmanager, nullcontext
 from typing import Any
 
 import grpc
+from fractus_core.api.names import component_name
 from fractus_core.policy.decision_types import Verdict
 from fractus_runtime import tracing
 from google.protobuf.message import DecodeError
@@ -252,7 +253,7 @@ class CallAdmission(grpc.aio.ServerInterceptor):  # type: ignore[misc]  # grpc h
                 caller.identity,
                 extra={"limit_by": caller.identity},
             )
-            raise PolicyDenied("NoGrant", f"{caller.identity} has no Grant on this node")
+            raise PolicyDenied("NoGrant", f"{component_name(caller.identity)} has no Grant on this node")
         if grant.spec.class_ != "driver":
             self._on_passenger(grant)
         return grant

@@ -15,6 +15,7 @@ import grpc.aio
 from fractus.channel import ServiceChannel
 from fractus.drone import Mobility
 from fractus.environment import Endpoint
+from fractus_core.api.names import component_name
 from fractus_services.error_details import abort
 from fractus_services.errors import PolicyDenied, Refused
 from fractus_services.grant_files import ActiveGrant
@@ -42,7 +43,7 @@ class Admission:
     def grant_of(self, caller: Any) -> ActiveGrant:
         grant = self._world.grants.active.get(caller.identity)
         if grant is None:
-            raise PolicyDenied("NoGrant", f"{caller.identity} has no Grant on this node")
+            raise PolicyDenied("NoGrant", f"{component_name(caller.identity)} has no Grant on this node")
         return grant
 
 

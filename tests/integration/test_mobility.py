@@ -13,7 +13,7 @@ import pytest
 from fractus_agent.registration.node_object_file import NodeObjectFile
 from fractus_cluster.ports import free_port
 from fractus_core.api.model import API_VERSION
-from fractus_core.api.names import node_identity
+from fractus_core.api.names import component_name, node_identity
 from fractus_core.api.nodes import Drone
 from fractus_proto.v1 import mobility_pb2 as pb
 from fractus_proto.v1 import types_pb2
@@ -136,7 +136,7 @@ def _check_log(rig: Rig) -> None:
     changed = [call for call in rig.entries("call") if call["action"] != "allow"]
     assert [f"action={c['action']} caller={c['caller']} method={c['method']} code={c['code']} " in line
             for c, line in zip(changed, lines, strict=True)] == [True] * len(changed), lines  # fmt: skip
-    assert f"control: granted (kind=control controller={DRIVER} " in log
+    assert f"control: granted (kind=control controller={component_name(DRIVER)} " in log
 
 
 async def _first_event(driver: Driver) -> None:

@@ -122,9 +122,10 @@ async def test_sdk_watch_streams_report_vehicle_state(rig: Rig) -> None:
         assert abs((await anext(drone.watch.attitude())).roll_deg) < 5
         assert (await anext(drone.watch.wind())).speed_mps < 30
         async with drone.control():
+            text = asyncio.create_task(anext(drone.watch.status_texts()))
             await drone.arm()
-            assert (await anext(drone.watch.status_texts())).text
             await drone.disarm()
+            assert (await text).text
 
 
 async def _until(items: AsyncIterator[T], over: Callable[[T], bool]) -> AsyncIterator[T]:

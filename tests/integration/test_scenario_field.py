@@ -73,7 +73,7 @@ def test_scenario_field_violating_program_is_corrected_and_owner_settings_surviv
         upload_lists(guest, HOME)
         owner = read_settings(guest)
         killed = scenario(link, tmp_path, "--run", "guarded")
-        until_printed(killed, "granted: control point 0")
+        until_printed(killed, "granted: control point 1")
         time.sleep(3)
         end_program(tmp_path, "navigator")
         until_printed(killed, "waiting until the service has restored")

@@ -18,6 +18,7 @@ import pytest
 import shapely.geometry
 from click.testing import CliRunner, Result
 from fractus_cli.audit import audit
+from fractus_core.api.names import component_identity
 from fractus_runtime.audit import AuditLog
 from mcap.reader import make_reader
 
@@ -29,13 +30,14 @@ MONITOR = {
     "kind": "monitor", "time": demo_flight.stamp(demo_flight.TAKEOFF_S + 20), "action": "correct", "code": "SpeedAboveLimit",
     "reason": "<too> fast & low", "policies": ["town-speed"], "mode": "GUIDED",
 }  # fmt: skip
+DRIVER = component_identity("default", "patrol", "Navigator", "patrol-navigator")
 ZONES = demo_flight.EXAMPLE / "zones.yaml"
 
 
 @pytest.fixture(scope="module")
 def entries() -> list[dict[str, Any]]:
     started = {"kind": "started", "time": demo_flight.stamp(demo_flight.APPLIED_S), "node": "drone-1"}
-    states = [state | {"amsl": state["alt"] + 100.0} for state in demo_flight.states()]
+    states = [state | {"amsl": state["alt"] + 100.0, "controller": DRIVER} for state in demo_flight.states()]
     return sorted([started, *demo_flight.calls(), *states, TAKEOVER, MONITOR], key=lambda entry: str(entry["time"]))
 
 
@@ -142,6 +144,7 @@ def test_csv_has_every_entry_with_its_hash(log: Path, entries: list[dict[str, An
     denied = next(row for row in rows if row["code"] == "MethodDenied")
     assert (denied["component"], denied["method"]) == ("AerialViewer", "CaptureImage")
     assert sum(row["kind"] == "state" for row in rows) == sum(entry["kind"] == "state" for entry in entries)
+    assert {row["controller"] for row in rows} == {"", "Navigator", "system"}
 
 
 def test_mcap_has_locations_states_decisions_logs_and_zones(
@@ -231,7 +234,10 @@ def test_show_prints_decisions(log: Path) -> None:
         "mobility  call: Navigator SetSpeed correct: SpeedAboveLimit, speed 12.0 m/s is above the limit of policy town-speed;"
         " corrected to 9.5 m/s (limit 10.0 less 0.5 for overshoot)"
     )
-    assert len(run("show", log, "--all").stdout.splitlines()) == len(log.read_text().splitlines())
+    everything = run("show", log, "--all").stdout
+    assert len(everything.splitlines()) == len(log.read_text().splitlines())
+    assert "controller=Navigator" in everything
+    assert "spiffe:" not in everything
     after = demo_flight.stamp(demo_flight.TAKEOFF_S + 60)
     (*_, last) = (json.loads(line) for line in run("show", log, "-o", "json", "--after", after).stdout.splitlines())
     assert (last["kind"], last["log"]) == ("control", "mobility")

@@ -61,6 +61,12 @@ def test_control_is_granted_and_returned() -> None:
     assert actions == (RefuseStream(2, "MissionComplete", reason),)
 
 
+def test_control_points_of_audit_entries_are_numbered_from_1() -> None:
+    state, _ = apply_events(*FLY, events.ControlReturned("a", 2))
+    _, actions = apply_events(*REQUEST_CONTROL[1:], state=state)
+    assert [action.reason for action in actions if isinstance(action, RecordAudit)] == ["control point 2"]
+
+
 @pytest.mark.parametrize(
     ("done", "kind"),
     [

@@ -7,6 +7,7 @@ import logging
 from typing import Any
 
 import pytest
+from fractus_core.api.names import component_identity
 from fractus_runtime.logs import BURST, CallerLogLimit, JsonFormatter
 from fractus_services.decision_log import log_decision
 
@@ -41,8 +42,9 @@ def lines(caplog: pytest.LogCaptureFixture, *entries: dict[str, Any]) -> list[st
      "INFO policy: filters required (action=correct caller=spiffe://fractus.dev/a method=CaptureImage filters=blurFaces,black "
      "policies=campus,fence reason=policy campus forbids 100% of it)"),
     (CHANGE, "WARNING control: return (kind=takeover controller=system code=- policies=- reason=-)"),
-    (CHANGE | {"kind": "control", "action": "granted", "controller": "a", "reason": "control point 0", "policies": ["p"]},
-     "INFO control: granted (kind=control controller=a code=- policies=p reason=control point 0)"),
+    (CHANGE | {"kind": "control", "action": "granted",
+               "controller": component_identity("default", "patrol", "a", "patrol-a"), "reason": "control point 1", "policies": ["p"]},
+     "INFO control: granted (kind=control controller=a code=- policies=p reason=control point 1)"),
 ])  # fmt: skip
 def test_decision_log_line_has_verdict_caller_and_reason(
     caplog: pytest.LogCaptureFixture, entry: dict[str, Any], line: str

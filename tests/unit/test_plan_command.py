@@ -170,7 +170,7 @@ def test_node_objects_determine_resources_and_readiness(run):
     result = run([*SCENE, TRAFFIC, flying])
     assert "infeasible (NoCloudNode)" in result.output
     result = run([*SCENE, TRAFFIC, cloud, flying | {"spec": {"unschedulable": True}}])
-    assert "d1 is cordoned" in result.output
+    assert "d1: its Kubernetes Node is cordoned" in result.output
 
 
 def test_bookings_of_one_application_reduce_capacity_for_the_next_application(run):

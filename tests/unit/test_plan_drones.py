@@ -98,7 +98,7 @@ def test_partial_control_from_depot_uses_its_drones_and_nearby_drones():
     result = plan(app, inventory(fleet))
     assert {result.drone.node, *(a.node for a in result.drone.alternatives)} == {"away", "near"}
     assert reasons(result) == {("Navigator", "far"): "TooFar"}
-    with pytest.raises(Infeasible, match="near is 1900 m from the start, more than 1000 m"):
+    with pytest.raises(Infeasible, match="near: it is 1900 m from the start, more than 1000 m"):
         plan(app, inventory(fleet[1:]), Settings(depot_radius_m=1000))
     assert reasons(plan(application(navigator(PATH)), inventory(fleet)))["Navigator", "near"] == "OtherDepot"
 

@@ -202,5 +202,5 @@ def test_infeasible_location_error_names_locations_that_need_its_nodes():
     with pytest.raises(Infeasible) as caught:
         plan(application(component_at("S", only, only)), inventory(edges=[edge("a", (0, 0))]))
     assert caught.value.message == (
-        "no node can host S at locations[1]: a hosts S for locations[0], which has no other node"
+        "no node can host S at locations[1]: a: it hosts S for locations[0], which has no other node"
     )

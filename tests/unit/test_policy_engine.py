@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, get_args
 
 import pytest
+from fractus_core.api.methods import Method
 from fractus_core.policy.decision_types import (
     Call,
     CaptureArgs,
@@ -147,6 +148,13 @@ def test_goto_with_invalid_arguments_is_denied(args: GotoArgs | None) -> None:
 )  # fmt: skip
 def test_calls_with_invalid_arguments_are_denied(call: Call) -> None:
     assert ask(compiled(), call).code == "InvalidArgument"
+
+
+@pytest.mark.parametrize(
+    "method", [method for method in get_args(Method) if method not in {"GetControl", "ReturnControl"}]
+)
+def test_reason_of_a_call_without_arguments_does_not_repeat_the_method(method: Method) -> None:
+    assert not ask(compiled(), Call(method), at(0, 0)).reason.startswith(method)
 
 
 def test_motion_is_denied_when_position_is_unknown() -> None:

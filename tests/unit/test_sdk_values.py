@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncGenerator
+from collections.abc import AsyncGenerator, Callable
 
 from fractus import Fix, Telemetry, Watch
 from fractus_cli.telemetry import _line
@@ -19,24 +19,61 @@ def test_telemetry_position_is_none_if_unknown() -> None:
     assert (known.position_error_m, known.autopilot_connected) == (1.5, True)
 
 
-async def test_watch_yields_changes_once_and_all_texts() -> None:
-    def sample(satellites: int, *texts: str) -> Telemetry:
+async def test_watch_yields_changes_once() -> None:
+    def sample(satellites: int) -> Telemetry:
         message = mobility_pb2.Telemetry(not_ready_reason="it has no home yet")
         message.gps.fix_type = 3
         message.gps.satellites = satellites
-        for text in texts:
-            message.texts.add(severity=2, text=text)
         return Telemetry.from_proto(message)
 
-    async def telemetry(_interval_s: float) -> AsyncGenerator[Telemetry, None]:
-        for one in (sample(7, "PreArm: a", "PreArm: b"), sample(7), sample(9, "PreArm: b")):
-            yield one
-
-    watch = Watch(telemetry)
+    watch = Watch(stream(sample(7), sample(7), sample(9)))
     assert [gps.satellites async for gps in watch.gps()] == [7, 9]
-    assert [text.text async for text in watch.status_texts()] == ["PreArm: a", "PreArm: b", "PreArm: b"]
     assert [(health.ready, health.problem) async for health in watch.health()] == [(False, "it has no home yet")]
     assert [wind async for wind in watch.wind()] == []
+
+
+def stream(*samples: Telemetry) -> Callable[[float], AsyncGenerator[Telemetry, None]]:
+    async def telemetry(_interval_s: float) -> AsyncGenerator[Telemetry, None]:
+        for one in samples:
+            yield one
+
+    return telemetry
+
+
+def text_sample(time_s: int, **texts: int) -> Telemetry:
+    """Return a sample with texts and their times in seconds. A text with the time -1 has none."""
+    message = mobility_pb2.Telemetry()
+    message.time.FromSeconds(time_s)
+    for text, received_s in texts.items():
+        sent = message.texts.add(severity=2, text=text)
+        if received_s >= 0:
+            sent.time.FromSeconds(received_s)
+    return Telemetry.from_proto(message)
+
+
+async def status_texts(*samples: Telemetry) -> list[tuple[str, float]]:
+    return [(text.text, text.time.timestamp()) async for text in Watch(stream(*samples)).status_texts()]
+
+
+async def test_status_texts_start_at_the_subscription_and_have_times() -> None:
+    samples = text_sample(100, early=40, earlier=99), text_sample(110, later=104), text_sample(120, last=120)
+    assert await status_texts(*samples) == [("later", 104.0), ("last", 120.0)]
+
+
+async def test_status_texts_are_not_repeated_when_the_stream_is_opened_again() -> None:
+    reopened = text_sample(120, early=40, seen=104, missed=115)
+    assert await status_texts(text_sample(100, early=40), text_sample(110, seen=104), reopened) == [
+        ("seen", 104.0),
+        ("missed", 115.0),
+    ]
+
+
+async def test_status_texts_are_not_lost_when_the_clock_is_set_back() -> None:
+    assert await status_texts(text_sample(1000), text_sample(20, after=19)) == [("after", 19.0)]
+
+
+async def test_status_texts_of_a_service_without_times_have_the_time_of_the_sample() -> None:
+    assert await status_texts(text_sample(100, early=-1), text_sample(110, later=-1)) == [("later", 110.0)]
 
 
 def test_unknown_gps_fix_type_counts_as_3d_fix() -> None:

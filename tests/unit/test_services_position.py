@@ -186,5 +186,6 @@ def test_telemetry_reports_satellites_wind_and_new_statustexts() -> None:
     assert (full.gps.fix_type, full.gps.satellites) == (4, 12)
     assert (full.wind.from_deg, full.wind.speed_mps) == (90.0, 5.0)
     assert [(text.number, text.text) for text in full.texts] == [(1, "PreArm: a"), (2, "PreArm: b")]
+    assert [text.time.ToNanoseconds() for text in full.texts] == [-1e9, -1e9]
     assert [text.text for text in telemetry(vehicle, 11.0, last_text=1).texts] == ["PreArm: b"]
     assert not telemetry(vehicle, 21.0).HasField("wind")

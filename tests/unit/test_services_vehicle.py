@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 from fractus_runtime.mavlink_codec import Message, message
+from fractus_services.mobility.autopilot import StatusText
 from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
 from fractus_services.mobility.mavlink.vehicle import Vehicle
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -148,7 +149,7 @@ def test_vehicle_reports_satellites_wind_and_statustexts() -> None:
     for number in range(60):
         vehicle.take(message("STATUSTEXT", severity=4, text=f"text {number}".encode()), 5.0)
     assert len(vehicle.status_texts) == 50
-    assert vehicle.status_texts[-1] == (60, 4, "text 59")
+    assert vehicle.status_texts[-1] == StatusText(60, 5.0, 4, "text 59")
 
 
 @pytest.mark.parametrize(("flags", "path_lost"), [(POSITIONED, False), (BOOTED, True)])

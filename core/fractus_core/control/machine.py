@@ -265,7 +265,7 @@ def _grant_control(update: StateUpdate, lease_id: int) -> None:
     update.stop_task()
     update.set(grace=None, authority=Authority.DRIVER, lease=replace(lease, granted=True), unattended=0)
     update.adopt(mission)
-    update.audit("control", "granted", lease.identity, f"control point {mission.points_done}")
+    update.audit("control", "granted", lease.identity, f"control point {mission.points_done + 1}")
     granted = ControlEvent(StreamState.GRANTED, mission.points_done, "", mission.waypoints)
     update.act(SendEvent(lease_id, granted))
 

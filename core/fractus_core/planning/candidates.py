@@ -68,7 +68,10 @@ def requests(component: Component) -> dict[str, float]:
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """Result of checking a node: suitable, or the first failed requirement."""
+    """Result of checking a node: suitable, or the first failed requirement.
+
+    The message calls the node "it", because it is printed after the name of the node.
+    """
 
     reason: str = ""
     message: str = ""
@@ -93,13 +96,13 @@ def check_host(hosts: Mapping[str, Host], node: str, settings: Settings, *, kept
     """
     host = hosts.get(node)
     if host is None:
-        return Check("NodeMissing", f"no Kubernetes Node is called {node}")
+        return Check("NodeMissing", "no Kubernetes Node has its name")
     if node in settings.excluded:
         return Check("Excluded", settings.excluded[node])
     if not host.ready and not kept:
-        return Check("NodeNotReady", f"the Kubernetes Node {node} is not Ready")
+        return Check("NodeNotReady", "its Kubernetes Node is not Ready")
     if not host.schedulable:
-        return Check("NodeUnschedulable", f"the Kubernetes Node {node} is cordoned")
+        return Check("NodeUnschedulable", "its Kubernetes Node is cordoned")
     return SUITABLE
 
 

@@ -145,11 +145,11 @@ def _legal_first(
         return tried[0]
     for candidate, _, conflict in tried:
         if conflict is not None:
-            builder.reject(leader, candidate.drone.name, Check("PolicyConflict", f"{candidate.drone.name}: {conflict}"))
+            builder.reject(leader, candidate.drone.name, Check("PolicyConflict", conflict))
     if legal:
         return tried[-1]
     for candidate in ranked[len(tried) :]:
-        message = f"{candidate.drone.name} was not checked because policies do not allow the routes of {len(tried)} other drones"
+        message = f"it was not checked because policies do not allow the routes of {len(tried)} other drones"
         builder.reject(leader, candidate.drone.name, Check("NotJudged", message))
     raise builder.infeasible(leader, "PolicyConflict", f"no drone may fly {leader.name}", "")
 
@@ -182,10 +182,10 @@ def _parked_in_range(builder: PlanBuilder, area: OperationArea, leader: Componen
             relation = "is"
             if reason == "OtherDepot":
                 relation = f"is kept in {builder.inventory.drones[name].spec.depot or 'no depot'},"
-            message = f"{name} {relation} {distance:.0f} m from the start, {requirement}"
+            message = f"it {relation} {distance:.0f} m from the start, {requirement}"
             builder.reject(leader, name, Check(reason, message), far=True)
     for name in sorted(located.homeless - kept - set(flying))[: settings.near_misses]:
-        message = f"{name} has neither a depot that exists nor a home; set spec.depot or spec.home"
+        message = "it has neither a depot that exists nor a home; set spec.depot or spec.home"
         builder.reject(leader, name, Check("NoHome", message))
     return sorted(in_range)
 
@@ -213,7 +213,7 @@ def _flying_past(builder: PlanBuilder, leader: Component) -> list[str]:
             listed += 1
             holder = "/".join(flight.holder)
             order = " in this order" if poi.ordered else ""
-            message = f"{name} flies for {holder}, which does not visit pointsOfInterest.points[{missed}]{order}"
+            message = f"it flies for {holder}, which does not visit pointsOfInterest.points[{missed}]{order}"
             builder.reject(leader, name, Check("PathMissesPoint", message), far=True)
     return visiting
 
@@ -259,7 +259,7 @@ def _check_permanent(
         # Components may not request the service: without a driver, the system flies the drone.
         return SUITABLE if kept else Check("ServiceMissing", "it has no mobility service, which every flight requires")
     if mission.top_m > mobility.max_altitude:
-        message = f"{drone.name} climbs to {mobility.max_altitude:g} m; the path goes up to {mission.top_m:g} m"
+        message = f"it climbs to {mobility.max_altitude:g} m; the path goes up to {mission.top_m:g} m"
         return Check("TooHigh", message)
     full = (1 - builder.settings.battery_reserve) * mobility.max_flight_time
     if not kept and mission.needed_min > full:
@@ -279,7 +279,7 @@ def _check_temporary(
     if owner is not None and owner != builder.application.key and not used:
         leader = builder.spec.driver or components[0]
         note = builder.range_message(leader, drone.name)
-        return Check("Claimed", f"{owner[0]}/{owner[1]} uses {drone.name}" + (f", and {note}" if note else ""))
+        return Check("Claimed", f"{owner[0]}/{owner[1]} uses it" + (f", and {note}" if note else ""))
     host = check_host(builder.inventory.hosts, drone.name, builder.settings, kept=kept)
     if kept:
         return host
@@ -294,7 +294,7 @@ def _check_temporary(
 def _too_long(drone: Drone, mission: Estimate, available_min: float, when: str) -> Check:
     return Check(
         "FlightTooLong",
-        f"{drone.name} can fly {max(available_min, 0):.1f} min with its reserve kept, {when};"
+        f"it can fly {max(available_min, 0):.1f} min with its reserve kept, {when};"
         f" the mission takes {mission.needed_min:.1f} min for {mission.distance_m:.0f} m",
     )
 
@@ -311,7 +311,7 @@ def _mission(estimate: Estimate, route: MissionRoute | None) -> PlannedMission:
 def _check_state(drone: Drone) -> Check:
     ready = readiness(drone.status)
     if ready is None:
-        return Check("DroneUnknown", f"{drone.name} has not reported yet")
+        return Check("DroneUnknown", "it has not reported yet")
     if ready.status != "True":
-        return Check("DroneNotReady", ready.message or f"{drone.name} is not Ready ({ready.reason})")
+        return Check("DroneNotReady", ready.message or f"it is not Ready ({ready.reason})")
     return SUITABLE

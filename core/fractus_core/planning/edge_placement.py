@@ -58,7 +58,7 @@ def find_static(builder: PlanBuilder, component: Component) -> list[Location]:
             spot.center, builder.settings.near_misses, spot.radius, builder.settings.near_miss_m
         ):
             if name not in inside and name in known:
-                message = f"{name} is {distance:.0f} m from the centre of locations[{i}], more than {spot.radius:.0f} m"
+                message = f"it is {distance:.0f} m from the centre of locations[{i}], more than {spot.radius:.0f} m"
                 builder.reject(component, name, Check("OutsideLocation", message), far=True)
     return matches
 
@@ -198,7 +198,7 @@ def _no_node(builder: PlanBuilder, starved: Location, locations: Iterable[Locati
     for other in locations:
         for name in other.hosts:
             if other.component is component and name in starved.nodes:
-                message = f"{name} hosts {component.name} for locations[{other.index}], which has no other node"
+                message = f"it hosts {component.name} for locations[{other.index}], which has no other node"
                 builder.reject(component, name, Check("NeededElsewhere", message))
     surroundings = f"{spot.radius:.0f} m of {spot.center.lat:.6f}, {spot.center.lon:.6f}"
     problem = f"no node can host {component.name} at locations[{starved.index}]"
@@ -275,10 +275,10 @@ def _in_direct_range(builder: PlanBuilder, component: Component, origin: EdgeNod
             continue
         reach = direct_reach_m(origin.spec.interfaces, builder.inventory.edge_nodes[name].spec.interfaces)
         if reach is None:
-            message = f"{name} has no interface that pairs with {origin.name}'s"
+            message = f"it has no interface that pairs with {origin.name}'s"
             builder.reject(component, name, Check("NoDirectInterface", message))
         elif distance > reach:
-            message = f"{name} is {distance:.0f} m from {origin.name}, beyond their direct reach of {reach:.0f} m"
+            message = f"it is {distance:.0f} m from {origin.name}, beyond their direct reach of {reach:.0f} m"
             builder.reject(component, name, Check("OutOfReach", message))
         else:
             matches.append(name)
@@ -322,7 +322,7 @@ def find_along(builder: PlanBuilder, component: Component, drone: Drone, area: O
         node = builder.inventory.edge_nodes.get(name)
         reach = reaches.to(node.spec.interfaces) if node is not None else None
         if node is not None and reach is None:
-            message = f"{name} has no interface that pairs with {drone.name}'s"
+            message = f"it has no interface that pairs with {drone.name}'s"
             builder.reject(component, name, Check("NoDirectInterface", message))
         elif reach is not None:
             matches.append(i)
@@ -372,7 +372,7 @@ def _reject_without_coverage(builder: PlanBuilder, component: Component, scene: 
     for i in np.flatnonzero(~useful).tolist():
         name = scene.names[i]
         if name not in hosts.nodes:
-            message = f"{name} reaches {scene.reach_m[i]:.0f} m and covers nothing of the operation area"
+            message = f"it reaches {scene.reach_m[i]:.0f} m and covers nothing of the operation area"
             builder.reject(component, name, Check("NoCoverage", message))
 
 
@@ -391,9 +391,9 @@ def _reject_out_of_range(
         if node is None or name in near:
             continue
         reach = reaches.to(node.spec.interfaces)
-        check = Check("NoDirectInterface", f"{name} has no interface that pairs with {drone.name}'s")
+        check = Check("NoDirectInterface", f"it has no interface that pairs with {drone.name}'s")
         if reach is not None:
-            check = Check("NoCoverage", f"{name} reaches {reach:.0f} m and covers nothing of the operation area")
+            check = Check("NoCoverage", f"it reaches {reach:.0f} m and covers nothing of the operation area")
         builder.reject(component, name, check, far=True)
 
 

@@ -140,7 +140,7 @@ class PlanBuilder:
             fallback: Explanation if no node was rejected.
         """
         rejected = self.rejections(component)
-        explanation = "; ".join(r.message for r in rejected[:5]) or fallback
+        explanation = "; ".join(f"{r.node}: {r.message}" for r in rejected[:5]) or fallback
         more = f"; and {len(rejected) - 5} more" if len(rejected) > 5 else ""
         omitted = self._unlisted(component.name, {r.node for r in rejected})
         return Infeasible(component.name, reason, f"{problem}: {explanation}{more}", rejected, omitted)
@@ -206,7 +206,7 @@ def _check_state(node: EdgeNode) -> Check:
     """Check that an edge node is Ready. A node whose agent has not reported is accepted."""
     ready = readiness(node.status)
     if ready is not None and ready.status != "True":
-        return Check("EdgeNodeNotReady", ready.message or f"{node.name} is not Ready ({ready.reason})")
+        return Check("EdgeNodeNotReady", ready.message or f"it is not Ready ({ready.reason})")
     return SUITABLE
 
 

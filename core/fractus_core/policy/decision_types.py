@@ -389,6 +389,8 @@ def deny(code: str, reason: str, policies: tuple[str, ...] = ()) -> Verdict:
     return Verdict("deny", None, code, reason, policies)
 
 
+# Reasons do not name the method: clients print it before the reason.
+DENY_NO_ARGUMENTS = deny("InvalidArgument", "the arguments are missing")
 DENY_POSITION_UNKNOWN = deny(
     "PositionUnknown",
     "the drone's position is unknown: there is no recent fix, the delay of the autopilot link is not measured yet, or"

@@ -13,6 +13,7 @@ from dataclasses import replace
 import shapely
 
 from fractus_core.api.methods import CONTROL_METHODS, Method
+from fractus_core.api.names import component_name
 from fractus_core.exhaustive import exhaustive
 from fractus_core.policy.compiled_grant import (
     OPERATION_AREA,
@@ -23,6 +24,7 @@ from fractus_core.policy.compiled_grant import (
     band_surely_contains,
 )
 from fractus_core.policy.decision_types import (
+    DENY_NO_ARGUMENTS,
     Call,
     CaptureArgs,
     GotoArgs,
@@ -80,7 +82,7 @@ def _judge_once(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
     """Judge a call without judging its correction again."""
     expected = _ARGUMENT_TYPES.get(call.method)
     if expected is not None and not isinstance(call.args, expected):
-        return deny("InvalidArgument", f"{call.method} needs its arguments")
+        return DENY_NO_ARGUMENTS
     for field, name, lower, upper, unit in _ARGUMENT_BOUNDS.get(type(call.args), ()):
         value = getattr(call.args, field)
         if value is not None and not (math.isfinite(value) and lower <= value <= upper):
@@ -117,7 +119,7 @@ def judge_access(call: Call, now: Situation, grant: CompiledGrant) -> Verdict | 
     if method not in grant.methods:
         return deny(
             "MethodNotGranted",
-            f"the grant of {grant.identity} does not include {method}; add it to the component's services",
+            f"the Grant of {component_name(grant.identity)} does not include {method}; add it to the component's services",
         )
     denied = judge_denials(method, now, grant)
     if denied is not None:

@@ -8,7 +8,16 @@ from dataclasses import dataclass, replace
 import shapely
 
 from fractus_core.policy.compiled_grant import AirVolume, CompiledGrant, altitude_above_home_m
-from fractus_core.policy.decision_types import DENY_POSITION_UNKNOWN, Call, GotoArgs, Situation, Verdict, deny, distinct
+from fractus_core.policy.decision_types import (
+    DENY_NO_ARGUMENTS,
+    DENY_POSITION_UNKNOWN,
+    Call,
+    GotoArgs,
+    Situation,
+    Verdict,
+    deny,
+    distinct,
+)
 from fractus_core.policy.geofences import BISECTION_STEPS, Breach, breach_verdict, check_straight_return, find_breaches
 from fractus_core.policy.kinematics import (
     XY,
@@ -52,7 +61,7 @@ def judge_goto(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
     args = call.args
     position = grant.locate(now)
     if not isinstance(args, GotoArgs):
-        return deny("InvalidArgument", "Goto needs its arguments")
+        return DENY_NO_ARGUMENTS
     if position is None:
         return DENY_POSITION_UNKNOWN
     target = grant.frame.xy(args.lat, args.lon)

@@ -6,6 +6,7 @@ import shapely
 
 from fractus_core.policy.compiled_grant import AirVolume, CompiledGrant
 from fractus_core.policy.decision_types import (
+    DENY_NO_ARGUMENTS,
     DENY_POSITION_UNKNOWN,
     Call,
     Situation,
@@ -25,7 +26,7 @@ def judge_takeoff(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
     args = call.args
     position = grant.locate(now)
     if position is None or not isinstance(args, TakeoffArgs):
-        return DENY_POSITION_UNKNOWN if position is None else deny("InvalidArgument", "Takeoff needs its arguments")
+        return DENY_POSITION_UNKNOWN if position is None else DENY_NO_ARGUMENTS
     lower, upper = sorted((now.altitude_m, args.altitude_m))
     air = AirVolume(shapely.points(position), now.margin_m, lower, upper)
     bounds, unknown = altitude_bounds(grant, now, air, now.height_margin_m)

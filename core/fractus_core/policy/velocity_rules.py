@@ -9,6 +9,7 @@ import shapely
 
 from fractus_core.policy.compiled_grant import AirVolume, CompiledGrant
 from fractus_core.policy.decision_types import (
+    DENY_NO_ARGUMENTS,
     DENY_POSITION_UNKNOWN,
     Call,
     SetSpeedArgs,
@@ -54,7 +55,7 @@ def judge_speed(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
     args = call.args
     position = grant.locate(now)
     if not isinstance(args, SetSpeedArgs):
-        return deny("InvalidArgument", "SetSpeed needs its arguments")
+        return DENY_NO_ARGUMENTS
     if position is None:
         return DENY_POSITION_UNKNOWN
     air = AirVolume(shapely.points(position), now.margin_m, now.altitude_m, now.altitude_m)
@@ -102,7 +103,7 @@ def judge_velocity(call: Call, now: Situation, grant: CompiledGrant) -> Verdict:
     args = call.args
     position = grant.locate(now)
     if not isinstance(args, VelocityArgs):
-        return deny("InvalidArgument", "SetVelocity needs its arguments")
+        return DENY_NO_ARGUMENTS
     if position is None:
         return DENY_POSITION_UNKNOWN
     setpoint = _Setpoint(args, now, grant, position)

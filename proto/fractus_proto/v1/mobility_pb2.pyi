@@ -320,14 +320,16 @@ class Wind(_message.Message):
     def __init__(self, from_deg: _Optional[float] = ..., speed_mps: _Optional[float] = ...) -> None: ...
 
 class StatusText(_message.Message):
-    __slots__ = ("number", "severity", "text")
+    __slots__ = ("number", "severity", "text", "time")
     NUMBER_FIELD_NUMBER: _ClassVar[int]
     SEVERITY_FIELD_NUMBER: _ClassVar[int]
     TEXT_FIELD_NUMBER: _ClassVar[int]
+    TIME_FIELD_NUMBER: _ClassVar[int]
     number: int
     severity: int
     text: str
-    def __init__(self, number: _Optional[int] = ..., severity: _Optional[int] = ..., text: _Optional[str] = ...) -> None: ...
+    time: _timestamp_pb2.Timestamp
+    def __init__(self, number: _Optional[int] = ..., severity: _Optional[int] = ..., text: _Optional[str] = ..., time: _Optional[_Union[datetime.datetime, _timestamp_pb2.Timestamp, _Mapping]] = ...) -> None: ...
 
 class Telemetry(_message.Message):
     __slots__ = ("time", "position", "altitude_amsl_m", "velocity", "yaw_deg", "battery_remaining", "battery_voltage_v", "battery_current_a", "armed", "in_air", "mode", "ready", "home", "flight_state", "controller", "autopilot_connected", "missions", "position_error_m", "attitude", "position_age_s", "attitude_age_s", "gps", "wind", "not_ready_reason", "texts", "recording_problem", "gimbal", "gimbal_age_s", "controller_reason")

@@ -64,6 +64,23 @@ MIN_COURSE_MPS = 0.1
 """Speed below which the velocity is noise and has no direction."""
 
 
+@dataclass(frozen=True, slots=True)
+class StatusText:
+    """A text message of the autopilot.
+
+    Attributes:
+        number: Sequence number since the start of the service, from 1.
+        at: Time of arrival, in monotonic seconds.
+        severity: MAV_SEVERITY.
+        text: Text.
+    """
+
+    number: int
+    at: float
+    severity: int
+    text: str
+
+
 @dataclass(slots=True)
 class VehicleState:
     """Latest state that the autopilot reported. Times are monotonic seconds.
@@ -80,7 +97,7 @@ class VehicleState:
         satellites: Number of visible satellites; None until it is reported.
         velocity_history: Time on the vehicle's clock, and velocity north and east, of the latest positions.
         texts: Time of arrival and text of recent status texts.
-        status_texts: Number, MAV_SEVERITY and text of recent status texts.
+        status_texts: Recent status texts, oldest first.
         identity_problem: Reason why it is uncertain which vehicle on the link is the drone's own; empty if it is certain.
         heartbeat_gap_s: Interval between the last two heartbeats.
         stopped_in_air: True if the last reports before the motors stopped were from a flight, and not from a landing.
@@ -131,7 +148,7 @@ class VehicleState:
     wind_mps: float = 0.0
     wind_at: float = -math.inf
     texts: list[tuple[float, str]] = field(default_factory=list)
-    status_texts: deque[tuple[int, int, str]] = field(default_factory=lambda: deque(maxlen=50))
+    status_texts: deque[StatusText] = field(default_factory=lambda: deque(maxlen=50))
     path_lost: bool = False
     failsafe_text: str = ""
     failsafe_text_at: float = -math.inf

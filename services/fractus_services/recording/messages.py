@@ -148,8 +148,19 @@ def level_of(entry: Mapping[str, Any]) -> int:
 
 def component_of(entry: Mapping[str, Any]) -> str:
     """Return the component that made the call, or an empty string for an action of the system."""
+    return _component(str(entry.get("caller") or ""))
+
+
+def controller_of(entry: Mapping[str, Any]) -> str:
+    """Return the control authority: the component that is the driver, `system` or `pilot`. Empty if the entry has none."""
+    controller = str(entry.get("controller") or "")
+    return _component(controller) or controller
+
+
+def _component(identity: str) -> str:
+    """Return the component in a SPIFFE ID, or an empty string for any other text."""
     # Not `fractus_core.api.names.component_name`, whose import of pydantic would delay `fractus audit`.
-    _, separator, rest = str(entry.get("caller") or "").partition("/component/")
+    _, separator, rest = identity.partition("/component/")
     return rest.partition("/")[0] if separator else ""
 
 

@@ -12,6 +12,7 @@ from collections.abc import Callable, Coroutine
 from dataclasses import replace
 from typing import Any
 
+from fractus_core.api.names import component_name
 from fractus_core.control import Authority, ControlState, Mission
 from fractus_core.control.actions import Action, RecordAudit, RefuseStream
 from fractus_core.control.events import (
@@ -331,7 +332,7 @@ class ControlStore:
         lease = self.lease
         state = self.state
         if lease is None or lease.key != grant.key or not state.drives:
-            reason = f"you do not have control of the drone, {state.controller} has it; call GetControl first"
+            reason = f"you do not have control of the drone, {component_name(state.controller)} has it; call GetControl first"
             raise PreconditionFailed("NotInControl", reason)
         if not self.autopilot.connected:
             raise Unavailable("AutopilotUnavailable", "the autopilot is not connected")

@@ -7,6 +7,7 @@ import logging
 from collections.abc import AsyncGenerator, Callable
 
 from fractus_core.api.geometry import Position
+from fractus_core.api.names import component_name
 from fractus_core.control import Outcome, OutcomeKind
 from fractus_core.control.events import TourEnded, TourInterrupted, TourPointVisited
 from fractus_core.control.state import COMPLETE
@@ -93,7 +94,7 @@ class PoiMissions:
         The state ignores the outcome if the mission has lost the drone.
         """
         control = self._control
-        control.note("tour", f"{len(grant.spec.tour)} points of interest for {grant.identity}")
+        control.note("tour", f"{len(grant.spec.tour)} points of interest for {component_name(grant.identity)}")
         try:
             await self._visit(grant)
         except (Refused, AutopilotError) as error:

@@ -90,7 +90,7 @@ class MobilityService:
         """Stop and hover."""
         self.calls.cancel_pending(grant)
         verdict = self.calls.allow_motion(Call("Hover"), grant)
-        _require_in_air(self._autopilot, "Hover")
+        _require_in_air(self._autopilot)
         self._control.finish_motion(self._control.begin_motion("Hover"))
         await self._control.effects.hover(self._control.driver_permit(grant))
         return verdict
@@ -179,7 +179,7 @@ class MobilityService:
             reached_m: Distance to the target within which the motion is complete; 0 for the default.
         """
         verdict = self.calls.allow_motion(Call("Goto", args), grant)
-        _require_in_air(self._autopilot, "Goto")
+        _require_in_air(self._autopilot)
         radius_m = SETTINGS.reached_m
         if reached_m > 0:
             radius_m = min(max(reached_m, SETTINGS.min_acceptance_radius_m), SETTINGS.max_acceptance_radius_m)
@@ -263,7 +263,7 @@ class MobilityService:
     async def set_velocity(self, grant: ActiveGrant, args: VelocityArgs) -> tuple[Verdict, VelocityArgs]:
         """Fly with a velocity until the next setpoint, or until its hold time ends."""
         verdict = self.calls.allow_motion(Call("SetVelocity", args), grant)
-        _require_in_air(self._autopilot, "SetVelocity")
+        _require_in_air(self._autopilot)
         motion = self._control.begin_motion("SetVelocity")
         permit = self._control.driver_permit(grant, motion)
         try:
@@ -280,7 +280,7 @@ class MobilityService:
         """Land at the current position."""
         self.calls.cancel_pending(grant)
         verdict = self.calls.allow_motion(Call("Land"), grant)
-        _require_in_air(self._autopilot, "Land")
+        _require_in_air(self._autopilot)
 
         async def steps(motion: Motion) -> AsyncGenerator[Progress, None]:
             await self._control.modes.change_mode(
@@ -295,7 +295,7 @@ class MobilityService:
         """Fly home on a legal route and land. A route that becomes illegal in flight is replaced."""
         self.calls.cancel_pending(grant)
         verdict = self.calls.allow_motion(Call("ReturnToLaunch"), grant)
-        _require_in_air(self._autopilot, "ReturnToLaunch")
+        _require_in_air(self._autopilot)
         return self._return(grant, verdict)
 
     async def _return(self, grant: ActiveGrant, verdict: Verdict) -> AsyncGenerator[Progress, None]:
@@ -360,6 +360,6 @@ class MobilityService:
         self._control.finish_motion(motion)
 
 
-def _require_in_air(autopilot: Autopilot, method: str) -> None:
+def _require_in_air(autopilot: Autopilot) -> None:
     if not autopilot.vehicle.in_air:
-        raise PreconditionFailed("NotFlying", f"{method} requires a drone in the air; take off first")
+        raise PreconditionFailed("NotFlying", "the drone is on the ground; take off first")

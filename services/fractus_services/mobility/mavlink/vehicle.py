@@ -10,7 +10,13 @@ from fractus_core.policy.decision_types import Home
 from fractus_runtime.mavlink_codec import Message
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from fractus_services.mobility.autopilot import DEFAULT_ERROR_M, MAX_POSITION_AGE_S, VELOCITY_HISTORY_S, VehicleState
+from fractus_services.mobility.autopilot import (
+    DEFAULT_ERROR_M,
+    MAX_POSITION_AGE_S,
+    VELOCITY_HISTORY_S,
+    StatusText,
+    VehicleState,
+)
 from fractus_services.mobility.mavlink.flight_stack import FlightStack
 from fractus_services.mobility.mavlink.gimbal import attitude_of
 from fractus_services.mobility.mavlink.position_checks import VARIANCES, GpsFix, PositionChecks, ReportedPosition
@@ -346,8 +352,8 @@ def _text(vehicle: Vehicle, message: Message, now: float) -> None:
     text = message.text("text")
     vehicle.texts.append((now, text))
     del vehicle.texts[:-20]
-    number = vehicle.status_texts[-1][0] + 1 if vehicle.status_texts else 1
-    vehicle.status_texts.append((number, message.integer("severity"), text))
+    number = vehicle.status_texts[-1].number + 1 if vehicle.status_texts else 1
+    vehicle.status_texts.append(StatusText(number, now, message.integer("severity"), text))
     if vehicle.stack.reports_path_lost(text):
         vehicle.path_lost = True
     if vehicle.stack.reports_estimator_switch(text):

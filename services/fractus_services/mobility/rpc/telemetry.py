@@ -119,9 +119,10 @@ def telemetry_of(
     if control.autopilot.now - vehicle.wind_at <= WIND_MAX_AGE_S:
         message.wind.from_deg = vehicle.wind_from_deg
         message.wind.speed_mps = vehicle.wind_mps
-    for number, severity, text in vehicle.status_texts:
-        if number > last_text:
-            message.texts.add(number=number, severity=severity, text=text)
+    for text in vehicle.status_texts:
+        if text.number > last_text:
+            sent = message.texts.add(number=text.number, severity=text.severity, text=text.text)
+            sent.time.FromNanoseconds(int((time_s - control.autopilot.now + text.at) * 1e9))
     if vehicle.home is not None:
         message.home.latitude_deg = vehicle.home.lat
         message.home.longitude_deg = vehicle.home.lon

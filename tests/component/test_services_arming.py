@@ -12,9 +12,14 @@ from fractus_core.control.events import Airborne, ArmingRequested
 from fractus_core.policy.decision_types import Airframe, TakeoffArgs
 from fractus_services.errors import AutopilotError
 from fractus_services.mobility.autopilot import FailsafeStatus
-from mobility_world import BRAKE, World, end, partial, refusal, spec
+from mobility_world import BRAKE, World, area, end, partial, refusal, spec
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from virtual_time import fly
+
+
+def altitude(upper_m: float) -> dict[str, Any]:
+    limit = {"type": "LimitControl", "kind": "altitude", "upperLimit": upper_m}
+    return {"name": "altitude", "spec": limit}
 
 
 class Slow:
@@ -47,6 +52,49 @@ def test_arming_happens_once_for_two_concurrent_requests(tmp_path: Path) -> None
             assert slow.began_armed == [False], "no flight is prepared while the drone is armed"
             assert world.plane.commands.count(mavlink.MAV_CMD_COMPONENT_ARM_DISARM) == 1
             assert world.plane.vehicle.armed
+
+    fly(flight)
+
+
+def test_arming_follows_grant_that_changes_while_autopilot_is_not_ready(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            grant = world.grants.put(spec())
+            await world.drive(grant)
+            world.plane.vehicle.ready = False
+            areas: list[Any] = []
+            raise_around = world.fence.raise_around
+
+            async def raised(grant: GrantSpec, *, retraces: bool) -> None:
+                areas.append(grant.operation_area)
+                await raise_around(grant, retraces=retraces)
+                world.grants.put(spec(altitude(8.0), operationArea=[smaller]))
+
+            world.fence.raise_around = raised  # type: ignore[method-assign]
+            call = asyncio.ensure_future(world.service.arm(grant, 60.0))
+            await asyncio.sleep(3)
+            smaller = area(-90, -90, 90, 90)
+            changed = world.grants.put(spec(altitude(9.0), operationArea=[smaller]))
+            world.plane.vehicle.ready = True
+            await call
+            assert areas == [changed.spec.operation_area]
+            assert world.plane.parameters["RTL_ALT"] <= 800.0
+
+    fly(flight)
+
+
+def test_arming_is_refused_by_grant_that_changes_while_autopilot_is_not_ready(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            grant = world.grants.put(spec())
+            await world.drive(grant)
+            world.plane.vehicle.ready = False
+            call = asyncio.ensure_future(world.service.arm(grant, 60.0))
+            await asyncio.sleep(3)
+            world.grants.put(spec(services=[{"service": "mobility", "methods": ["Takeoff"]}]))
+            world.plane.vehicle.ready = True
+            assert (await refusal(call)).verdict.code == "MethodNotGranted"
+            assert not world.plane.vehicle.armed
 
     fly(flight)
 

@@ -101,6 +101,27 @@ def test_return_avoids_zone_after_one_refused_command(tmp_path: Path) -> None:
     fly(flight)
 
 
+def test_return_avoids_zone_that_appeared_while_position_was_not_trusted(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            grant = world.grants.put(spec())
+            await world.up(grant)
+            await end(world.service.goto(grant, GotoArgs(*at(0, 70), 10.0), 0))
+            world.plane.vehicle.position_problem = "GPS glitch"
+            world.plane.vehicle.position_problem_at = world.plane.now
+            await world.control.return_control(grant)
+            await asyncio.sleep(5.0)
+            world.grants.put(spec(zone("wall", "ignore", *WALL)))
+            await asyncio.sleep(5.0)
+            assert world.plane.xy[1] > 60.0, "the drone waits"
+            world.plane.trace.clear()
+            world.plane.vehicle.position_problem = ""
+            await world.until(lambda: not world.plane.vehicle.armed)
+            assert clearance_m(world, *WALL) > 1.0
+
+    fly(flight)
+
+
 @pytest.mark.parametrize(("remembers", "mode"), [(True, SMART_RTL), (False, RTL)])
 def test_return_is_left_to_autopilot_after_three_refused_commands(
     tmp_path: Path, remembers: bool, mode: FlightMode

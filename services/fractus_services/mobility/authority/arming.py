@@ -82,7 +82,7 @@ class Arming:
         async with self._control.autopilot.starting:
             permit()
             if not self._control.autopilot.vehicle.armed:
-                await self._arm(grant, permit)
+                await self._arm(self._control.latest(grant), permit)
 
     async def _arm(self, grant: ActiveGrant, permit: Permit) -> None:
         self._require_verified()
@@ -159,7 +159,7 @@ class Arming:
             raise PreconditionFailed("FenceNotRaised", reason) from error
         self._require_verified(status)
         try:
-            lowered = await self._safeguards.limit_return(grant)
+            lowered = await self._safeguards.limit_return(self._control.latest(grant))
         except (AutopilotError, OSError) as error:
             reason = f"cannot limit speed and altitude of the autopilot's return: {error}"
             raise PreconditionFailed("ReturnNotLimited", reason) from error

@@ -250,6 +250,10 @@ class ControlStore:
         current = self._grants.active.get(grant.identity)
         return current is not None and current.key == grant.key
 
+    def latest(self, grant: ActiveGrant) -> ActiveGrant:
+        """Return the grant with its latest policies; the grant itself if it was removed."""
+        return self._grants.active[grant.identity] if self.is_valid(grant) else grant
+
     def not_ready_reason(self, key: str) -> str | None:
         """Return why the drone cannot fly for a mission now, or None if it can."""
         vehicle = self.autopilot.vehicle

@@ -76,7 +76,6 @@ class ReturnFlight:
             AutopilotError: The autopilot refused, or the link broke.
         """
         control = self._control
-        grant = control.last_grant
         vehicle = control.autopilot.vehicle
         stack = control.autopilot.stack
         self.given_up = None
@@ -84,9 +83,9 @@ class ReturnFlight:
             await self._restore_home()
         # A landing in progress was chosen by a failsafe or a pilot. The battery may be too low for any other flight.
         landing = vehicle.mode.kind is ModeKind.LANDING
-        if kind is TaskKind.LAND and (grant is None or landing or not self._lands_in_zone(grant)):
+        if kind is TaskKind.LAND and (landing or not self._lands_in_zone()):
             return stack.land
-        if not vehicle.mode.comes_down and not await self._trusts_position(is_current, grant):
+        if not vehicle.mode.comes_down and not await self._trusts_position(is_current):
             if is_current() and vehicle.in_air:
                 control.note("land", f"the position is not trusted: {vehicle.position_problem}", "PositionUnknown")
             return stack.land
@@ -98,6 +97,7 @@ class ReturnFlight:
         ):
             control.note("returnToLaunch", "home was moved; the drone returns on the path it flew", "HomeMoved")
             return stack.return_retracing
+        grant = control.last_grant  # Not earlier: the Grant may have changed while the drone waited.
         if grant is None or not vehicle.in_air or vehicle.mode.comes_down or self._blind():
             return stack.return_straight
         try:
@@ -120,10 +120,10 @@ class ReturnFlight:
             "returnToLaunch", f"no legal route home is known ({problem}); the drone returns {path}", "NoLegalWay"
         )
         log.error("return: no legal route home is known, the drone returns %s (reason=%s)", path, problem)
-        self.given_up = grant
+        self.given_up = control.last_grant
         return stack.return_retracing if retraces else stack.return_straight
 
-    async def _trusts_position(self, is_current: Callable[[], bool], grant: ActiveGrant | None) -> bool:
+    async def _trusts_position(self, is_current: Callable[[], bool]) -> bool:
         """Wait until the position is trusted; the drone hovers. Return False after a timeout, or if the task or flight has ended."""
         autopilot = self._control.autopilot
         vehicle = autopilot.vehicle
@@ -131,7 +131,7 @@ class ReturnFlight:
         while vehicle.position_problem:
             waited_s = (autopilot.now - vehicle.position_problem_at) * autopilot.pace
             if waited_s >= SETTINGS.position_problem_timeout_s:
-                if waited_s >= SETTINGS.position_problem_above_zone_timeout_s or not self._descends_into_zone(grant):
+                if waited_s >= SETTINGS.position_problem_above_zone_timeout_s or not self._lands_in_zone():
                     break
                 if not above_zone:
                     reason = f"a zone lies below, and the position is not trusted: {vehicle.position_problem}"
@@ -143,9 +143,6 @@ class ReturnFlight:
                 autopilot.stop()
             await autopilot.update(SETTINGS.brake_resend_s / autopilot.pace)
         return not vehicle.position_problem
-
-    def _descends_into_zone(self, grant: ActiveGrant | None) -> bool:
-        return grant is not None and self._lands_in_zone(grant)
 
     def _require_trusted_position(self) -> None:
         problem = self._control.autopilot.vehicle.position_problem
@@ -241,11 +238,14 @@ class ReturnFlight:
         """Return True if the drone does not come to rest because of wind, and the straight return is legal from its position."""
         return refusal.verdict.code == "NotStopping" and self._straight_return_legal(flight.constraints.compiled)
 
-    def _lands_in_zone(self, grant: ActiveGrant) -> bool:
-        """Return True if the drone is above a zone into which it would descend.
+    def _lands_in_zone(self) -> bool:
+        """Return True if the drone is above a zone into which it would descend. Without a Grant, no zones are known.
 
         While the position is not trusted, the drone counts as being where it is expected.
         """
+        grant = self._control.last_grant
+        if grant is None:
+            return False
         now = self._gate.situation()
         vehicle = self._control.autopilot.vehicle
         if now.lat is None and vehicle.expected_place is not None:

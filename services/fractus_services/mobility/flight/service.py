@@ -74,8 +74,11 @@ class MobilityService:
     async def arm(self, grant: ActiveGrant, patience_s: float = 0.0) -> Verdict:
         """Arm. Retry transient failures, such as an autopilot that is not ready yet, for `patience_s` seconds."""
         permit = self._control.driver_permit(grant)
-        call = Call("Arm")
-        async for _ in self._arming.arm(grant, permit, lambda: self.calls.allow_motion(call, grant), patience_s):
+
+        def judge() -> None:
+            self.calls.allow_motion(Call("Arm"), self._control.latest(grant))
+
+        async for _ in self._arming.arm(grant, permit, judge, patience_s):
             pass
         return Verdict("allow")
 

@@ -246,6 +246,7 @@ def test_mcap_contains_decisions_statustexts_and_zones(tmp_path: Path) -> None:
         ["zone", "operationArea"],
         [],
     ]
+    assert maps[0]["features"][0]["properties"]["uses"] == ["exclusion"]
 
 
 def test_oldest_segments_are_removed_and_files_are_private(tmp_path: Path) -> None:

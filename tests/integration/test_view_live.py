@@ -96,7 +96,9 @@ def test_view_page_shows_cluster_live_and_stale_when_api_server_is_unreachable(
         opened(browser, address) as page,
     ):
         expect(page.locator("#mode")).to_have_text("live", timeout=TIMEOUT_MS)
-        expect(page.locator("#zones")).to_contain_text("school zone, 0 to 30 m above home", timeout=TIMEOUT_MS)
+        expect(page.locator("#zones")).to_contain_text(
+            "school exclusion zone, 0 to 30 m above home", timeout=TIMEOUT_MS
+        )
         expect(page.locator("#zones")).to_contain_text("edge-1 edge node")
         expect(page.locator("#policies")).to_contain_text("no-school exclusion, ignore; in school")
         expect(page.locator("#applications")).to_contain_text(f"{namespace}/traffic")

@@ -23,8 +23,8 @@ from PIL import Image
 from playwright.sync_api import Browser, Page, Playwright, expect, sync_playwright
 
 FLOWN = (11, 87, 184)
-ZONE = (194, 24, 43)
-"""Colours of the flown path and of zones in the light colour scheme."""
+EXCLUSION = (194, 24, 43)
+"""Colours of the flown path and of exclusion zones in the light colour scheme."""
 
 pytestmark = [
     pytest.mark.slow,
@@ -110,7 +110,7 @@ def test_view_page_shows_zones_verdicts_path_and_pictures_of_flight(browser: Bro
         page.wait_for_selector("#map[data-map=ready]")
         assert "token" not in page.url
         go_to_end(page)
-        expect(page.locator("#zones")).to_contain_text("school-zone zone, 0 to 30 m above home")
+        expect(page.locator("#zones")).to_contain_text("school-zone exclusion zone, 0 to 30 m above home")
         expect(page.locator("#zones")).to_contain_text("operation area of Navigator")
         verdicts = page.locator("#verdicts")
         expect(verdicts).to_contain_text("corrected to 14.8 m above home", timeout=TIMEOUT_MS)
@@ -120,7 +120,7 @@ def test_view_page_shows_zones_verdicts_path_and_pictures_of_flight(browser: Bro
         expect(page.locator("#drones")).to_contain_text(re.compile(r"battery \d+ %"))
         page.wait_for_function("[...document.querySelectorAll('#pictures img')].some(image => image.naturalWidth > 0)")
         page.wait_for_timeout(1_000)
-        assert pixels(page, ZONE) > 100
+        assert pixels(page, EXCLUSION) > 100
         assert pixels(page, FLOWN) > 600, "the map does not show the flown path"
 
 

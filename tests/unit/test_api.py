@@ -11,6 +11,7 @@ from fractus_core.api import KINDS, Application, InvalidObject, Policy, Zone
 from fractus_core.api.crd import crd
 from fractus_core.api.model import quantity
 from fractus_core.api.nodes import Interface
+from fractus_core.api.policies import PolicySpec
 from fractus_core.api.schedules import ActiveTime, active_at
 from fractus_core.planning import operation_area
 from fractus_core.validation import check_application, check_area, check_policy
@@ -374,3 +375,22 @@ def test_interface_accepts_valid_device_and_network_names_only(field: str, good:
     for name in bad:
         with pytest.raises(ValidationError):
             Interface.model_validate(interface(name))
+
+
+@pytest.mark.parametrize(
+    ("spec", "uses"),
+    [
+        ({"type": "GeofenceControl", "kind": "exclusion", "selector": {"zones": ["a"]}}, {"exclusion"}),
+        ({"type": "GeofenceControl", "kind": "inclusion", "selector": {"zones": ["a"]}}, {"inclusion"}),
+        ({"type": "LimitControl", "kind": "speed", "upperLimit": 3}, {"speedLimit"}),
+        ({"type": "LimitControl", "kind": "altitude", "upperLimit": 30}, {"altitudeLimit"}),
+        ({"type": "PrivacyControl", "kind": "camera", "action": "refuse"}, {"noPictures"}),
+        ({"type": "PrivacyControl", "kind": "camera", "action": "blurFaces"}, {"pictureFilter"}),
+        ({"type": "AccessControl", "kind": "grant", "methods": ["CaptureImage"]}, {"grant"}),
+        ({"type": "AccessControl", "kind": "denial", "methods": ["CaptureImage"]}, {"noPictures"}),
+        ({"type": "AccessControl", "kind": "denial", "methods": ["ListImages"]}, {"denial"}),
+        ({"type": "AccessControl", "kind": "denial", "methods": ["CaptureImage", "Land"]}, {"noPictures", "denial"}),
+    ],
+)
+def test_policy_has_effects_on_its_zones(spec: dict[str, object], uses: set[str]) -> None:
+    assert PolicySpec.model_validate(spec).zone_uses == uses

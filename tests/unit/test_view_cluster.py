@@ -182,7 +182,10 @@ async def test_view_reports_drones_areas_applications_links_and_policies(monkeyp
     features = [feature for event in events if event["type"] == "areas" for feature in event["features"]]
     assert {(f["properties"]["kind"], f["properties"]["name"]) for f in features} == {
         ("zone", "school"), ("depot", "base"), ("edgeNode", "edge-1"), ("operationArea", "demo/traffic"), ("path", "demo/traffic"),
+        ("controlPoint", "demo/traffic"),
     }  # fmt: skip
+    (point,) = [feature for feature in features if feature["properties"]["kind"] == "controlPoint"]
+    assert (point["properties"]["number"], point["geometry"]["coordinates"]) == (0, [22.93, 39.36])
     (zone,) = [feature for feature in features if feature["properties"]["kind"] == "zone"]
     assert zone["properties"]["altitude"] == {"lower": 0, "upper": 30, "reference": "home"}
     assert {f["properties"]["component"] for f in features if f["properties"]["kind"] == "path"} == {
@@ -293,6 +296,34 @@ def test_policy_is_described_in_a_phrase(spec: Body, text: str) -> None:
     assert objects.policy(api.Policy.from_body(resource("Policy", "p", spec))).text == text
     broken = resource("Policy", "p", spec, {"conditions": [ready("False", "NoZone", "zone a is missing")]})
     assert objects.policy(api.Policy.from_body(broken)).text == f"not in force: zone a is missing ({text})"
+
+
+def policy_on_school(name: str, spec: Body) -> api.Policy:
+    return api.Policy.from_body(resource("Policy", name, spec | {"selector": {"zones": ["school"]}}))
+
+
+def test_zone_has_the_effects_of_all_policies_that_select_it() -> None:
+    speed = policy_on_school("slow", {"type": "LimitControl", "kind": "speed", "upperLimit": 3})
+    fence = policy_on_school("closed", {"type": "GeofenceControl", "kind": "exclusion"})
+    zone = api.Zone.from_body(ZONE)
+    (unused,) = objects.zones([zone], [api.Policy.from_body(POLICY)])
+    (used,) = objects.zones([zone], [speed, fence])
+    assert unused["properties"]["uses"] == []
+    assert used["properties"]["uses"] == ["exclusion", "speedLimit"]
+
+
+def test_control_point_at_a_missing_depot_is_omitted() -> None:
+    spec = json.loads(json.dumps(APPLICATION["spec"]))
+    spec["components"][0]["controlPoints"][0]["point"] = {"depot": "base"}
+    application = api.Application.from_body(APPLICATION | {"spec": spec})
+    plans = {application.key: api.DeploymentPlan.from_body(PLAN)}
+
+    def points(depots: dict[str, api.Depot]) -> list[object]:
+        features = objects.planned_flights([application], plans, depots)
+        return [f["geometry"]["coordinates"] for f in features if f["properties"]["kind"] == "controlPoint"]
+
+    assert points({}) == []
+    assert points({"base": api.Depot.from_body(DEPOT)}) == [[22.93, 39.36]]
 
 
 def test_view_reads_no_kinds_with_secrets() -> None:

@@ -136,15 +136,16 @@ class ClusterSource:
         now_ms = self._now_ms()
         for name in sorted(drones):
             yield from self._drone(name, now_ms)
-        if api.Zone in changed:
-            yield Areas("zones", now_ms, objects.zones(self._all(api.Zone)))
+        if changed & {api.Zone, api.Policy}:
+            yield Areas("zones", now_ms, objects.zones(self._all(api.Zone), self._all(api.Policy)))
         if changed & {api.EdgeNode, api.Depot}:
             yield Areas("places", now_ms, objects.places(self._all(api.EdgeNode), self._all(api.Depot)))
-        if changed & {api.Application, api.DeploymentPlan}:
+        if changed & {api.Application, api.DeploymentPlan, api.Depot}:
+            depots = {depot.name: depot for depot in self._all(api.Depot)}
             plans = {
                 (plan.metadata.namespace or "", plan.spec.application): plan for plan in self._all(api.DeploymentPlan)
             }
-            yield Areas("plans", now_ms, objects.planned_flights(self._all(api.Application), plans))
+            yield Areas("plans", now_ms, objects.planned_flights(self._all(api.Application), plans, depots))
         if api.Application in changed:
             applications = map(objects.application, self._all(api.Application))
             yield Applications(now_ms, sorted(applications, key=attrgetter("name")))

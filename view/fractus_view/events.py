@@ -7,6 +7,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Literal, NotRequired, TypedDict
 
+from fractus_core.api.policies import ZoneUse
+
 
 @dataclass(frozen=True, slots=True)
 class Fix:
@@ -110,10 +112,18 @@ class AltitudeBand(TypedDict):
 
 
 class FeatureProperties(TypedDict):
-    """Properties of an area or place. `kind` is zone, operationArea, corridor, path, depot or edgeNode."""
+    """Properties of an area or place.
+
+    Attributes:
+        kind: zone, operationArea, corridor, path, controlPoint, depot or edgeNode.
+        uses: Effects of the policies that select a zone, from the most to the least restrictive. Missing: unknown.
+        number: Number of a control point, which is its index in `controlPoints`.
+    """
 
     kind: str
     name: str
+    uses: NotRequired[Sequence[ZoneUse]]
+    number: NotRequired[int]
     application: NotRequired[str]
     component: NotRequired[str]
     altitude: NotRequired[AltitudeBand]

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from datetime import datetime
-from typing import cast
+from typing import cast, get_args
 
 from fractus_core import api
 from fractus_core.api.geometry import Area, Circle, Position
 from fractus_core.api.model import Condition, Metadata
-from fractus_core.api.policies import PolicySpec, ZoneSpec
+from fractus_core.api.policies import PolicySpec, ZoneSpec, ZoneUse
 from fractus_core.geo import line_geojson
 from fractus_core.geo.formats.geojson import zone_feature
+from fractus_core.planning.operation_area import control_routes
 
 from fractus_view.events import Application, Feature, FeatureProperties, Fix, Geometry, Link, Policy, State
 from fractus_view.translation import short_name
@@ -114,9 +115,18 @@ def _summary(spec: PolicySpec) -> str:
             return f"pictures: {spec.action}"
 
 
-def zones(resources: Iterable[api.Zone]) -> list[Feature]:
-    """Return the zones, sorted by name."""
-    return [_zone_feature(zone, "zone") for zone in sorted(resources, key=lambda zone: zone.name)]
+def zones(resources: Iterable[api.Zone], policies: Iterable[api.Policy]) -> list[Feature]:
+    """Return the zones, sorted by name, with the effects of the policies that select them."""
+    uses: dict[str, set[ZoneUse]] = {}
+    for resource in policies:
+        for name in resource.spec.selector.zones:
+            uses.setdefault(name, set()).update(resource.spec.zone_uses)
+    features = []
+    for zone in sorted(resources, key=lambda zone: zone.name):
+        feature = _zone_feature(zone, "zone")
+        feature["properties"]["uses"] = [use for use in get_args(ZoneUse) if use in uses.get(zone.name, ())]
+        features.append(feature)
+    return features
 
 
 def places(edge_nodes: Iterable[api.EdgeNode], depots: Iterable[api.Depot]) -> list[Feature]:
@@ -142,13 +152,16 @@ def places(edge_nodes: Iterable[api.EdgeNode], depots: Iterable[api.Depot]) -> l
 
 
 def planned_flights(
-    applications: Iterable[api.Application], plans: Mapping[tuple[str, str], api.DeploymentPlan]
+    applications: Iterable[api.Application],
+    plans: Mapping[tuple[str, str], api.DeploymentPlan],
+    depots: Mapping[str, api.Depot],
 ) -> list[Feature]:
-    """Return operation areas and planned paths of applications that have not ended.
+    """Return operation areas, planned paths and control points of applications that have not ended.
 
     Args:
         applications: Applications.
         plans: Plans by namespace and name of their application.
+        depots: Depots by name. A control point whose depot is missing has no position, and is omitted.
     """
     features: list[Feature] = []
     for resource in sorted(applications, key=lambda resource: resource.key):
@@ -161,6 +174,7 @@ def planned_flights(
         for component, path in _paths(resource):
             if len(path) > 1:
                 features.append(_application_feature("path", name, line_geojson(path), component))
+        features += _control_points(resource, depots)
         transit = plan.spec.drone.transit if plan.spec.drone is not None else ()
         features += [
             _application_feature("path", name, line_geojson((leg.start, leg.end)), "system") for leg in transit
@@ -174,6 +188,23 @@ def _paths(resource: api.Application) -> Iterator[tuple[str, tuple[Position, ...
             yield component.name, point.path or ()
         if component.points_of_interest is not None:
             yield component.name, component.points_of_interest.points
+
+
+def _control_points(resource: api.Application, depots: Mapping[str, api.Depot]) -> Iterator[Feature]:
+    """Yield the control points of the driver with their numbers, which are the indices of `controlPoints`."""
+    driver = resource.spec.driver
+    if driver is None:
+        return
+    for number, point in enumerate(driver.control_points):
+        try:
+            ((start, *_),) = control_routes([point], depots)
+        except api.InvalidObject:
+            continue
+        geometry = {"type": "Point", "coordinates": [start.lon, start.lat]}
+        name = "/".join(resource.key)
+        feature = _application_feature("controlPoint", name, geometry, driver.name)
+        feature["properties"]["number"] = number
+        yield feature
 
 
 def _application_feature(kind: str, application: str, geometry: Mapping[str, object], component: str = "") -> Feature:

@@ -77,7 +77,8 @@ def _type(hint: Any) -> str:
     if get_origin(hint) is Literal:
         return " | ".join(json.dumps(argument) for argument in arguments)
     if get_origin(hint) is Sequence:
-        return f"{_type(arguments[0])}[]"
+        item = _type(arguments[0])
+        return f"({item})[]" if " | " in item else f"{item}[]"
     return str(hint.__name__)
 
 

@@ -10,7 +10,7 @@ from pydantic import Field
 from pydantic.alias_generators import to_snake
 
 from fractus_core.api.geometry import Altitude, AltitudeBand, Area, Reference
-from fractus_core.api.methods import Method
+from fractus_core.api.methods import CAMERA_METHODS, Method
 from fractus_core.api.model import AGE, READY, Conditions, Model, ObservedGeneration, OpenModel, Resource
 from fractus_core.api.names import ComponentName, Name
 from fractus_core.api.rules import Violation, referenced_by, rule
@@ -139,6 +139,11 @@ PrivacyAction = Literal["refuse", FilterAction]
 FaceMethod = Literal["pixelate", "gaussian"]
 Fallback = Literal["blurAverage", "black", "refuse"]
 
+ZoneUse = Literal[
+    "exclusion", "noPictures", "inclusion", "denial", "pictureFilter", "altitudeLimit", "speedLimit", "grant"
+]
+"""Effect of a policy on its zones, from the most to the least restrictive."""
+
 _LIMIT_ACTIONS: dict[str | None, LimitAction] = {action: action for action in get_args(LimitAction)}
 _GEOFENCE_ACTIONS: dict[str | None, GeofenceAction] = {action: action for action in get_args(GeofenceAction)}
 _FILTER_ACTIONS: dict[str | None, FilterAction] = {action: action for action in get_args(FilterAction)}
@@ -225,6 +230,25 @@ class PolicySpec(Validity):
     def filter_action(self) -> FilterAction | None:
         """Filter for images, or None if the policy refuses them."""
         return _FILTER_ACTIONS.get(self.action)
+
+    @property
+    def zone_uses(self) -> frozenset[ZoneUse]:
+        """Effects of the policy on its zones. A denial of `CaptureImage` means that no pictures are taken."""
+        match self.type:
+            case "GeofenceControl":
+                return frozenset({"inclusion" if self.kind == "inclusion" else "exclusion"})
+            case "LimitControl":
+                return frozenset({"speedLimit" if self.kind == "speed" else "altitudeLimit"})
+            case "PrivacyControl":
+                return frozenset({"noPictures" if self.filter_action is None else "pictureFilter"})
+        if self.kind == "grant":
+            return frozenset({"grant"})
+        uses: set[ZoneUse] = set()
+        if "CaptureImage" in self.methods:
+            uses.add("noPictures")
+        if not uses or set(self.methods) - set(CAMERA_METHODS):
+            uses.add("denial")
+        return frozenset(uses)
 
     @rule(
         _for("AccessControl", f"({_among('kind', AccessKind)} && has(self.methods) && size(self.methods) > 0)"),

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any
+from typing import Any, get_args
 
 from fractus_core.api import Zone
 from fractus_core.api.grants import GrantSpec
 from fractus_core.api.model import Metadata
-from fractus_core.api.policies import ZoneShape, ZoneSpec
+from fractus_core.api.policies import ZoneShape, ZoneSpec, ZoneUse
 from fractus_core.geo.formats.geojson import zone_feature
 
 Feature = dict[str, Any]
 
 _COLOURS = {"zone": "#d62728", "operationArea": "#2ca02c", "corridor": "#9467bd"}
+_USE_COLOURS: dict[ZoneUse, str] = {
+    "exclusion": "#d62728", "noPictures": "#e377c2", "inclusion": "#bcbd22", "denial": "#7f7f7f",
+    "pictureFilter": "#e377c2", "altitudeLimit": "#ff7f0e", "speedLimit": "#ff7f0e", "grant": "#7f7f7f",
+}  # fmt: skip
 
 
 def zones_of(specs: Iterable[GrantSpec]) -> list[Zone]:
@@ -33,9 +37,28 @@ def areas_of(spec: GrantSpec) -> list[Zone]:
 def grant_features(specs: Iterable[GrantSpec]) -> list[Feature]:
     """Return the zones, operation areas and corridors of some Grants as features with `kind` and `component` properties."""
     specs = tuple(specs)
-    zones = [to_feature(zone, "zone") for zone in zones_of(specs)]
+    uses = _uses_of(specs)
+    zones = [_zone_feature(zone, uses[zone.name]) for zone in zones_of(specs)]
     areas = [to_feature(area, area.name, component=spec.component) for spec in specs for area in areas_of(spec)]
     return zones + areas
+
+
+def _uses_of(specs: Iterable[GrantSpec]) -> dict[str, set[ZoneUse]]:
+    """Return the effects of all policies on each of their zones, by name of the zone."""
+    uses: dict[str, set[ZoneUse]] = {}
+    for policy in (policy for spec in specs for policy in spec.policies):
+        for zone in policy.zones:
+            uses.setdefault(zone.name, set()).update(policy.spec.zone_uses)
+    return uses
+
+
+def _zone_feature(zone: Zone, uses: set[ZoneUse]) -> Feature:
+    """Return a zone with the property `uses`, in the colour of the most restrictive use."""
+    feature = to_feature(zone, "zone")
+    ordered = [use for use in get_args(ZoneUse) if use in uses]
+    feature["properties"]["uses"] = ordered
+    feature["properties"]["style"]["color"] = _USE_COLOURS[ordered[0]]
+    return feature
 
 
 def to_feature(zone: Zone, kind: str, **properties: str) -> Feature:

@@ -98,10 +98,19 @@ export interface AltitudeBand {
   reference?: string;
 }
 
-/** Properties of an area or place. `kind` is zone, operationArea, corridor, path, depot or edgeNode. */
+/**
+ * Properties of an area or place.
+ *
+ * Attributes:
+ *     kind: zone, operationArea, corridor, path, controlPoint, depot or edgeNode.
+ *     uses: Effects of the policies that select a zone, from the most to the least restrictive. Missing: unknown.
+ *     number: Number of a control point, which is its index in `controlPoints`.
+ */
 export interface FeatureProperties {
   kind: string;
   name: string;
+  uses?: ("exclusion" | "noPictures" | "inclusion" | "denial" | "pictureFilter" | "altitudeLimit" | "speedLimit" | "grant")[];
+  number?: number;
   application?: string;
   component?: string;
   altitude?: AltitudeBand;

@@ -2,11 +2,15 @@
 
 import type { Application, Feature, Link, Note, Policy, Verdict } from "./events";
 import type { Drone, Model } from "./model";
-import { actionOf, callOf, clock, facts, isIntervention, kindName, quantity, sentence } from "./text";
+import { policiesAt } from "./places";
+import { actionOf, callOf, classOf, clock, facts, isIntervention, kindName, quantity, sentence } from "./text";
 
 const MAX_VERDICTS = 200;
 const MAX_NOTES = 200;
 const MAX_PICTURES = 6;
+const NO_POLICIES =
+  "No policy restricts flights or pictures. Each application is limited to its granted methods, its operation area and the limits of the drone.";
+const UNLISTED_POLICIES = "Recordings do not list policies. The zones on the map are those of the policies that apply to the flight.";
 
 export interface Actions {
   select(drone: string): void;
@@ -73,6 +77,8 @@ export class Lists {
   private readonly log = byId<HTMLOListElement>("log");
   private readonly filter = byId<HTMLSelectElement>("verdict-filter");
   private readonly announcer = byId("announcer");
+  /** Entries of the legend that are shown only if the map contains their class. */
+  private readonly legend = document.querySelectorAll<HTMLElement>("#legend [data-class]");
   private readonly rows = new Map<string, Row>();
   private shown: Record<string, string> = { verdicts: "", zones: "", pictures: "", log: "" };
   private announced = -Infinity;
@@ -87,7 +93,8 @@ export class Lists {
     this.rows.clear();
   }
 
-  show(time: number, selected: string): void {
+  /** Shows the state at a time. `staleSince` is the time of the last contact if the state is stale, in Unix milliseconds. */
+  show(time: number, selected: string, staleSince: number | undefined): void {
     this.showDrones(time, selected);
     this.showVerdicts(time);
     this.showZones(time);
@@ -97,7 +104,9 @@ export class Lists {
     for (const id of ["verdicts", "pictures", "log"]) byId(`${id}-section`).hidden = fromCluster;
     this.showSection("applications", model.applications.at(time)?.applications, applicationItem, "No applications.");
     this.showSection("links", model.linksAt(time), linkItem, "No direct links.");
-    this.showSection("policies", model.policies.at(time)?.policies, policyItem, "No policies. All calls are refused without a policy.");
+    const unlisted = model.contact === undefined && model.drones.size > 0;
+    this.showSection("policies", model.policies.at(time)?.policies ?? (unlisted ? [] : undefined), policyItem, unlisted ? UNLISTED_POLICIES : NO_POLICIES);
+    setText(byId("policies-age"), staleSince === undefined ? "" : `as of ${clock(staleSince)} UTC, may have changed`);
     this.showPictures(time);
     this.showLog(time);
   }
@@ -118,12 +127,15 @@ export class Lists {
     const state = drone.states.at(time);
     const battery = state?.battery;
     const isStale = drone.isStale(time);
+    const position = drone.position(time);
+    const policies = position === undefined ? undefined : policiesAt(this.model, time, position.lon, position.lat);
     const values = [
       `battery ${quantity(battery === null || battery === undefined ? null : battery * 100, 0, "%")}`,
       `altitude ${quantity(state?.altitude_m, 1, "m")}`,
       `speed ${quantity(state?.speed_mps, 1, "m/s")}`,
       `controller ${state?.controller || "–"}`,
       ...(state?.mode ? [`mode ${state.mode}`] : []),
+      ...(policies === undefined ? [] : [policies]),
       ...(isStale ? [`last report at ${state?.seen_ms ? clock(state.seen_ms) : "–"}`] : []),
     ];
     setText(row.phase, state?.phase ?? "not reporting");
@@ -196,14 +208,17 @@ export class Lists {
       const properties = feature.properties;
       const owner = properties.component ? ` of ${properties.component}` : "";
       const name = properties.name === properties.kind ? kindName(feature) : properties.name;
-      features.set(`${name}${owner}`, feature);
+      const number = properties.number === undefined ? "" : ` ${properties.number}`;
+      features.set(`${name}${owner}${number}`, feature);
     }
+    const classes = new Set([...features.values()].map(classOf));
+    for (const entry of this.legend) entry.hidden = !classes.has(entry.dataset["class"]!);
     const key = [...features].map(([name, feature]) => `${name} ${facts(feature)}`).join("\n");
     if (key === this.shown.zones) return;
     this.shown.zones = key;
     const items = [...features].map(([name, feature]) => {
       const item = element("li");
-      const swatch = element("span", `swatch ${feature.properties.kind}`);
+      const swatch = element("span", `swatch ${classOf(feature)}`);
       item.append(swatch, element("span", "name", name), element("span", "facts", ` ${facts(feature)}`));
       return item;
     });

@@ -49,19 +49,7 @@ const mode = byId("mode");
 
 function colours(): Colours {
   const style = getComputedStyle(document.documentElement);
-  const colour = (name: string) => style.getPropertyValue(`--${name}`).trim();
-  return {
-    background: colour("map"),
-    text: colour("text"),
-    flown: colour("flown"),
-    link: colour("link"),
-    edgeNode: colour("quiet"),
-    zone: colour("zone"),
-    operationArea: colour("operation-area"),
-    corridor: colour("corridor"),
-    path: colour("path"),
-    depot: colour("quiet"),
-  };
+  return (name) => style.getPropertyValue(`--${name}`).trim();
 }
 
 let resolveFirstEvents: () => void;
@@ -177,7 +165,7 @@ function showTicks(): void {
 }
 
 function show(): void {
-  lists.show(playback.time, selected);
+  lists.show(playback.time, selected, staleness()?.since);
   showConnection();
   play.textContent = playback.playing || playback.following ? "Pause" : "Play";
   liveButton.hidden = !live;

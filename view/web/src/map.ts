@@ -7,7 +7,8 @@ import workerUrl from "maplibre-gl/dist/maplibre-gl-worker.mjs?url";
 
 import type { Feature, Link } from "./events";
 import { type Drone, MAX_GAP_MS, type Model } from "./model";
-import { altitudeLimits, facts } from "./text";
+import { policiesAt } from "./places";
+import { ZONE_CLASSES, altitudeLimits, classOf, facts, kindName } from "./text";
 
 setWorkerUrl(new URL(workerUrl, window.location.href).href);
 // Start the workers while the first events are being received.
@@ -28,25 +29,23 @@ const MIN_LABELLED_PX = 40;
 const STALE_OPACITY = 0.45;
 const NOT_READY_OPACITY = 0.55;
 
-const KINDS = ["operationArea", "corridor", "depot", "zone"] as const;
+/** Classes of areas, in drawing order. */
+const AREAS = ["operationArea", "corridor", "depot", ...ZONE_CLASSES] as const;
+/** Classes of areas and lines, each with its own outline. */
+const OUTLINES = [...AREAS, "path"] as const;
+const FILL_OPACITY: Record<string, number> = { exclusion: 0.22, pictures: 0.18, limit: 0.14 };
+const DEFAULT_FILL_OPACITY = 0.06;
+/** Outlines differ in their dashes too, so that colours are not needed to tell them apart. An exclusion zone has a solid outline. */
+const DASHES: Record<string, [number, number]> = { inclusion: [6, 2], pictures: [1, 1.5], limit: [4, 1.5], methods: [2, 2], zone: [1, 3] };
+const DEFAULT_DASHES: [number, number] = [3, 2];
 
-export interface Colours {
-  background: string;
-  text: string;
-  flown: string;
-  zone: string;
-  operationArea: string;
-  corridor: string;
-  path: string;
-  depot: string;
-  link: string;
-  edgeNode: string;
-}
+/** Returns the colour with a name, which is a custom property of the style sheet. */
+export type Colours = (name: string) => string;
 
 export class FlightMap {
   private readonly map: MapLibre;
   private readonly overlay: HTMLCanvasElement;
-  private readonly popup = new Popup({ closeButton: false, maxWidth: "320px" });
+  private readonly popup = new Popup({ closeOnClick: false, maxWidth: "320px" });
   /** Time of the latest update of the areas and paths, on the clock of animation frames. */
   private areasUpdated = -Infinity;
   private pathsUpdated = -Infinity;
@@ -66,7 +65,7 @@ export class FlightMap {
     private colours: Colours,
     private readonly reducedMotion: boolean,
     private readonly select: (drone: string) => void,
-    time: number,
+    private time: number,
   ) {
     this.features = model.features(time);
     const bounds = this.bounds(time);
@@ -102,20 +101,20 @@ export class FlightMap {
   private style(): StyleSpecification {
     const source = (features: GeoJSON.Feature[]) =>
       ({ type: "geojson", data: { type: "FeatureCollection", features }, buffer: 32, tolerance: 0.2 }) as const;
-    const filter = (kind: string) => ["==", ["get", "kind"], kind] as ["==", ["get", string], string];
+    const filter = (name: string) => ["==", ["get", "class"], name] as ["==", ["get", string], string];
     const colours = this.colours;
-    const layers: StyleSpecification["layers"] = [{ id: "background", type: "background", paint: { "background-color": colours.background } }];
-    for (const kind of KINDS) {
+    const layers: StyleSpecification["layers"] = [{ id: "background", type: "background", paint: { "background-color": colours("map") } }];
+    for (const name of AREAS) {
       // Line layers draw the outlines.
-      const paint = { "fill-antialias": false, "fill-color": colours[kind], "fill-opacity": kind === "zone" ? 0.22 : 0.06 };
-      layers.push({ id: `${kind}-fill`, type: "fill", source: "areas", filter: filter(kind), paint });
+      const paint = { "fill-antialias": false, "fill-color": colours(name), "fill-opacity": FILL_OPACITY[name] ?? DEFAULT_FILL_OPACITY };
+      layers.push({ id: `${name}-fill`, type: "fill", source: "areas", filter: filter(name), paint });
     }
-    for (const kind of [...KINDS, "path" as const]) {
-      const paint = { "line-color": colours[kind], "line-width": 2, ...(kind === "zone" ? {} : { "line-dasharray": [3, 2] }) };
-      layers.push({ id: `${kind}-line`, type: "line", source: "areas", filter: filter(kind), paint });
+    for (const name of OUTLINES) {
+      const paint = { "line-color": colours(name), "line-width": 2, ...(name === "exclusion" ? {} : { "line-dasharray": DASHES[name] ?? DEFAULT_DASHES }) };
+      layers.push({ id: `${name}-line`, type: "line", source: "areas", filter: filter(name), paint });
     }
     for (const [id, width, opacity] of [["whole", 2, 0.3], ["flown", PATH_WIDTH_PX, 1]] as const) {
-      const paint = { "line-color": colours.flown, "line-width": width, "line-opacity": opacity };
+      const paint = { "line-color": colours("flown"), "line-width": width, "line-opacity": opacity };
       layers.push({ id: `${id}-line`, type: "line", source: id, layout: { "line-join": "round", "line-cap": "round" }, paint });
     }
     return { version: 8, sources: { areas: source(this.shapes()), whole: source([]), flown: source([]) }, layers };
@@ -145,15 +144,16 @@ export class FlightMap {
 
   paint(colours: Colours): void {
     this.colours = colours;
-    this.map.setPaintProperty("background", "background-color", colours.background);
+    this.map.setPaintProperty("background", "background-color", colours("map"));
     if (!this.ready) return;
-    for (const kind of KINDS) this.map.setPaintProperty(`${kind}-fill`, "fill-color", colours[kind]);
-    for (const kind of [...KINDS, "path" as const]) this.map.setPaintProperty(`${kind}-line`, "line-color", colours[kind]);
-    for (const id of ["whole", "flown"]) this.map.setPaintProperty(`${id}-line`, "line-color", colours.flown);
+    for (const name of AREAS) this.map.setPaintProperty(`${name}-fill`, "fill-color", colours(name));
+    for (const name of OUTLINES) this.map.setPaintProperty(`${name}-line`, "line-color", colours(name));
+    for (const id of ["whole", "flown"]) this.map.setPaintProperty(`${id}-line`, "line-color", colours("flown"));
   }
 
   /** Draws the state at a time. `now` is the time of the animation frame. */
   draw(time: number, selected: string, now: number): void {
+    this.time = time;
     if (!this.ready || !Number.isFinite(this.model.begin)) return;
     if (now - this.areasUpdated > AREAS_INTERVAL_MS) {
       this.areasUpdated = now;
@@ -212,8 +212,8 @@ export class FlightMap {
   private shapes(): GeoJSON.Feature[] {
     const drawn = new Set<string>();
     return this.features
-      .map((feature, id) => ({ ...feature, id }) as GeoJSON.Feature)
-      .filter(({ geometry }) => drawn.size < drawn.add(JSON.stringify(geometry)).size);
+      .map((feature, id) => ({ ...feature, properties: { class: classOf(feature) }, id }) as GeoJSON.Feature)
+      .filter(({ geometry }) => geometry.type !== "Point" && drawn.size < drawn.add(JSON.stringify(geometry)).size);
   }
 
   /** Sets the data of a source to the paths of all drones up to a time. */
@@ -242,6 +242,7 @@ export class FlightMap {
     context.lineJoin = "round";
     for (const feature of this.features) {
       if (feature.properties.kind === "zone") this.drawZoneLabel(context, feature);
+      else if (feature.properties.kind === "controlPoint") this.drawControlPoint(context, feature);
       else if (feature.geometry.type === "Point") this.drawEdgeNode(context, feature);
     }
     for (const link of this.model.linksAt(time)) this.drawLink(context, link, time);
@@ -279,7 +280,7 @@ export class FlightMap {
       else context.lineTo(x, y);
       last = fix.time_ms;
     }
-    context.strokeStyle = this.colours.flown;
+    context.strokeStyle = this.colours("flown");
     context.lineWidth = PATH_WIDTH_PX;
     context.stroke();
   }
@@ -298,8 +299,8 @@ export class FlightMap {
       context.lineTo(-8, 10);
       context.closePath();
     }
-    context.fillStyle = this.colours.flown;
-    context.strokeStyle = selected ? this.colours.text : this.colours.background;
+    context.fillStyle = this.colours("flown");
+    context.strokeStyle = selected ? this.colours("text") : this.colours("map");
     context.lineWidth = selected ? 3 : 2;
     context.stroke();
     context.fill();
@@ -310,10 +311,28 @@ export class FlightMap {
     const [lon, lat] = (feature.geometry as GeoJSON.Point).coordinates as [number, number];
     const { x, y } = this.map.project([lon, lat]);
     context.globalAlpha = feature.properties.state === "ready" ? 1 : NOT_READY_OPACITY;
-    context.fillStyle = this.colours.edgeNode;
+    context.fillStyle = this.colours("edgeNode");
     context.fillRect(x - 5, y - 5, 10, 10);
     this.drawText(context, x + 9, y + 4, feature.properties.name, "left");
     context.globalAlpha = 1;
+  }
+
+  /** Draws a control point as a diamond with its number. */
+  private drawControlPoint(context: CanvasRenderingContext2D, feature: Feature): void {
+    const [lon, lat] = (feature.geometry as GeoJSON.Point).coordinates as [number, number];
+    const { x, y } = this.map.project([lon, lat]);
+    context.beginPath();
+    context.moveTo(x, y - 7);
+    context.lineTo(x + 7, y);
+    context.lineTo(x, y + 7);
+    context.lineTo(x - 7, y);
+    context.closePath();
+    context.fillStyle = this.colours("map");
+    context.strokeStyle = this.colours("path");
+    context.lineWidth = 2;
+    context.fill();
+    context.stroke();
+    this.drawText(context, x, y + 20, String(feature.properties.number), "center");
   }
 
   /** Draws a direct link: dashed unless it is up, thick if it carries traffic. */
@@ -328,12 +347,12 @@ export class FlightMap {
     context.lineTo(to.x, to.y);
     context.setLineDash(link.phase === "Up" ? [] : [4, 4]);
     context.lineWidth = link.traffic === "direct" ? 4 : 1.5;
-    context.strokeStyle = this.colours.link;
+    context.strokeStyle = this.colours("link");
     context.stroke();
     context.restore();
   }
 
-  /** Draws the name and altitude limits of a zone at its centre, if the zone is large enough on the screen. */
+  /** Draws the name, effect and altitude limits of a zone at its centre, if the zone is large enough on the screen. */
   private drawZoneLabel(context: CanvasRenderingContext2D, feature: Feature): void {
     const bounds = new LngLatBounds();
     extend(bounds, feature.geometry.coordinates);
@@ -342,28 +361,31 @@ export class FlightMap {
     if (northEast.x - southWest.x < MIN_LABELLED_PX || southWest.y - northEast.y < MIN_LABELLED_PX) return;
     const x = (southWest.x + northEast.x) / 2;
     const y = (southWest.y + northEast.y) / 2;
+    const altitude = feature.properties.altitude === undefined ? "" : `, ${altitudeLimits(feature)}`;
     this.drawText(context, x, y - 4, feature.properties.name, "center");
-    if (feature.properties.altitude !== undefined) this.drawText(context, x, y + 12, altitudeLimits(feature), "center");
+    const effect = `${kindName(feature)}${altitude}`;
+    if (context.measureText(effect).width < northEast.x - southWest.x + MIN_LABELLED_PX) this.drawText(context, x, y + 12, effect, "center");
   }
 
   private drawText(context: CanvasRenderingContext2D, x: number, y: number, text: string, align: CanvasTextAlign): void {
     context.textAlign = align;
-    context.strokeStyle = this.colours.background;
+    context.strokeStyle = this.colours("map");
     context.lineWidth = 3;
     context.strokeText(text, x, y);
-    context.fillStyle = this.colours.text;
+    context.fillStyle = this.colours("text");
     context.fillText(text, x, y);
   }
 
-  /** Selects the drone at a clicked point, or shows the areas there. */
+  /** Selects the drone at a clicked point, or shows the areas and policies there. */
   private clicked(point: { x: number; y: number }, position: { lng: number; lat: number }): void {
     const clickedDrone = this.drawnDrones.find((drone) => Math.hypot(drone.x - point.x, drone.y - point.y) < CLICK_RADIUS_PX);
     if (clickedDrone !== undefined) return this.select(clickedDrone.name);
-    const layers = KINDS.map((kind) => `${kind}-fill`);
+    const layers = AREAS.map((name) => `${name}-fill`);
     const rendered = this.map.queryRenderedFeatures([point.x, point.y], { layers });
     const areas = rendered.map((shape) => this.features[Number(shape.id)]).filter((area) => area !== undefined);
     const lines = new Set(areas.map((area) => `${area.properties.name}: ${facts(area)}`));
-    if (lines.size === 0) return void this.popup.remove();
+    if (lines.size === 0) lines.add("no zone or area here");
+    lines.add(policiesAt(this.model, this.time, position.lng, position.lat) ?? "policies are not known");
     this.popup.setLngLat(position).setText([...lines].join("\n")).addTo(this.map);
   }
 }

@@ -1,15 +1,31 @@
 // Converts values to text for people.
 
-import type { Feature, Verdict } from "./events";
+import type { Feature, FeatureProperties, Verdict } from "./events";
+
+type ZoneUse = NonNullable<FeatureProperties["uses"]>[number];
 
 const KIND_NAMES: Record<string, string> = {
-  zone: "zone",
   operationArea: "operation area",
   corridor: "corridor",
   path: "planned path",
   depot: "depot",
   edgeNode: "edge node",
 };
+
+const USES: Record<ZoneUse, { name: string; class: ZoneClass }> = {
+  exclusion: { name: "exclusion zone", class: "exclusion" },
+  noPictures: { name: "no pictures", class: "pictures" },
+  inclusion: { name: "inclusion zone", class: "inclusion" },
+  denial: { name: "methods denied", class: "methods" },
+  pictureFilter: { name: "pictures filtered", class: "pictures" },
+  altitudeLimit: { name: "altitude limit", class: "limit" },
+  speedLimit: { name: "speed limit", class: "limit" },
+  grant: { name: "methods permitted only here", class: "methods" },
+};
+
+/** Classes of zones, in the order in which the map draws them. The class `zone` means no policy, or an unknown use. */
+export const ZONE_CLASSES = ["zone", "methods", "limit", "pictures", "inclusion", "exclusion"] as const;
+export type ZoneClass = (typeof ZONE_CLASSES)[number];
 
 /** Kinds of areas with altitude limits. */
 const KINDS_WITH_ALTITUDE = new Set(["zone", "operationArea", "corridor"]);
@@ -23,8 +39,19 @@ const ACTIONS: Record<string, string> = {
   takeover: "taken over",
 };
 
+/** Class of a feature, which determines its colour. For a zone, it is the class of its most restrictive use. */
+export function classOf(feature: Feature): string {
+  const { kind, uses } = feature.properties;
+  const use = uses?.[0];
+  return use === undefined ? kind : USES[use].class;
+}
+
 export function kindName(feature: Feature): string {
-  return KIND_NAMES[feature.properties.kind] ?? feature.properties.kind;
+  const { kind, uses, number } = feature.properties;
+  if (kind === "controlPoint") return `control point ${number}`;
+  if (kind !== "zone") return KIND_NAMES[kind] ?? kind;
+  if (uses === undefined) return "zone";
+  return uses.map((use) => USES[use].name).join(", ") || "zone without a policy";
 }
 
 /** Kind, altitude limits and state of an area or place. */

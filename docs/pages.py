@@ -34,6 +34,8 @@ ROOT_PAGES = {
 """Path on the site of each page outside docs/."""
 
 _LINK = re.compile(r"(!?)\[((?:[^\[\]]|\[[^\]]*\])*)\]\(([^)#\s]+)(#[^)\s]*)?\)")
+_SESSION = re.compile(r"^```\n(?=\$ )", re.MULTILINE)
+"""Opening fence of a block that begins with a prompt."""
 _VALUE = re.compile(r"^( *)(\w[\w-]*):(?: +(.*))?$")
 
 
@@ -53,10 +55,12 @@ def on_files(files: Files, *, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, *, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Change links between files of the repository to links between pages of the site.
+    """Change links between files of the repository to links between pages of the site, and mark shell sessions.
 
-    Links to files that are not on the site are replaced by their text.
+    Links to files that are not on the site are replaced by their text. In marked sessions, the copy button can leave out
+    prompts and output (site.css).
     """
+    markdown = _SESSION.sub("```console\n", markdown)
     source = next((name for name, site in ROOT_PAGES.items() if site == page.file.src_uri), None)
     folder = posixpath.dirname(source or "docs/" + page.file.src_uri)
 

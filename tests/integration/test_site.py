@@ -6,12 +6,17 @@ import os
 import re
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 import yaml
+from browser import CHROMIUM, launched
+from docs_pages import shell_lines
+from playwright.sync_api import Browser, sync_playwright
 
 pytestmark = pytest.mark.slow
+in_browser = pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed; `make packages` installs it")
 
 ROOT = Path(__file__).parents[2]
 
@@ -54,3 +59,39 @@ def test_site_loads_no_external_resources(site: Path) -> None:
         loaded = re.findall(r'<(?:script|link|img)[^>]+(?:src|href)="([^"]+)"', (site / page).read_text())
         assert loaded
         assert not [address for address in loaded if "://" in address]
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with sync_playwright() as playwright, launched(playwright) as running:
+        yield running
+
+
+@in_browser
+@pytest.mark.parametrize("page", ["tutorial", "view", "experiments"])
+def test_copy_buttons_copy_commands_without_prompts_and_output(site: Path, browser: Browser, page: str) -> None:
+    with browser.new_page(viewport={"width": 1280, "height": 800}) as tab:
+        tab.goto((site / f"{page}.html").as_uri())
+        # The theme copies the text of a block while the block has this attribute.
+        copied = tab.evaluate("""
+            () => Array.from(document.querySelectorAll(".highlight code:has(.gp)"), block => {
+                block.setAttribute("data-md-copying", "");
+                return block.innerText;
+            })
+        """)
+    lines = [line.strip() for line in "\n".join(copied).replace("\\\n", "").splitlines() if line.strip()]
+    assert lines
+    assert not [line for line in lines if line not in shell_lines(f"docs/{page}.md")]
+
+
+@in_browser
+@pytest.mark.parametrize("page", ["kinds", "values", "calls"])
+def test_reference_tables_show_each_name_on_one_line(site: Path, browser: Browser, page: str) -> None:
+    with browser.new_page(viewport={"width": 1280, "height": 800}) as tab:
+        tab.goto((site / "reference" / f"{page}.html").as_uri())
+        broken = tab.evaluate("""
+            () => Array.from(document.querySelectorAll("td:first-child code"))
+                .filter(name => name.getClientRects().length > 1)
+                .map(name => name.textContent)
+        """)
+    assert broken == []

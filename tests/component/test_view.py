@@ -118,6 +118,58 @@ def test_only_judged_calls_are_shown_as_verdicts(recording: Path) -> None:
     assert (verdict.reason, list(verdict.policies)) == ("inside", ["school"])
 
 
+def state(second: int, *, in_air: bool, mode: str = "GUIDED") -> Record:
+    content = {"altitude_m": 1.0, "mode": mode, "controller": "system", "in_air": in_air}
+    return Record("state", "fractus.State", START_NS + second * 10**9, content)
+
+
+def decision(second: int, kind: str, action: str, reason: str = "") -> Record:
+    content = {"kind": kind, "action": action, "reason": reason}
+    return Record("decisions", "fractus.Decision", START_NS + second * 10**9, content)
+
+
+def phases(path: Path, items: Iterable[Record]) -> list[str]:
+    with path.open("wb") as file:
+        write(file, items)
+    return [state.phase for state in events_of(State, Replay([path]).events())]
+
+
+def test_flight_home_is_shown_as_returning(tmp_path: Path) -> None:
+    items = [
+        decision(0, "control", "granted"),
+        state(1, in_air=True),
+        decision(2, "control", "returned"),  # at the end of a control point that is not the last
+        state(3, in_air=True),
+        decision(4, "control", "returned", "the mission is complete"),
+        state(5, in_air=True),
+        state(6, in_air=False),
+        decision(7, "control", "granted"),
+        state(8, in_air=True),
+        decision(9, "takeover", "returnToLaunch"),
+        state(10, in_air=True),
+        decision(11, "takeover", "pilot"),
+        state(12, in_air=True),
+        state(13, in_air=True, mode="SMART_RTL"),
+    ]
+    assert phases(tmp_path / "flight.mcap", items) == [
+        "in the air", "in the air", "returning", "on the ground", "in the air", "returning", "in the air", "returning",
+    ]  # fmt: skip
+
+
+def test_state_contains_the_start_of_the_flight_in_an_earlier_file(tmp_path: Path) -> None:
+    paths = [tmp_path / "1.mcap", tmp_path / "2.mcap"]
+    contents = [
+        [state(0, in_air=False), state(1, in_air=True), state(2, in_air=True)],
+        [state(3, in_air=True), state(4, in_air=False), state(5, in_air=True)],
+    ]
+    for path, content in zip(paths, contents, strict=True):
+        with path.open("wb") as file:
+            write(file, content)
+    start_ms = START_NS // 1_000_000
+    starts = [s.flight_ms for s in events_of(State, Replay(paths).events())]
+    assert starts == [None, *[start_ms + 1_000] * 4, start_ms + 5_000]
+
+
 def test_invalid_messages_are_skipped(tmp_path: Path) -> None:
     path = tmp_path / "odd.mcap"
     invalid = [

@@ -53,11 +53,11 @@ def zone(name: str, rings: list[list[tuple[float, float]]], *uses: str) -> Featu
     return {"type": "Feature", "properties": properties, "geometry": {"type": "Polygon", "coordinates": rings}}  # type: ignore[typeddict-item]
 
 
-def drone(time_ms: int, north: float, *, phase: str = "in the air") -> list[Event]:
+def drone(time_ms: int, north: float, *, phase: str = "in the air", flight_ms: int | None = None) -> list[Event]:
     """Return position and state of a drone at a distance north of the origin, in degrees."""
     return [
         Fix("drone-1", time_ms, LAT + north, LON, 30.0, 0.0),
-        State("drone-1", time_ms, 10.0, 1.0, 0.5, "GUIDED", "Navigator", phase),
+        State("drone-1", time_ms, 10.0, 1.0, 0.5, "GUIDED", "Navigator", phase, None, flight_ms),
     ]
 
 
@@ -129,3 +129,42 @@ def test_view_map_states_policies_at_a_clicked_place(browser: Browser, source: P
         page.locator("#map canvas").first.click(position={"x": 60, "y": 60})
         expect(popup).to_contain_text("no zone or area here")
         expect(popup).to_contain_text("no policy restricts this place")
+
+
+def wait_for_pixels(page: Page, colour: tuple[int, int, int], at_least: int) -> None:
+    """Wait until the map has pixels of a colour."""
+    found = 0
+    for _ in range(40):
+        found = pixels(page, colour)
+        if found >= at_least:
+            return
+        page.wait_for_timeout(500)
+    raise AssertionError(f"{found} pixels of {colour}, expected at least {at_least}")
+
+
+def scale_m(page: Page) -> float:
+    """Return the length of the scale bar in metres."""
+    number, unit = page.locator(".maplibregl-ctrl-scale").inner_text().split()
+    return float(number) * {"m": 1, "km": 1_000}[unit]
+
+
+def test_view_map_zooms_to_the_flight_and_separates_earlier_paths(browser: Browser, source: PageSource) -> None:
+    far = zone("far", square(0.5, 0.5), "exclusion")
+    start_ms = T_MS + 60_000
+    source.publish(Areas("zones", T_MS, [far]))
+    for second in range(10):
+        source.publish(*drone(T_MS + second * 1_000, -0.0001 * second))
+    with source.serving() as address, opened(browser, address) as page:
+        page.wait_for_selector("#map[data-map=ready]")
+        assert scale_m(page) < 500, "the map does not show the flight at the start"
+        page.get_by_role("button", name="Show all").press("Enter")
+        assert scale_m(page) > 2_000
+        for second in range(10):
+            source.publish(*drone(start_ms + second * 1_000, 0.0001 * second, flight_ms=start_ms))
+        expect(page.locator("#legend")).to_contain_text("earlier path", timeout=TIMEOUT_MS)
+        page.get_by_role("button", name="Zoom to flight").press("Enter")
+        assert scale_m(page) < 500
+        wait_for_pixels(page, (11, 87, 184), 500)
+        expect(page.locator("#drones")).to_contain_text("in the air")
+        source.publish(*drone(start_ms + 11_000, 0.0, phase="returning", flight_ms=start_ms))
+        expect(page.locator("#drones .badge")).to_have_text("returning", timeout=TIMEOUT_MS)

@@ -221,6 +221,23 @@ async def test_view_reports_changed_and_deleted_objects(monkeypatch: pytest.Monk
     )
 
 
+async def test_drone_of_a_finished_mission_is_shown_as_returning(monkeypatch: pytest.MonkeyPatch) -> None:
+    server = ApiServer(*ALL)
+    clock = Clock()
+    async with watched(server, clock, monkeypatch) as cluster:
+        await until(cluster, lambda event: event["type"] == "policies")
+        clock.now_ms += 5_000
+        await server.send_event("MODIFIED", APPLICATION | {"status": {"phase": "Returning", "drone": "drone-1"}})
+        events = await until(cluster, lambda event: event["type"] == "state" and event["phase"] == "returning")
+        assert last(events, "state")["flight_ms"] == NOW_MS, "the flight starts at the first report from the air"
+        await server.send_event("MODIFIED", DRONE | {"status": DRONE["status"] | {"flightState": "inactive"}})
+        events = await until(cluster, lambda event: event["type"] == "state" and event["phase"] == "on the ground")
+        clock.now_ms += 5_000
+        await server.send_event("MODIFIED", DRONE)
+        events = await until(cluster, lambda e: e["type"] == "state" and e["flight_ms"] != NOW_MS)
+        assert last(events, "state")["flight_ms"] == NOW_MS + 10_000
+
+
 async def test_lost_api_server_is_reported_with_time_and_reason(monkeypatch: pytest.MonkeyPatch) -> None:
     server = ApiServer(*ALL)
     clock = Clock()

@@ -15,6 +15,7 @@ from prometheus_client import Metric
 
 from fractus_view import objects
 from fractus_view.events import Applications, Areas, Contact, Event, Gone, Links, Policies, Problem
+from fractus_view.flight_times import FlightTimes
 from fractus_view.hub import Hub
 
 PUBLISH_INTERVAL_S = 0.2
@@ -55,6 +56,8 @@ class ClusterSource:
         self._hub = Hub()
         self._changed: set[type[api.Resource]] = set()
         self._changed_drones: set[str] = set()
+        self._returning: frozenset[str] = frozenset()
+        self._flights = FlightTimes()
         self._last_contact_ms = now_ms()
         self._informers: dict[type[api.Resource], Informer[Any]] = {
             model: self._informer(model, namespace if model.NAMESPACED else "") for model in KINDS
@@ -134,8 +137,10 @@ class ClusterSource:
 
     def _events(self, changed: set[type[api.Resource]], drones: set[str]) -> Iterator[Event]:
         now_ms = self._now_ms()
-        for name in sorted(drones):
-            yield from self._drone(name, now_ms)
+        returning = objects.returning_drones(self._all(api.Application))
+        for name in sorted(drones | (returning ^ self._returning)):
+            yield from self._drone(name, now_ms, returns=name in returning)
+        self._returning = returning
         if changed & {api.Zone, api.Policy}:
             yield Areas("zones", now_ms, objects.zones(self._all(api.Zone), self._all(api.Policy)))
         if changed & {api.EdgeNode, api.Depot}:
@@ -156,12 +161,14 @@ class ClusterSource:
             policies = map(objects.policy, self._all(api.Policy))
             yield Policies(now_ms, sorted(policies, key=attrgetter("name")))
 
-    def _drone(self, name: str, now_ms: int) -> Iterator[Event]:
+    def _drone(self, name: str, now_ms: int, *, returns: bool) -> Iterator[Event]:
         drone: api.Drone | None = self._informers[api.Drone].get(("", name))
         if drone is None:
+            self._flights.forget(name)
             yield Gone(name, now_ms)
             return
-        yield objects.state(drone, now_ms)
+        flight_ms = self._flights.update(name, now_ms, in_air=objects.in_air(drone))
+        yield objects.state(drone, now_ms, flight_ms, returns=returns)
         fix = objects.fix(drone, now_ms)
         if fix is not None:
             yield fix

@@ -43,6 +43,7 @@ class State:
         controller: Control authority, or an empty string.
         phase: Phase of the flight, for people.
         seen_ms: Time of the drone's report in Unix milliseconds, or None if it equals `time_ms`.
+        flight_ms: Start of the current or latest flight in Unix milliseconds, or None if the source contains no flight.
     """
 
     drone: str
@@ -54,6 +55,7 @@ class State:
     controller: str
     phase: str
     seen_ms: int | None = None
+    flight_ms: int | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,6 +9,7 @@ from typing import cast, get_args
 from fractus_core import api
 from fractus_core.api.geometry import Area, Circle, Position
 from fractus_core.api.model import Condition, Metadata
+from fractus_core.api.nodes import is_airborne
 from fractus_core.api.policies import PolicySpec, ZoneSpec, ZoneUse
 from fractus_core.geo import line_geojson
 from fractus_core.geo.formats.geojson import zone_feature
@@ -40,13 +41,28 @@ def fix(drone: api.Drone, now_ms: int) -> Fix | None:
     return Fix(drone.name, now_ms, position.lat, position.lon, amsl_m, heading_deg=None)
 
 
-def state(drone: api.Drone, now_ms: int) -> State:
-    """Return the reported state of a drone."""
+def in_air(drone: api.Drone) -> bool:
+    """Return True if a drone is in the air, or was in the air at its last report."""
+    status = drone.status or api.nodes.DroneStatus()
+    return is_airborne(status.flight_state, status.last_flight_state)
+
+
+def state(drone: api.Drone, now_ms: int, flight_ms: int | None = None, *, returns: bool = False) -> State:
+    """Return the reported state of a drone.
+
+    Args:
+        drone: The drone.
+        now_ms: Current time in Unix milliseconds.
+        flight_ms: Start of the current or latest flight in Unix milliseconds.
+        returns: True if the mission of the drone is over, so that it flies home.
+    """
     status = drone.status or api.nodes.DroneStatus()
     phase = _PHASES.get(status.flight_state)
     if phase is None:
         last_phase = _PHASES.get(status.last_flight_state or "")
         phase = f"not reporting, last {last_phase}" if last_phase else "not reporting"
+    elif returns and status.flight_state == "flying":
+        phase = "returning"
     position = status.position
     return State(
         drone=drone.name,
@@ -58,7 +74,14 @@ def state(drone: api.Drone, now_ms: int) -> State:
         controller=short_name(status.controller),
         phase=phase,
         seen_ms=_unix_ms(status.last_seen),
+        flight_ms=flight_ms,
     )
+
+
+def returning_drones(applications: Iterable[api.Application]) -> frozenset[str]:
+    """Return the names of the drones that fly home after the mission of an application."""
+    statuses = (resource.status for resource in applications)
+    return frozenset(s.drone for s in statuses if s is not None and s.phase == "Returning" and s.drone)
 
 
 def application(resource: api.Application) -> Application:

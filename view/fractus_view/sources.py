@@ -9,14 +9,16 @@ import itertools
 import logging
 import time
 from base64 import b64decode
-from collections.abc import AsyncIterator, Iterator, Sequence
+from collections.abc import AsyncIterator, Iterable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Protocol
 
-from fractus_view.events import END, RESET, Event, Problem, encode, stream_message
+from fractus_view.events import END, RESET, Event, Problem, State, encode, stream_message
+from fractus_view.flight_times import FlightTimes
 from fractus_view.hub import Hub
 from fractus_view.mcap_tail import DamagedFile, MessageLocation, Tail, message_at
-from fractus_view.translation import Translator
+from fractus_view.translation import ON_THE_GROUND, Translator
 
 log = logging.getLogger(__name__)
 
@@ -95,7 +97,17 @@ class Replay:
     def events(self) -> Iterator[Event]:
         """Yield the events of all files, merged by time."""
         per_file = (_events(Tail(path), Translator(number)) for number, path in enumerate(self._files.paths))
-        return heapq.merge(*per_file, key=lambda event: event.time_ms)
+        return _with_flights(heapq.merge(*per_file, key=lambda event: event.time_ms), FlightTimes())
+
+
+def _with_flights(events: Iterable[Event], flights: FlightTimes) -> Iterator[Event]:
+    """Add the start of the flight to each state. A flight may begin in an earlier file, so events of all files are needed."""
+    for event in events:
+        if isinstance(event, State):
+            started_ms = flights.update(event.drone, event.time_ms, in_air=event.phase != ON_THE_GROUND)
+            yield replace(event, flight_ms=started_ms)
+        else:
+            yield event
 
 
 def _events(tail: Tail, translator: Translator) -> Iterator[Event]:
@@ -122,6 +134,7 @@ class GrowingRecordings:
         self._hub = Hub()
         self._files = PictureFiles()
         self._open: dict[Path, tuple[Tail, Translator]] = {}
+        self._flights = FlightTimes()
         self._problem = ""
 
     def picture(self, id_: str) -> bytes | None:
@@ -154,7 +167,7 @@ class GrowingRecordings:
         for tail, translator in self._open.values():
             if not tail.finished:
                 events += _events(tail, translator)
-        return sorted(events, key=lambda event: event.time_ms)
+        return list(_with_flights(sorted(events, key=lambda event: event.time_ms), self._flights))
 
     def _scan(self) -> None:
         """Start to read new files, and forget removed files."""

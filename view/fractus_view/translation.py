@@ -20,6 +20,15 @@ STILL_FIX_INTERVAL_MS = 1_000
 _DEFAULT_LEVEL = 2
 """Level of foxglove.Log of a log line without a level (information)."""
 
+_RETURN_ACTIONS = frozenset({"returnToLaunch", "homeward", "RTL", "SMART_RTL"})
+"""Actions of takeovers and changes of control after which the drone flies home."""
+
+_RETURN_MODES = frozenset({"RTL", "SMART_RTL"})
+"""Modes in which the autopilot itself flies home."""
+
+ON_THE_GROUND = "on the ground"
+"""Phase of a drone with stopped motors."""
+
 VERDICT_KINDS = frozenset({"call", "monitor", "takeover"})
 """Kinds of audit entries that are verdicts. Other entries become log lines."""
 
@@ -35,6 +44,7 @@ class Translator:
         self._file = file
         self._heading: dict[str, float] = {}
         self._last: dict[str, Fix] = {}
+        self._returning: set[str] = set()
 
     def events(self, message: RecordedMessage) -> Iterator[Event]:
         """Yield the events of a message. Messages that are irrelevant or do not match their schema have no events."""
@@ -50,9 +60,11 @@ class Translator:
                 if yaw is not None:
                     self._heading[node] = round(math.degrees(yaw) % 360, 1)
             case "fractus.State":
-                yield _state(node, time_ms, content)
-            case "fractus.Decision" if content.get("kind") in VERDICT_KINDS:
-                yield _verdict(node, time_ms, content)
+                yield _state(node, time_ms, content, returns=node in self._returning)
+            case "fractus.Decision":
+                self._follow_control(node, content)
+                if content.get("kind") in VERDICT_KINDS:
+                    yield _verdict(node, time_ms, content)
             case "foxglove.GeoJSON":
                 yield from _areas(node, time_ms, content)
             case "foxglove.CompressedImage" if content.get("format") == "jpeg":
@@ -62,6 +74,22 @@ class Translator:
                 level = content.get("level")
                 text = _text(content.get("message"))
                 yield Note(node, time_ms, level if isinstance(level, int) else _DEFAULT_LEVEL, text)
+
+    def _follow_control(self, node: str, content: Mapping[str, Any]) -> None:
+        """Note from a change of control if the drone flies home."""
+        action = _text(content.get("action"))
+        match content.get("kind"):
+            case "takeover":
+                returns = action in _RETURN_ACTIONS
+            # A driver that returns control for the last time gives the outcome of the mission as the reason.
+            case "control" if action in {"returned", "granted", "landed", *_RETURN_ACTIONS}:
+                returns = action in _RETURN_ACTIONS or (action == "returned" and bool(content.get("reason")))
+            case _:
+                return
+        if returns:
+            self._returning.add(node)
+        else:
+            self._returning.discard(node)
 
     def _fix(self, node: str, time_ms: int, content: Mapping[str, Any]) -> Iterator[Fix]:
         lat = _number(content.get("latitude"))
@@ -78,16 +106,20 @@ class Translator:
         yield fix
 
 
-def _state(node: str, time_ms: int, content: Mapping[str, Any]) -> State:
+def _state(node: str, time_ms: int, content: Mapping[str, Any], *, returns: bool) -> State:
+    mode = _text(content.get("mode"))
+    phase = ON_THE_GROUND
+    if content.get("in_air") is True:
+        phase = "returning" if returns or mode in _RETURN_MODES else "in the air"
     return State(
         drone=node,
         time_ms=time_ms,
         altitude_m=_number(content.get("altitude_m")),
         speed_mps=_number(content.get("speed_mps")),
         battery=_number(content.get("battery")),
-        mode=_text(content.get("mode")),
+        mode=mode,
         controller=short_name(content.get("controller")),
-        phase="in the air" if content.get("in_air") is True else "on the ground",
+        phase=phase,
     )
 
 

@@ -32,6 +32,7 @@ export interface Fix {
  *     controller: Control authority, or an empty string.
  *     phase: Phase of the flight, for people.
  *     seen_ms: Time of the drone's report in Unix milliseconds, or null if it equals `time_ms`.
+ *     flight_ms: Start of the current or latest flight in Unix milliseconds, or null if the source contains no flight.
  */
 export interface State {
   type: "state";
@@ -44,6 +45,7 @@ export interface State {
   controller: string;
   phase: string;
   seen_ms: number | null;
+  flight_ms: number | null;
 }
 
 /** A drone was removed. Its earlier events are void. */

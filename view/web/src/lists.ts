@@ -1,7 +1,7 @@
 // Lists of drones, verdicts, areas and other objects. They contain everything that the map shows.
 
 import type { Application, Feature, Link, Note, Policy, Verdict } from "./events";
-import type { Drone, Model } from "./model";
+import { type Drone, MAX_GAP_MS, type Model } from "./model";
 import { policiesAt } from "./places";
 import { actionOf, callOf, classOf, clock, facts, isIntervention, kindName, quantity, sentence } from "./text";
 
@@ -98,6 +98,7 @@ export class Lists {
     this.showDrones(time, selected);
     this.showVerdicts(time);
     this.showZones(time);
+    this.showLegend(time);
     const model = this.model;
     // Hide these lists for a cluster, which reports no calls, pictures or logs. Empty lists would suggest that there were none.
     const fromCluster = model.contact !== undefined && model.verdicts.values.length === 0;
@@ -211,8 +212,6 @@ export class Lists {
       const number = properties.number === undefined ? "" : ` ${properties.number}`;
       features.set(`${name}${owner}${number}`, feature);
     }
-    const classes = new Set([...features.values()].map(classOf));
-    for (const entry of this.legend) entry.hidden = !classes.has(entry.dataset["class"]!);
     const key = [...features].map(([name, feature]) => `${name} ${facts(feature)}`).join("\n");
     if (key === this.shown.zones) return;
     this.shown.zones = key;
@@ -224,6 +223,15 @@ export class Lists {
     });
     this.zones.replaceChildren(...items);
     if (items.length === 0) this.empty(this.zones, "No zones or areas.");
+  }
+
+  /** Shows the entries of the legend whose class the map contains. */
+  private showLegend(time: number): void {
+    const classes = new Set(this.model.features(time).map(classOf));
+    if (this.model.linksAt(time).length > 0) classes.add("link");
+    const drones = [...this.model.drones.values()];
+    if (drones.some((drone) => (drone.fixes.values[0]?.time_ms ?? Infinity) < drone.flightStart(time) - MAX_GAP_MS)) classes.add("earlier");
+    for (const entry of this.legend) entry.hidden = !classes.has(entry.dataset["class"]!);
   }
 
   /** Shows the section of a list. The section stays hidden until the source has sent such a list. */

@@ -62,6 +62,7 @@ async function openMap(): Promise<void> {
     map = new module.FlightMap(byId("map"), model, colours(), reducedMotion, select, time);
     window.matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => map?.paint(colours()));
     if (complete) map?.showWhole();
+    byId("map-tools").hidden = false;
   } catch (error) {
     byId("map").hidden = true;
     byId("legend").hidden = true;
@@ -179,6 +180,8 @@ function show(): void {
   output.textContent = `${clock(playback.time)} UTC · ${progress}`;
 }
 
+byId("zoom-flight").addEventListener("click", () => map?.zoomToFlight(playback.time, selected));
+byId("zoom-all").addEventListener("click", () => map?.zoomToAll());
 play.addEventListener("click", () => {
   if (playback.playing || playback.following) playback.pause();
   else playback.play(model.begin, model.end);

@@ -31,6 +31,8 @@ const NOT_READY_OPACITY = 0.55;
 
 /** Classes of areas, in drawing order. */
 const AREAS = ["operationArea", "corridor", "depot", ...ZONE_CLASSES] as const;
+/** Kinds of features that belong to the flight of an application. */
+const FLIGHT_KINDS = new Set(["operationArea", "corridor", "path", "controlPoint"]);
 /** Classes of areas and lines, each with its own outline. */
 const OUTLINES = [...AREAS, "path"] as const;
 const FILL_OPACITY: Record<string, number> = { exclusion: 0.22, pictures: 0.18, limit: 0.14 };
@@ -57,6 +59,8 @@ export class FlightMap {
   private showsWhole = false;
   /** True if the user has moved the map. */
   private moved = false;
+  /** Names of the flying drones to which the map was fitted. */
+  private flying = "";
   private drawnDrones: { x: number; y: number; name: string }[] = [];
 
   constructor(
@@ -113,11 +117,13 @@ export class FlightMap {
       const paint = { "line-color": colours(name), "line-width": 2, ...(name === "exclusion" ? {} : { "line-dasharray": DASHES[name] ?? DEFAULT_DASHES }) };
       layers.push({ id: `${name}-line`, type: "line", source: "areas", filter: filter(name), paint });
     }
+    const earlier = { "line-color": colours("earlier"), "line-width": 2, "line-dasharray": [1, 2] };
+    layers.push({ id: "earlier-line", type: "line", source: "earlier", paint: earlier });
     for (const [id, width, opacity] of [["whole", 2, 0.3], ["flown", PATH_WIDTH_PX, 1]] as const) {
       const paint = { "line-color": colours("flown"), "line-width": width, "line-opacity": opacity };
       layers.push({ id: `${id}-line`, type: "line", source: id, layout: { "line-join": "round", "line-cap": "round" }, paint });
     }
-    return { version: 8, sources: { areas: source(this.shapes()), whole: source([]), flown: source([]) }, layers };
+    return { version: 8, sources: { areas: source(this.shapes()), whole: source([]), earlier: source([]), flown: source([]) }, layers };
   }
 
   /** Makes the map visible after the first frame that contains all areas. */
@@ -126,7 +132,10 @@ export class FlightMap {
     if (!this.ready) {
       this.ready = true;
       this.map.getCanvasContainer().style.visibility = "";
-      if (this.showsWhole) this.showWhole();
+      if (this.showsWhole) {
+        this.showWhole();
+        this.fit(this.time);
+      }
     }
     if (this.features.length === 0) return;
     this.map.off("render", this.rendered);
@@ -148,6 +157,7 @@ export class FlightMap {
     if (!this.ready) return;
     for (const name of AREAS) this.map.setPaintProperty(`${name}-fill`, "fill-color", colours(name));
     for (const name of OUTLINES) this.map.setPaintProperty(`${name}-line`, "line-color", colours(name));
+    this.map.setPaintProperty("earlier-line", "line-color", colours("earlier"));
     for (const id of ["whole", "flown"]) this.map.setPaintProperty(`${id}-line`, "line-color", colours("flown"));
   }
 
@@ -158,13 +168,15 @@ export class FlightMap {
     if (now - this.areasUpdated > AREAS_INTERVAL_MS) {
       this.areasUpdated = now;
       this.showAreas(time);
+      this.fitToNewFlights(time);
     }
     const jumped = time < this.pathsEnd || time - this.pathsEnd > MAX_TAIL_MS;
     const interval = jumped ? AREAS_INTERVAL_MS : PATHS_INTERVAL_MS;
     if (time !== this.pathsEnd && now - this.pathsUpdated > interval) {
       this.pathsUpdated = now;
       this.pathsEnd = time;
-      this.setPaths("flown", time);
+      this.setPaths("flown", (drone) => flownPath(drone, drone.flightStart(time), time));
+      this.setPaths("earlier", (drone) => flownPath(drone, -Infinity, Math.min(drone.flightStart(time) - 1, time)));
     }
     this.drawOverlay(time, selected);
   }
@@ -172,20 +184,62 @@ export class FlightMap {
   /** Draws the complete paths of a recording. */
   showWhole(): void {
     this.showsWhole = true;
-    if (this.ready) this.setPaths("whole", Infinity);
+    if (this.ready) this.setPaths("whole", (drone) => flownPath(drone, -Infinity, Infinity));
   }
 
-  /** Fits the map to all areas and drones, unless the user has moved it. */
+  /** Fits the map to the flights, or to everything if no drone flies, unless the user has moved it. */
   fit(time: number): void {
-    if (!this.ready || this.moved) return;
-    const bounds = this.bounds(time);
+    if (this.ready && !this.moved) this.showBounds(this.bounds(time));
+  }
+
+  /** Fits the map to the flight of a drone, or to all flights if no drone is selected. */
+  zoomToFlight(time: number, selected: string): void {
+    this.moved = true;
+    const drones = [...this.model.drones.values()];
+    const chosen = drones.filter((drone) => (selected ? drone.name === selected : drone.isFlying(time)));
+    this.showBounds(this.flightBounds(chosen.length > 0 ? chosen : drones, time));
+  }
+
+  zoomToAll(): void {
+    this.moved = true;
+    this.showBounds(this.allBounds());
+  }
+
+  private showBounds(bounds: LngLatBounds): void {
     if (!bounds.isEmpty()) this.map.fitBounds(bounds, { ...FIT, animate: false });
   }
 
   private bounds(time: number): LngLatBounds {
+    const drones = [...this.model.drones.values()];
+    // A recording is shown from its beginning, when its drones do not fly yet.
+    const flying = this.showsWhole ? drones : drones.filter((drone) => drone.isFlying(time));
+    const bounds = this.flightBounds(flying, this.showsWhole ? Infinity : time);
+    return bounds.isEmpty() ? this.allBounds() : bounds;
+  }
+
+  private allBounds(): LngLatBounds {
     const bounds = new LngLatBounds();
-    for (const feature of this.model.features(time)) extend(bounds, feature.geometry.coordinates);
+    for (const feature of this.model.features(this.time)) extend(bounds, feature.geometry.coordinates);
     for (const drone of this.model.drones.values()) for (const fix of drone.fixes.values) bounds.extend([fix.lon, fix.lat]);
+    return bounds;
+  }
+
+  /** Bounds of the paths that drones have flown since their takeoff, and of the areas of their applications. */
+  private flightBounds(drones: Drone[], time: number): LngLatBounds {
+    const bounds = new LngLatBounds();
+    if (drones.length === 0) return bounds;
+    for (const drone of drones) {
+      const begin = this.showsWhole ? -Infinity : drone.flightStart(time);
+      for (const fix of drone.fixes.values) if (fix.time_ms >= begin && fix.time_ms <= time) bounds.extend([fix.lon, fix.lat]);
+    }
+    const names = new Set(drones.map((drone) => drone.name));
+    const applications = this.model.applications.at(time)?.applications ?? [];
+    const flown = new Set(applications.filter((application) => names.has(application.drone)).map((application) => application.name));
+    for (const feature of this.model.features(time)) {
+      const { kind, application } = feature.properties;
+      // Areas without an application are those of the recorded drones.
+      if (FLIGHT_KINDS.has(kind) && (application === undefined || flown.has(application))) extend(bounds, feature.geometry.coordinates);
+    }
     return bounds;
   }
 
@@ -197,6 +251,15 @@ export class FlightMap {
     const center: [number, number] = [position.lon, position.lat];
     if (this.reducedMotion) this.map.jumpTo({ center });
     else this.map.easeTo({ center, duration: 400 });
+  }
+
+  /** Fits the map again if the flying drones have changed. The extent of a recording contains all its flights from the beginning. */
+  private fitToNewFlights(time: number): void {
+    const flying = [...this.model.drones.values()].filter((drone) => drone.isFlying(time)).map((drone) => drone.name);
+    const key = flying.join();
+    if (key === this.flying) return;
+    this.flying = key;
+    if (key && !this.showsWhole) this.fit(time);
   }
 
   private showAreas(time: number): void {
@@ -216,9 +279,8 @@ export class FlightMap {
       .filter(({ geometry }) => geometry.type !== "Point" && drawn.size < drawn.add(JSON.stringify(geometry)).size);
   }
 
-  /** Sets the data of a source to the paths of all drones up to a time. */
-  private setPaths(source: string, time: number): void {
-    const features = [...this.model.drones.values()].flatMap((drone) => flownPath(drone, time));
+  private setPaths(source: string, path: (drone: Drone) => GeoJSON.Feature[]): void {
+    const features = [...this.model.drones.values()].flatMap(path);
     this.source(source).setData({ type: "FeatureCollection", features });
   }
 
@@ -390,18 +452,20 @@ export class FlightMap {
   }
 }
 
-/** Returns the path of a drone up to a time. It is interrupted if the drone has reported no position for `MAX_GAP_MS`. */
-function flownPath(drone: Drone, time: number): GeoJSON.Feature<GeoJSON.MultiLineString>[] {
+/** Returns the path of a drone between two times. It is interrupted if the drone has reported no position for `MAX_GAP_MS`. */
+function flownPath(drone: Drone, begin: number, end: number): GeoJSON.Feature<GeoJSON.MultiLineString>[] {
   const parts: [number, number][][] = [];
   let last = -Infinity;
-  const count = Number.isFinite(time) ? drone.fixes.count(time) : drone.fixes.values.length;
-  for (const fix of drone.fixes.values.slice(0, count)) {
+  for (const fix of drone.fixes.values) {
+    if (fix.time_ms < begin || fix.time_ms > end) continue;
     if (fix.time_ms - last > MAX_GAP_MS) parts.push([]);
     parts.at(-1)!.push([fix.lon, fix.lat]);
     last = fix.time_ms;
   }
-  const position = drone.position(time);
-  if (position !== undefined && time - position.reported < MAX_GAP_MS) parts.at(-1)?.push([position.lon, position.lat]);
+  const position = drone.position(end);
+  if (position !== undefined && position.reported >= begin && end - position.reported < MAX_GAP_MS) {
+    parts.at(-1)?.push([position.lon, position.lat]);
+  }
   const coordinates = parts.filter((part) => part.length > 1);
   if (coordinates.length === 0) return [];
   return [{ type: "Feature", properties: { drone: drone.name }, geometry: { type: "MultiLineString", coordinates } }];

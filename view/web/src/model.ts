@@ -12,6 +12,9 @@ export const MAX_GAP_MS = 10_000;
 /** Time without a report after which a drone is drawn pale. On the ground, a drone may report only every 30 s. */
 const STALE_AFTER_MS = 45_000;
 
+/** Phases in which a drone does not fly. A drone that last reported from the air may still be flying. */
+const GROUND_PHASES = new Set(["on the ground", "charging", "not reporting", "not reporting, last on the ground", "not reporting, last charging"]);
+
 /** Values in order of time. A full series drops every second value of its older half (`thin`), or its older half. */
 export class Series<T extends { time_ms: number }> {
   readonly values: T[] = [];
@@ -73,6 +76,16 @@ export class Drone {
     if (state?.seen_ms != null) return time - state.seen_ms > STALE_AFTER_MS;
     const reported = Math.max(state?.time_ms ?? -Infinity, this.fixes.at(time)?.time_ms ?? -Infinity);
     return time - reported > STALE_AFTER_MS;
+  }
+
+  /** Start of the flight that is current or latest at a time. Minus infinity if there was none. */
+  flightStart(time: number): number {
+    return this.states.at(time)?.flight_ms ?? -Infinity;
+  }
+
+  isFlying(time: number): boolean {
+    const phase = this.states.at(time)?.phase;
+    return phase !== undefined && !GROUND_PHASES.has(phase);
   }
 
   /** Position at a time, interpolated between the positions before and after it. */

@@ -304,18 +304,21 @@ def policy_decisions(audit: Iterable[Mapping[str, Any]]) -> tuple[JudgedCall, ..
 def _policy_decision(entry: Mapping[str, Any]) -> JudgedCall | None:
     """Return the call of an audit log entry if policies changed the call. Return None for all other entries."""
     kind = entry.get("kind")
+    changed = kind == "takeover" or (kind in {"call", "monitor"} and entry.get("action") in _CHANGING_ACTIONS)
+    return judged_call(entry) if changed else None
+
+
+def judged_call(entry: Mapping[str, Any]) -> JudgedCall:
+    """Return the call, or the action of the system, of an audit log entry of kind call, monitor or takeover."""
+    kind = entry["kind"]
     action = entry.get("action")
-    if kind not in {"call", "monitor", "takeover"}:
-        return None
-    if kind != "takeover" and action not in _CHANGING_ACTIONS:
-        return None
     position = _place(entry, None)
     args = entry.get("args") or {}
     return JudgedCall(
         time_s=_time_s(entry["time"]),
         caller=component_name(entry.get("caller", "")) if kind == "call" else "the system",
         method=entry["method"] if kind == "call" else entry.get("action", kind),
-        action=str(action) if action in _CHANGING_ACTIONS else "takeover",
+        action=str(action) if kind == "call" or action in _CHANGING_ACTIONS else "takeover",
         code=entry.get("code", ""),
         reason=entry.get("reason", ""),
         policies=tuple(entry.get("policies", ())),

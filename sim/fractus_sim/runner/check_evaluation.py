@@ -259,7 +259,9 @@ def _simultaneous_samples(ones: Sequence[Sample], others: Sequence[Sample]) -> I
 
 
 def _program(check: checks.ProgramEnded, evidence: Evidence) -> tuple[bool, str]:
-    code = evidence.findings.programs.get(check.program)
+    if check.program not in evidence.findings.programs:
+        return False, "was not started"
+    code = evidence.findings.programs[check.program]
     observed = "had to be stopped" if code is None else f"exit code {code}"
     return code == check.exit_code, observed
 

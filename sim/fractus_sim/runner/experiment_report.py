@@ -146,6 +146,13 @@ def experiment_results(outcome: Outcome) -> dict[str, Any]:
             for event in outcome.events
         ],
         "programs": outcome.findings.programs,
+        "resources": {
+            name: {
+                "vehicle": usage.vehicle or None, "cpu_s": round(usage.cpu_s, 2), "wall_s": round(usage.wall_s, 2),
+                "mean_memory_mib": round(usage.mean_memory_mib, 1), "peak_memory_mib": round(usage.peak_memory_mib, 1),
+            }
+            for name, usage in outcome.findings.usages.items()
+        },
         "phases": outcome.findings.phases,
         "audit": outcome.findings.audit_problems,
     }  # fmt: skip

@@ -85,15 +85,25 @@ class Processes:
         """Return True if a process with this name is running."""
         return name in self._running and self._poll(self._running[name]) is None
 
+    def started(self, name: str) -> bool:
+        """Return True if a process with this name was started."""
+        return name in self._running
+
+    def pid(self, name: str) -> int:
+        """Return the id of the process that was started last with this name.
+
+        Raises:
+            ExperimentError: No process with this name was started.
+        """
+        return self._process(name).pid
+
     def exit_code(self, name: str) -> int | None:
         """Return the exit code of a process, or None while it is running.
 
         Raises:
             ExperimentError: No process with this name was started.
         """
-        if name not in self._running:
-            raise ExperimentError(f"no process {name}; known: {', '.join(sorted(self._running)) or 'none'}")
-        return self._poll(self._running[name])
+        return self._poll(self._process(name))
 
     def dead(self) -> dict[str, int]:
         """Return the exit codes of the processes that have ended."""
@@ -158,6 +168,11 @@ class Processes:
         finally:
             self.stop(*self._running, kill=True)
             self._guard.close()
+
+    def _process(self, name: str) -> subprocess.Popen[bytes]:
+        if name not in self._running:
+            raise ExperimentError(f"no process {name}; known: {', '.join(sorted(self._running)) or 'none'}")
+        return self._running[name]
 
     def _wait_ended(self, processes: Sequence[subprocess.Popen[bytes]]) -> None:
         began_s = time.monotonic()

@@ -101,6 +101,19 @@ class Standalone:
         self._grants[grant.spec.identity] = grant
         return grant.spec.identity
 
+    def revoke(self, node: str) -> None:
+        """Remove all Grants of a drone. The system takes the drone and brings it home.
+
+        Raises:
+            ExperimentError: The drone is unknown.
+        """
+        for file in self._drone(node).grants.glob("*.json"):
+            file.unlink()
+
+    def node_of(self, program: str) -> str:
+        """Return the drone on which a started program runs. Empty for a program that uses no system service."""
+        return self._programs[program].node
+
     def environment(self, identity: str) -> dict[str, str]:
         """Return the FRACTUS_* variables of a component's pod: identity, service addresses and control points.
 

@@ -19,6 +19,7 @@ from fractus_sim.errors import ExperimentError
 from fractus_sim.experiment.definition import Experiment, Program, VehicleSetup
 from fractus_sim.testbeds.detections import DETECTIONS_FILE, DETECTIONS_VARIABLE, TruthWatch, read_detections
 from fractus_sim.testbeds.ground_station import TcpLink
+from fractus_sim.testbeds.resource_meter import ResourceMeter
 from fractus_sim.testbeds.standalone_drones import CameraSetup, DroneSetup, Standalone
 from fractus_sim.testbeds.testbed import Moment, Testbed, program_command, wind_argument
 
@@ -39,6 +40,7 @@ class StandaloneTestbed(Testbed):
         self._drones = self.keep(Standalone(folder))
         self.processes = self._drones.processes
         self._identities: dict[str, str] = {}
+        self._meter = ResourceMeter()
         self._watches: list[TruthWatch] = []
         self._detections = folder / DETECTIONS_FILE
         self._detections.unlink(missing_ok=True)
@@ -71,6 +73,8 @@ class StandaloneTestbed(Testbed):
         """
         time.sleep(TICK_S)
         self._drones.check()
+        self._meter.measure()
+        self.findings.usages = self._meter.usages
         return Moment((time.monotonic() - self._began_s) * self.experiment.pace, time.time_ns() // 1000)
 
     def begin(self, program: Program | None = None) -> None:
@@ -88,6 +92,10 @@ class StandaloneTestbed(Testbed):
         for spec in grants:
             if spec.node in self._drones.drones:
                 self._identities[spec.component] = self._drones.grant(grant_manifest(spec))
+
+    def revoke(self, vehicle: str) -> None:
+        """Remove the Grants of a drone."""
+        self._drones.revoke(vehicle)
 
     @property
     def required_flights(self) -> list[str]:
@@ -160,6 +168,7 @@ class StandaloneTestbed(Testbed):
             services=services,
             folder=self.base,
         )
+        self._meter.add(program.name, self._drones.node_of(program.name), self._drones.processes.pid(program.name))
 
 
 def read_all_manifests(paths: Sequence[Path]) -> Manifests:

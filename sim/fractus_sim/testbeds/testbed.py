@@ -18,6 +18,7 @@ from fractus_sim.report.audit_log_reader import read_audit_logs
 from fractus_sim.testbeds.detections import ObservedObject
 from fractus_sim.testbeds.ground_station import OBSERVER_ID, Link, Station
 from fractus_sim.testbeds.local_processes import Processes
+from fractus_sim.testbeds.resource_meter import ProgramUsage
 from fractus_sim.testbeds.tlog import TlogWriter
 
 AUDIT_LOGS = ("mobility.jsonl", "camera.jsonl")
@@ -39,7 +40,8 @@ class Findings:
     """Results for checks and report that are not part of a flight recording.
 
     Attributes:
-        programs: Exit codes by program. None if the program had to be stopped.
+        programs: Exit codes by program. None if the program had to be stopped. Programs that were not started are missing.
+        usages: Resources that programs used, by program.
         calls: Audit log entries with a verdict.
         audit_problems: Verification problem by log. Empty if the log is valid.
         phases: Phases of each Application in the order observed.
@@ -48,6 +50,7 @@ class Findings:
     """
 
     programs: dict[str, int | None] = field(default_factory=dict)
+    usages: dict[str, ProgramUsage] = field(default_factory=dict)
     calls: list[Mapping[str, Any]] = field(default_factory=list)
     audit_problems: dict[str, str] = field(default_factory=dict)
     phases: dict[str, list[str]] = field(default_factory=dict)
@@ -165,6 +168,16 @@ class Testbed(ABC):
         """Names of vehicles. If it is not empty, the experiment does not end before one of these vehicles has flown."""
         return ()
 
+    def revoke(self, vehicle: str) -> None:
+        """Remove the Grants of a drone. The system takes the drone and brings it home.
+
+        Raises:
+            ExperimentError: The mode has no Grants, or its operator issues them.
+        """
+        raise ExperimentError(
+            f"{vehicle}: Grants cannot be revoked in mode {self.experiment.mode}; use mode standalone"
+        )
+
     @abstractmethod
     def set_link(self, vehicle: str, *, connected: bool) -> None:
         """Drop all traffic on the link of a vehicle, or restore the link."""
@@ -181,7 +194,8 @@ class Testbed(ABC):
         """Collect results into `findings` before the testbed is closed. The base class adds exit codes of programs."""
         if self.processes is not None:
             for program in self.experiment.programs:
-                self.findings.programs[program.name] = self.processes.exit_code(program.name)
+                if self.processes.started(program.name):
+                    self.findings.programs[program.name] = self.processes.exit_code(program.name)
 
     def read_audit_logs(self, vehicle: str, folder: Path) -> None:
         """Verify the audit logs of a drone's services, and add their policy decisions to the findings."""

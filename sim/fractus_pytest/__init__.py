@@ -1,0 +1,132 @@
+"""pytest plugin `fractus`: the fixture `fractus`, which is the scene of one test, and its marker and options.
+
+The plugin is a package of its own, because every run of pytest in its environment imports it, and the import of
+`fractus_testing` takes a second.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import shutil
+from collections.abc import Generator, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+if TYPE_CHECKING:
+    from fractus_testing import Scene
+
+MARKER = "fractus"
+_MARKER_FIELDS = frozenset({"speedup", "seed", "seeds"})
+_SCENE = pytest.StashKey["Scene"]()
+_FAILED = pytest.StashKey[bool]()
+_MAX_NAME = 80
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Add the options of the plugin."""
+    group = parser.getgroup("fractus", "tests with virtual drones")
+    group.addoption(
+        "--fractus-out", type=Path, default=Path("out/tests"), help="Folder of the tests' logs and reports. [out/tests]"
+    )
+    group.addoption("--fractus-keep", action="store_true", help="Keep the folders of passed tests, with their reports.")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Register the marker."""
+    config.addinivalue_line(
+        "markers",
+        "fractus(speedup, seed, seeds): factor of real time, seed of wind and noise, number of seeds to repeat the test with",
+    )
+
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    """Repeat a test with several seeds.
+
+    Raises:
+        UsageError: The marker has an unknown field.
+    """
+    if "fractus_seed" not in metafunc.fixturenames:
+        return
+    fields = _marker_fields(metafunc.definition)
+    if "seeds" in fields:
+        first = int(fields.get("seed", 1))
+        seeds = range(first, first + int(fields["seeds"]))
+        metafunc.parametrize("fractus_seed", seeds, indirect=True, ids=[f"seed{seed}" for seed in seeds])
+
+
+@pytest.fixture
+def fractus_seed(request: pytest.FixtureRequest) -> int:
+    """Seed of wind and noise of the test."""
+    default = _marker_fields(request.node).get("seed", 1)
+    return int(getattr(request, "param", default))
+
+
+@pytest.fixture
+def fractus(request: pytest.FixtureRequest, fractus_seed: int, record_property: Any) -> Iterator[Scene]:
+    """Scene of the test: virtual drones and controllers. All processes end with the test."""
+    from fractus_testing import Scene  # noqa: PLC0415 - the import takes a second
+
+    config = request.config
+    fields = _marker_fields(request.node)
+    speedup = fields.get("speedup")
+    folder = (config.rootpath / config.getoption("fractus_out")) / _folder_name(request.node.nodeid)
+    record_property("fractus_seed", fractus_seed)
+    with Scene(
+        folder, base=request.path.parent, speedup=None if speedup is None else float(speedup), seed=fractus_seed
+    ) as scene:
+        request.node.stash[_SCENE] = scene
+        yield scene
+        keep = bool(config.getoption("fractus_keep"))
+        if keep and not request.node.stash.get(_FAILED, False):
+            scene.write_report()
+            record_property("fractus_folder", str(folder))
+    if not keep and not request.node.stash.get(_FAILED, False):
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(
+    item: pytest.Item, call: pytest.CallInfo[None]
+) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    """Add folder, map, last verdicts and logs to the report of a failed test, and the folder to its properties."""
+    report = yield
+    scene = item.stash.get(_SCENE, None)
+    if call.when != "call" or scene is None or not report.failed:
+        return report
+    item.stash[_FAILED] = True
+    item.user_properties.append(("fractus_folder", str(scene.folder)))
+    try:
+        lines = scene.write_report()
+    except Exception as error:
+        lines = [f"folder: {scene.folder}", f"the report could not be written: {error}"]
+    report.sections.append(("fractus", "\n".join(lines)))
+    if (scene.folder / "map.png").exists():
+        item.user_properties.append(("fractus_map", str(scene.folder / "map.png")))
+    return report
+
+
+def _marker_fields(node: pytest.Item | pytest.Function | Any) -> dict[str, Any]:
+    """Return the fields of the closest marker.
+
+    Raises:
+        UsageError: A field is unknown.
+    """
+    marker = node.get_closest_marker(MARKER)
+    if marker is None:
+        return {}
+    unknown = sorted(set(marker.kwargs) - _MARKER_FIELDS)
+    if unknown or marker.args:
+        problem = f"unknown field {unknown[0]}" if unknown else "fields need names"
+        message = f"{node.nodeid}: marker fractus: {problem}; known: {', '.join(sorted(_MARKER_FIELDS))}"
+        raise pytest.UsageError(message)
+    return dict(marker.kwargs)
+
+
+def _folder_name(nodeid: str) -> str:
+    """Return a folder name that is unique for a test."""
+    name = re.sub(r"[^A-Za-z0-9]+", "-", nodeid.rpartition("/")[2]).strip("-")
+    digest = hashlib.sha256(nodeid.encode()).hexdigest()[:8]
+    return f"{name[:_MAX_NAME]}-{digest}"

@@ -1,0 +1,707 @@
+"""Scene of one test: virtual drones, a virtual controller, and the experiment that runs them.
+
+    with Scene(Path("out/square")) as scene:
+        drone = scene.vDrone("vDrone-1")
+        drone.set_pos((50.8637, 4.6785, 25))
+        drone.set_plan(FlightPlan(path=[(50.8640, 4.6785, 10)]))
+        drone.set_app("square.py")
+        drone.start_app()
+        drone.wait_landed(120)
+        scene.results().check_landed("vDrone-1", near_home=3)
+
+With pytest, the fixture `fractus` is the scene. A scene builds the same `Experiment` as an experiment file, and writes
+it to `experiment.yaml` of its folder, so `fractus experiment run` repeats the flight of a test without its actions.
+"""
+
+from __future__ import annotations
+
+import itertools
+import re
+import shutil
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Self
+
+import yaml
+from fractus_cli.manifests import Manifests
+from fractus_core.api import Application
+from fractus_core.api.model import InvalidObject
+from fractus_sim.errors import ExperimentError
+from fractus_sim.experiment import parse
+from fractus_sim.experiment.definition import NamedZone, Program
+from fractus_sim.progress import Progress
+from fractus_sim.report.flight_record import policy_decisions
+from fractus_sim.report.track import Sample
+from fractus_sim.runner import ExperimentRun, Outcome
+from fractus_sim.runner.telemetry_recording import Flight
+from fractus_sim.testbeds.standalone_testbed import planned_grants, read_all_manifests
+
+from fractus_testing.applications import App, app_of
+from fractus_testing.flight_plan import (
+    MIN_RESOURCES,
+    FlightPlan,
+    Manifest,
+    Resources,
+    Restriction,
+    Waypoint,
+    circle,
+    drone_manifests,
+    no_fly,
+)
+from fractus_testing.records import record_of_run
+from fractus_testing.results import Results
+from fractus_testing.triggers import Trigger
+from fractus_testing.world import World
+
+SITL = "sitl"
+Ardupilot = "ardupilot"
+Builtin = "builtin"
+app = "app"
+runtime = "runtime"
+autopilot = "autopilot"
+_LOGS = (app, runtime, autopilot)
+
+TRIGGER_TIMEOUT_S = 300.0
+MAX_DURATION_S = 7200.0
+SETTLE_S = 600.0
+"""Calm time after which the experiment of a test would end by itself, seconds. The test ends it earlier."""
+
+STEP_S = 0.25
+PROGRAM_END_S = 5.0
+"""Real time for which a program may continue to run after the landing of its drone, seconds."""
+
+EMERGENCY_RADIUS_M = 5000.0
+_LOG_LINES = 15
+_MAX_VERDICTS = 10
+
+
+class VirtualDrone:
+    """A virtual drone: simulated vehicle, services of Fractus and programs under test, as local processes.
+
+    Attributes:
+        name: Name in the test.
+        node: Name of the node: the name in lower case.
+    """
+
+    def __init__(self, scene: Scene, name: str, setup: Resources) -> None:
+        self.name = name
+        self.node = name.lower()
+        self.resources = setup
+        self.home: tuple[float, float, float] | None = None
+        self.plan: FlightPlan | None = None
+        self.manifests: tuple[Path, ...] = ()
+        self.apps: list[App] = []
+        self.task: list[dict[str, Any]] = []
+        self.faults: list[dict[str, Any]] = []
+        self.parameters: dict[str, float] = {}
+        self.world: World | None = None
+        self.logs: tuple[str, ...] = ()
+        self._scene = scene
+
+    def set_pos(self, home: tuple[float, float, float]) -> None:
+        """Set the start and home position: latitude, longitude, ground height in metres above mean sea level."""
+        self._scene.require_not_started("set_pos")
+        self.home = home
+
+    def set_plan(self, plan: FlightPlan) -> None:
+        """Set the approved flight plan and its restrictions."""
+        self._scene.require_not_started("set_plan")
+        self.plan = plan
+
+    def set_manifests(self, *paths: str | Path) -> None:
+        """Use manifests instead of a flight plan: files or folders with the Application, Drone, Depot and policies.
+
+        Args:
+            paths: Paths, relative to the file of the test. A Drone must have the name of this drone in lower case.
+        """
+        self._scene.require_not_started("set_manifests")
+        self.manifests = tuple(self._scene.base / path for path in paths)
+
+    def set_app(
+        self, program: App | str, params: Mapping[str, object] | None = None, component: str | None = None
+    ) -> None:
+        """Set a program under test. It runs as a component of the application, with the environment of its pod.
+
+        Args:
+            program: Path of a Python program, relative to the file of the test, or an App.
+            params: Environment variables of the program. Values other than text are passed as JSON.
+            component: Component that the program implements. Only needed with `set_manifests`.
+        """
+        self._scene.require_not_started("set_app")
+        self.apps.append(app_of(program, params or {}, component))
+
+    def set_task(self, *steps: dict[str, Any]) -> None:
+        """Let a ground station fly the vehicle alone, without services and programs.
+
+        Args:
+            steps: Task steps as in experiment files, such as `{"do": "takeoff", "alt": 10}`.
+        """
+        self._scene.require_not_started("set_task")
+        self.task = list(steps)
+
+    def set_camera(self, world: World) -> None:
+        """Add a camera, and the world that it sees."""
+        self._scene.require_not_started("set_camera")
+        self.world = world
+
+    def set_parameters(self, **parameters: float) -> None:
+        """Set parameters of the autopilot, such as `WPNAV_SPEED=500`."""
+        self._scene.require_not_started("set_parameters")
+        self.parameters |= parameters
+
+    def set_logs(self, *logs: str) -> None:
+        """Select the logs whose last lines a failed test shows: app, runtime, autopilot. All logs are always written.
+
+        Raises:
+            ExperimentError: A log is unknown.
+        """
+        unknown = [log for log in logs if log not in _LOGS]
+        if unknown:
+            raise ExperimentError(f"set_logs: unknown log {unknown[0]}; known: {', '.join(_LOGS)}")
+        self.logs = logs
+
+    def add_fault(self, fault: str, **fields: Any) -> None:
+        """Inject a fault in time, as in experiment files: `add_fault("gpsLoss", at=10, duration=5)`.
+
+        Args:
+            fault: Kind of fault.
+            fields: Fields of the fault. `at` is in seconds after the takeoff.
+        """
+        self._scene.require_not_started("add_fault")
+        self.faults.append({"fault": fault, "vehicles": [self.node], **fields})
+
+    def start_app(self) -> None:
+        """Start the programs of this drone. The first call starts all drones and waits until they are ready.
+
+        Raises:
+            ExperimentError: A drone has no program, or a part did not start.
+        """
+        if not self.apps and not self.task:
+            raise ExperimentError(f"{self.name} has no program; call set_app() or set_task() first")
+        self._scene.start()
+        for program in self._scene.programs(self):
+            self._scene.run.begin(program)
+
+    def wait_landed(self, timeout: float) -> None:
+        """Wait until the drone has flown, and is landed and disarmed. Its programs get a few seconds to end.
+
+        Args:
+            timeout: Seconds of the vehicle.
+
+        Raises:
+            AssertionError: The drone has not landed in time.
+            ExperimentError: A service or vehicle ended.
+        """
+        __tracebackhide__ = True
+        flight = self._scene.flight(self)
+
+        def landed() -> bool:
+            return flight.track.landing_s is not None and not flight.armed_at_end
+
+        def cannot_fly() -> bool:
+            return flight.track.takeoff_s is None and self._scene.programs_ended(self)
+
+        if not self._scene.advance_until(lambda: landed() or cannot_fly(), timeout) or not landed():
+            raise AssertionError(f"{self.name} has not landed within {timeout:g} s: {self._scene.describe(self)}")
+        self._scene.wait_programs_end(self)
+
+    def wait(self, trigger: Trigger, timeout: float = TRIGGER_TIMEOUT_S) -> None:
+        """Wait for a moment of the flight.
+
+        Args:
+            trigger: Moment, from `until`.
+            timeout: Seconds of the vehicle.
+
+        Raises:
+            AssertionError: The moment did not come in time.
+        """
+        __tracebackhide__ = True
+        self._scene.wait(trigger, timeout)
+
+    @property
+    def samples(self) -> Sequence[Sample]:
+        """Positions so far, in order."""
+        return self._scene.flight(self).samples
+
+    @property
+    def waypoints(self) -> Sequence[Waypoint]:
+        """Waypoints of the flight plan, or of the driver in the manifests."""
+        if self.plan is not None:
+            return tuple(self.plan.path)
+        return self._scene.manifest_waypoints()
+
+    @property
+    def now_s(self) -> float:
+        """Seconds since all vehicles were ready."""
+        return self._scene.run.now_s
+
+
+class VirtualController:
+    """A virtual controller: it plans the flights, signs Grants, and changes restrictions during flights."""
+
+    def __init__(self, scene: Scene) -> None:
+        self._scene = scene
+        self._restrictions: tuple[Restriction, ...] = ()
+        self._silent_until_s: dict[str, float] = {}
+        self._pending: set[str] = set()
+
+    def set_logs(self, *logs: str) -> None:
+        """Select logs for failed tests. The controller has the log `runtime` only: the events of the test."""
+        if set(logs) - {runtime}:
+            raise ExperimentError("set_logs: the controller has only the log runtime")
+
+    def update_restrictions(self, *restrictions: Restriction, at: Trigger | None = None) -> None:
+        """Replace the restrictions that this controller has issued. Restrictions of flight plans stay.
+
+        The new Grants take effect within one second. A drone without contact gets them when the contact returns.
+
+        Args:
+            restrictions: Restrictions that apply from now on. None: lift all.
+            at: Moment of a flight to wait for.
+
+        Raises:
+            AssertionError: The moment did not come.
+            ExperimentError: The applications cannot be planned with the restrictions.
+        """
+        __tracebackhide__ = True
+        if at is not None:
+            self._scene.wait(at, TRIGGER_TIMEOUT_S)
+        self._restrictions = restrictions
+        names = ", ".join(restriction.name for restriction in restrictions) or "none"
+        self._scene.run.report("", f"restrictions of the controller: {names}")
+        self._issue(self._scene.nodes)
+
+    def emergency_landing(self, drone: VirtualDrone, at: Trigger | None = None) -> None:
+        """Land a drone at once where it is. The system takes the drone from its program.
+
+        Args:
+            drone: Drone to land.
+            at: Moment of a flight to wait for.
+        """
+        __tracebackhide__ = True
+        if at is not None:
+            self._scene.wait(at, TRIGGER_TIMEOUT_S)
+        if not drone.samples:
+            raise ExperimentError(f"{drone.name} has no position; start its program first")
+        place = drone.samples[-1].place
+        area = circle(place.lat, place.lon, EMERGENCY_RADIUS_M)
+        closed = no_fly(f"emergency-{drone.node}", area, action="land", priority=1000)
+        node = {"nodes": [{"key": "name", "operator": "In", "values": [drone.node]}]}
+        self.update_restrictions(
+            *self._restrictions, Restriction(closed.name, {**closed.policy, "selector": node}, closed.area)
+        )
+
+    def abort(self, drone: VirtualDrone, at: Trigger | None = None) -> None:
+        """End the mission of a drone: its Grants are revoked, and the system brings the drone home.
+
+        Args:
+            drone: Drone to bring home.
+            at: Moment of a flight to wait for.
+        """
+        __tracebackhide__ = True
+        if at is not None:
+            self._scene.wait(at, TRIGGER_TIMEOUT_S)
+        self._scene.run.report(drone.node, "mission aborted by the controller")
+        self._scene.run.testbed.revoke(drone.node)
+
+    def lose_contact(self, drone: VirtualDrone, duration: float, at: Trigger | None = None) -> None:
+        """Interrupt the contact of this controller to a drone. The drone keeps its Grants and continues its flight.
+
+        Args:
+            drone: Drone.
+            duration: Seconds of the vehicle.
+            at: Moment of a flight to wait for.
+        """
+        __tracebackhide__ = True
+        if at is not None:
+            self._scene.wait(at, TRIGGER_TIMEOUT_S)
+        self._silent_until_s[drone.node] = self._scene.run.now_s + duration
+        self._scene.run.report(drone.node, f"contact to the controller lost for {duration:g} s")
+
+    def poll(self) -> None:
+        """Issue pending Grants to drones whose contact has returned."""
+        back = {node for node in self._pending if not self._silent(node)}
+        if back:
+            self._pending -= back
+            self._issue(back)
+
+    def _silent(self, node: str) -> bool:
+        return self._scene.run.now_s < self._silent_until_s.get(node, 0.0)
+
+    def _issue(self, nodes: Iterable[str]) -> None:
+        reachable = {node for node in nodes if not self._silent(node)}
+        self._pending |= set(nodes) - reachable
+        self._scene.reissue(self._restrictions, reachable)
+
+
+class Scene:
+    """A test with its drones. Use it as a context manager.
+
+    Attributes:
+        folder: Folder of logs, manifests and report. Files of an earlier run are removed.
+        base: Base directory of relative paths of programs and manifests.
+    """
+
+    def __init__(self, folder: Path, *, base: Path | None = None, speedup: float | None = None, seed: int = 1) -> None:
+        """Create an empty scene.
+
+        Args:
+            folder: Output folder. It is emptied.
+            base: Base directory of relative paths. Default: the working directory.
+            speedup: Factor of real time. Default: 4, and as fast as possible for vehicles alone.
+            seed: Seed of noise and wind.
+        """
+        self.folder = folder.absolute()
+        self.base = base or Path.cwd()
+        self.speedup = speedup
+        self.seed = seed
+        self.lines: list[str] = []
+        self._drones: list[VirtualDrone] = []
+        self._controllers: list[VirtualController] = []
+        self._run: ExperimentRun | None = None
+        self._outcome: Outcome | None = None
+        self._began = False
+        self._wind: dict[str, float] = {}
+        self._changes = itertools.count(1)
+        shutil.rmtree(self.folder, ignore_errors=True)
+        self.folder.mkdir(parents=True)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def vController(self) -> VirtualController:  # noqa: N802 - term of the field
+        """Return a new virtual controller."""
+        controller = VirtualController(self)
+        self._controllers.append(controller)
+        return controller
+
+    def vDrone(  # noqa: N802 - term of the field
+        self,
+        name: str,
+        mode: str = SITL,
+        *,
+        autopilot: str = Ardupilot,
+        fdm: str = Builtin,
+        setup: Resources = MIN_RESOURCES,
+    ) -> VirtualDrone:
+        """Add a virtual drone.
+
+        Args:
+            name: Name of the drone. In lower case, it is the name of its node.
+            mode: SITL: simulated vehicle, and services and programs as local processes.
+            autopilot: Ardupilot: an ArduCopter-compatible simulated vehicle.
+            fdm: Flight dynamics. Builtin: part of the simulated vehicle.
+            setup: Resources that the application of the drone declares.
+
+        Raises:
+            ExperimentError: The name is used twice, or a mode is not supported.
+        """
+        self.require_not_started("vDrone")
+        for value, only, field in ((mode, SITL, "mode"), (autopilot, Ardupilot, "autopilot"), (fdm, Builtin, "fdm")):
+            if value != only:
+                raise ExperimentError(f"vDrone {name}: {field} {value} is not supported; use {only}")
+        drone = VirtualDrone(self, name, setup)
+        if drone.node in self.nodes:
+            raise ExperimentError(f"the drone name {name} is used twice; names must be unique in lower case")
+        self._drones.append(drone)
+        return drone
+
+    def set_wind(self, speed: float, direction: float = 270.0, turbulence: float = 0.0) -> None:
+        """Set the wind: speed in m/s, direction in degrees that it comes from, turbulence in m/s (1 sigma)."""
+        self.require_not_started("set_wind")
+        self._wind = {"speed": speed, "direction": direction, "turbulence": turbulence}
+
+    def advance(self, seconds: float) -> None:
+        """Let the flights continue for some seconds of the vehicles."""
+        self.advance_until(lambda: False, seconds)
+
+    def results(self) -> Results:
+        """Return queries and assertions about this test. Each query reads the state at the time of its call."""
+        run = self.run
+        declared = {drone.node: drone.resources for drone in self._drones if drone.plan is not None}
+        return Results(lambda: record_of_run(run), declared, self._zones())
+
+    def close(self) -> None:
+        """Stop all processes."""
+        if self._run is not None:
+            self._run.close()
+
+    def write_report(self) -> list[str]:
+        """End the run, and write report and figures to the folder.
+
+        Returns:
+            Lines for the report of a failed test: folder, map, last verdicts, and the selected logs.
+        """
+        lines = [f"folder: {self.folder}"]
+        if self._run is None or not self._began:
+            return lines
+        from fractus_sim.runner.experiment_report import write_outcome  # noqa: PLC0415 - draws figures
+
+        if self._outcome is None:
+            self._outcome = self._run.result()
+            write_outcome(self._outcome)
+        if (self.folder / "map.png").exists():
+            lines.append(f"map: {self.folder / 'map.png'}")
+        if self._outcome.problem:
+            lines.append(f"problem: {self._outcome.problem}")
+        decisions = [call for call in self._outcome.decisions if call.action]
+        lines += [
+            f"{call.time_s:7.1f} s  {call.caller} {call.method}: {call.action} {call.code}: {call.reason}"
+            for call in decisions[-_MAX_VERDICTS:]
+        ] or ["verdicts: policies changed no call"]
+        for drone in self._drones:
+            lines += self._log_lines(drone)
+        return lines
+
+    @property
+    def run(self) -> ExperimentRun:
+        """The running experiment.
+
+        Raises:
+            ExperimentError: No program was started.
+        """
+        if self._run is None:
+            raise ExperimentError("nothing runs yet; call start_app() first")
+        return self._run
+
+    @property
+    def nodes(self) -> tuple[str, ...]:
+        """Names of the nodes of all drones."""
+        return tuple(drone.node for drone in self._drones)
+
+    def require_not_started(self, method: str) -> None:
+        """Check that no program was started.
+
+        Raises:
+            ExperimentError: The experiment runs already.
+        """
+        if self._run is not None:
+            raise ExperimentError(f"{method}() must be called before the first start_app()")
+
+    def start(self) -> None:
+        """Start all drones and wait until they are ready, unless they run already.
+
+        Raises:
+            ExperimentError: A part did not start. The message says what to do.
+        """
+        if self._run is not None:
+            return
+        try:
+            content = self._experiment()
+            (self.folder / "experiment.yaml").write_text(yaml.safe_dump(content, sort_keys=False))
+            experiment = parse({**content, "settle": SETTLE_S})
+        except InvalidObject as error:
+            raise ExperimentError(str(error)) from None
+        self._run = ExperimentRun(experiment, self.folder, base=self.folder, progress=Progress(self.lines.append))
+        self._run.start()
+        self._began = True
+
+    def programs(self, drone: VirtualDrone) -> list[Program]:
+        """Return the programs of a drone in the experiment."""
+        names = {f"{drone.node}-{number}" for number in range(len(drone.apps))}
+        return [program for program in self.run.experiment.programs if program.name in names]
+
+    def flight(self, drone: VirtualDrone) -> Flight:
+        """Return the recording of a drone."""
+        return self.run.flights[drone.node]
+
+    def wait(self, trigger: Trigger, timeout: float) -> None:
+        """Let the flights continue until a moment.
+
+        Raises:
+            AssertionError: The moment did not come in time.
+        """
+        __tracebackhide__ = True
+        if not self.advance_until(trigger.fired, timeout):
+            states = "; ".join(f"{drone.name}: {self.describe(drone)}" for drone in self._drones)
+            raise AssertionError(f"not within {timeout:g} s: {trigger.title} ({states})")
+
+    def advance_until(self, condition: Callable[[], bool], timeout: float) -> bool:
+        """Let the flights continue until a condition holds. Return False after the timeout.
+
+        Raises:
+            ExperimentError: A service or vehicle ended.
+        """
+        run = self.run
+        end_s = run.now_s + timeout
+        while not condition():
+            if run.problem:
+                raise ExperimentError(run.problem)
+            if run.now_s >= end_s or not run.advance(min(STEP_S, end_s - run.now_s)):
+                return condition()
+            for controller in self._controllers:
+                controller.poll()
+        return True
+
+    def programs_ended(self, drone: VirtualDrone) -> bool:
+        """Return True if the drone has programs, and all of them have ended."""
+        processes = self.run.testbed.processes
+        names = [program.name for program in self.programs(drone)]
+        return processes is not None and bool(names) and not any(map(processes.running, names))
+
+    def wait_programs_end(self, drone: VirtualDrone) -> None:
+        """Give the programs of a drone some real time to end."""
+        deadline = time.monotonic() + PROGRAM_END_S
+        while drone.apps and not self.programs_ended(drone) and time.monotonic() < deadline:
+            self.run.advance(STEP_S)
+
+    def describe(self, drone: VirtualDrone) -> str:
+        """Describe the state of a drone for error messages."""
+        samples = drone.samples
+        if not samples:
+            return "no position received"
+        last = samples[-1]
+        state = "in the air" if last.in_air else "on the ground"
+        text = f"{state} in mode {last.mode}, {last.place.alt_m:.1f} m above home"
+        decisions = policy_decisions(record_of_run(self.run).entries.get(drone.node, ()))
+        if decisions:
+            text += f"; last verdict: {decisions[-1].method} {decisions[-1].code}: {decisions[-1].reason}"
+        processes = self.run.testbed.processes
+        for program in self.programs(drone):
+            if processes is not None and processes.started(program.name) and not processes.running(program.name):
+                code = processes.exit_code(program.name)
+                text += f"; program ended with exit code {code}: {processes.log_tail(program.name)}"
+        return text
+
+    def reissue(self, restrictions: Sequence[Restriction], nodes: Iterable[str]) -> None:
+        """Plan the applications with additional restrictions, and replace the Grants of drones.
+
+        Raises:
+            ExperimentError: An application cannot be planned.
+        """
+        chosen = set(nodes)
+        if not chosen:
+            return
+        paths = [self.folder / path for path in self.run.experiment.manifests]
+        manifests = [manifest for restriction in restrictions for manifest in restriction.manifests()]
+        if manifests:
+            paths.append(self._write(f"restrictions-{next(self._changes)}.yaml", manifests))
+        grants = [spec for spec in planned_grants(read_all_manifests(paths)) if spec.node in chosen]
+        self.run.testbed.reissue(grants)
+
+    def manifest_waypoints(self) -> tuple[Waypoint, ...]:
+        """Return the waypoints of the first driver in the manifests of the drones."""
+        paths = [path for drone in self._drones for path in drone.manifests]
+        return _driver_waypoints(read_all_manifests(paths)) if paths else ()
+
+    def _experiment(self) -> dict[str, Any]:
+        if not self._drones:
+            raise ExperimentError("the scene has no drone; call vDrone() first")
+        alone = [drone for drone in self._drones if drone.task]
+        if alone and len(alone) < len(self._drones):
+            others = ", ".join(drone.name for drone in self._drones if not drone.task)
+            raise ExperimentError(f"set_task() flies vehicles alone, so all drones need it; missing: {others}")
+        speedup = self.speedup if self.speedup is not None else 4.0
+        content: dict[str, Any] = {
+            "name": _slug(self.folder.name), "mode": "vehicles" if alone else "standalone", "seed": self.seed,
+            "speedup": (self.speedup or 0.0) if alone else speedup, "timeout": MAX_DURATION_S, "wind": self._wind,
+            "vehicles": [self._vehicle(drone) for drone in self._drones],
+            "faults": [fault for drone in self._drones for fault in drone.faults],
+        }  # fmt: skip
+        worlds = {drone.world for drone in self._drones if drone.world is not None}
+        if len(worlds) > 1:
+            raise ExperimentError("set_camera: all drones of a test see the same world; pass the same World")
+        content["world"] = worlds.pop().to_dict() if worlds else {}
+        if not alone:
+            content["manifests"] = self._manifests()
+            content["programs"] = [program for drone in self._drones for program in self._program_entries(drone)]
+        return {name: value for name, value in content.items() if value not in ({}, [])}
+
+    def _vehicle(self, drone: VirtualDrone) -> dict[str, Any]:
+        if drone.home is None:
+            raise ExperimentError(f"{drone.name} has no start position; call set_pos()")
+        lat, lon, alt = drone.home
+        entry: dict[str, Any] = {
+            "name": drone.node, "home": {"lat": lat, "lon": lon, "alt": alt}, "readyAfter": 1 if drone.task else 3,
+        }  # fmt: skip
+        optional = {"parameters": drone.parameters, "task": drone.task, "camera": drone.world is not None}
+        return entry | {name: value for name, value in optional.items() if value}
+
+    def _manifests(self) -> list[str]:
+        """Write the manifests of flight plans, and return the paths of all manifests."""
+        paths = []
+        for drone in self._drones:
+            if (drone.plan is None) == (not drone.manifests):
+                raise ExperimentError(f"{drone.name} needs a flight plan: call either set_plan() or set_manifests()")
+            paths += [str(path.absolute()) for path in drone.manifests]
+            if drone.plan is not None and drone.home is not None:
+                manifests = drone_manifests(
+                    drone.node, _component(drone), drone.home, drone.plan,
+                    resources=drone.resources, camera=drone.world is not None,
+                )  # fmt: skip
+                paths.append(self._write(f"{drone.node}.yaml", manifests).name)
+        return list(dict.fromkeys(paths))
+
+    def _program_entries(self, drone: VirtualDrone) -> list[dict[str, Any]]:
+        if drone.plan is not None and len(drone.apps) > 1:
+            raise ExperimentError(f"{drone.name}: a flight plan has one program; use set_manifests() for several")
+        entries = []
+        for number, program in enumerate(drone.apps):
+            component = _component(drone) if drone.plan is not None else program.component
+            if component is None:
+                raise ExperimentError(f"{drone.name}: set_app() needs `component` with set_manifests()")
+            command = [self._absolute(word) for word in program.command]
+            entry = {"name": f"{drone.node}-{number}", "component": component, "command": command}
+            entries.append({**entry, "environment": program.environment})
+        return entries
+
+    def _absolute(self, word: str) -> str:
+        """Return the absolute path of a file of the test, or any other word unchanged."""
+        path = self.base / word
+        return str(path.absolute()) if path.is_file() else word
+
+    def _write(self, name: str, manifests: Sequence[Manifest]) -> Path:
+        path = self.folder / name
+        unique = {(body["kind"], body["metadata"]["name"]): body for body in manifests}
+        path.write_text(yaml.safe_dump_all(unique.values(), sort_keys=False))
+        return path
+
+    def _zones(self) -> dict[str, NamedZone]:
+        restrictions = [r for drone in self._drones if drone.plan is not None for r in drone.plan.restrictions]
+        return {
+            r.name: NamedZone.model_validate({"name": r.name, "area": r.area})
+            for r in restrictions
+            if r.area is not None
+        }
+
+    def _log_lines(self, drone: VirtualDrone) -> list[str]:
+        files = []
+        if app in drone.logs:
+            files += [f"{drone.node}-{number}" for number in range(len(drone.apps))]
+        if runtime in drone.logs:
+            files += [f"{drone.node}-mobility", f"{drone.node}-camera"]
+        lines = []
+        for name in files:
+            path = self.folder / "logs" / f"{name}.log"
+            if path.exists():
+                lines += [f"--- {path.name}", *path.read_text(errors="replace").splitlines()[-_LOG_LINES:]]
+        if autopilot in drone.logs and self._run is not None:
+            texts = self._run.flights[drone.node].texts[-_LOG_LINES:]
+            lines += [f"--- autopilot of {drone.name}", *(f"{text.time_s:7.1f} s  {text.text}" for text in texts)]
+        return lines
+
+
+def _component(drone: VirtualDrone) -> str:
+    """Return the component of the program of a flight plan. Names of drones may begin with a digit."""
+    return f"App-{drone.node}"
+
+
+def _slug(text: str) -> str:
+    """Return a text as a name of an experiment."""
+    return re.sub(r"[^a-z0-9]+", "-", text.lower()).strip("-")[:60].strip("-") or "test"
+
+
+def _driver_waypoints(manifests: Manifests) -> tuple[Waypoint, ...]:
+    for application in manifests.of(Application).values():
+        driver = application.spec.driver
+        if driver is not None:
+            return tuple(
+                (position.lat, position.lon, position.alt or 0.0)
+                for point in driver.control_points
+                for position in point.path or ()
+            )
+    return ()

@@ -1,0 +1,158 @@
+"""Scenes: vehicles alone in lockstep, flight plans that can be planned, and clear refusals of wrong use."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from fractus_core.api import Grant
+from fractus_sim.experiment import load
+from fractus_sim.testbeds.standalone_testbed import grant_manifest, planned_grants, read_all_manifests
+from fractus_testing import (
+    ExperimentError,
+    FlightPlan,
+    Resources,
+    Results,
+    Scene,
+    World,
+    app,
+    circle,
+    max_altitude,
+    max_speed,
+    no_fly,
+    no_photo,
+    stay_inside,
+    until,
+)
+from fractus_testing.flight_plan import drone_manifests
+
+HOME = (50.8637, 4.6785, 25.0)
+TASK = ({"do": "takeoff", "alt": 5}, {"do": "goto", "north": 10, "east": 0, "alt": 5}, {"do": "returnToLaunch"})
+PATH = ((50.8640, 4.6785, 10.0), (50.8640, 4.6791, 10.0))
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Iterator[Scene]:
+    with Scene(tmp_path / "scene", base=tmp_path) as scene:
+        yield scene
+
+
+def test_vehicle_alone_flies_its_task(scene: Scene) -> None:
+    drone = scene.vDrone("vDrone-1")
+    drone.set_pos(HOME)
+    drone.set_task(*TASK)
+    drone.add_fault("gpsNoise", noise=0.3, at=1, duration=2)
+    scene.set_wind(3.0, 200.0)
+    drone.start_app()
+    drone.wait(until(drone, altitude=4))
+    assert scene.results().track("vDrone-1").landing_s is None
+    drone.wait_landed(60)
+    live = scene.results()
+    live.check_landed("vDrone-1", near_home=3)
+    live.check("reached", north=10, east=0)
+    lines = scene.write_report()
+    assert lines[:2] == [f"folder: {scene.folder}", f"map: {scene.folder / 'map.png'}"]
+    old = Results.read(scene.folder)
+    assert len(old.track("vdrone-1").samples) == len(live.track("vDrone-1").samples)
+    old.check_landed("vdrone-1", near_home=3)
+    assert load(scene.folder / "experiment.yaml").vehicles[0].task
+
+
+def test_two_vehicles_alone_are_separate(scene: Scene) -> None:
+    for number in (1, 2):
+        drone = scene.vDrone(f"vDrone-{number}")
+        drone.set_pos((HOME[0] + number / 1000, HOME[1], HOME[2]))
+        drone.set_task(*TASK)
+        drone.start_app() if number == 2 else None
+    drone.wait_landed(60)
+    results = scene.results()
+    assert results.drones == ("vdrone-1", "vdrone-2")
+    results.check("separation", min=50)
+
+
+def test_drone_that_does_not_land_is_described(scene: Scene) -> None:
+    drone = scene.vDrone("vDrone-1")
+    drone.set_pos(HOME)
+    drone.set_task({"do": "takeoff", "alt": 5}, {"do": "hold", "seconds": 100})
+    drone.start_app()
+    with pytest.raises(
+        AssertionError, match=r"vDrone-1 has not landed within 20 s: in the air in mode GUIDED, 5\.\d m above"
+    ):
+        drone.wait_landed(20)
+    with pytest.raises(AssertionError, match="not within 3 s: vDrone-1 reaches 50 m"):
+        drone.wait(until(drone, altitude=50), timeout=3)
+
+
+def test_manifests_of_a_flight_plan_can_be_planned(tmp_path: Path) -> None:
+    import yaml
+
+    plan = FlightPlan(
+        path=PATH,
+        restrictions=(
+            no_fly("hospital", circle(50.8650, 4.6785, 20), action="land"),
+            stay_inside("town", circle(50.8640, 4.6785, 500)),
+            no_photo("school", circle(50.8640, 4.6791, 20)),
+            max_altitude(40),
+            max_speed(8, refuse=True),
+        ),
+    )
+    manifests = drone_manifests("vdrone-1", "App-vdrone-1", HOME, plan, resources=Resources(), camera=True)
+    (tmp_path / "plan.yaml").write_text(yaml.safe_dump_all(manifests))
+    (spec,) = planned_grants(read_all_manifests([tmp_path / "plan.yaml"]))
+    grant = Grant.from_body(grant_manifest(spec)).spec
+    assert grant.node == "vdrone-1"
+    assert {policy.name for policy in grant.policies} == {"hospital", "town", "school", "max-altitude", "max-speed"}
+    assert {service.service for service in grant.services} == {"mobility", "camera"}
+
+
+def test_wrong_use_is_refused_with_a_remedy(scene: Scene) -> None:
+    with pytest.raises(ExperimentError, match="mode hitl is not supported; use sitl"):
+        scene.vDrone("vDrone-1", "hitl")
+    with pytest.raises(ExperimentError, match="fdm gazebo is not supported; use builtin"):
+        scene.vDrone("vDrone-1", fdm="gazebo")
+    drone = scene.vDrone("vDrone-1")
+    with pytest.raises(ExperimentError, match="names must be unique in lower case"):
+        scene.vDrone("VDRONE-1")
+    with pytest.raises(ExperimentError, match="unknown log radio; known: app, runtime, autopilot"):
+        drone.set_logs(app, "radio")
+    with pytest.raises(ExperimentError, match="nothing runs yet; call start_app"):
+        scene.results()
+    with pytest.raises(ExperimentError, match=r"has no program; call set_app\(\) or set_task\(\) first"):
+        drone.start_app()
+    drone.set_app("pilot.py")
+    with pytest.raises(ExperimentError, match=r"has no start position; call set_pos\(\)"):
+        drone.start_app()
+    drone.set_pos(HOME)
+    with pytest.raises(ExperimentError, match=r"needs a flight plan: call either set_plan\(\) or set_manifests\(\)"):
+        drone.start_app()
+    drone.set_camera(World(seed=1))
+    other = scene.vDrone("vDrone-2")
+    other.set_pos(HOME)
+    other.set_camera(World(seed=2))
+    with pytest.raises(ExperimentError, match="pass the same World"):
+        drone.start_app()
+    other.set_task(*TASK)
+    with pytest.raises(ExperimentError, match="flies vehicles alone, so all drones need it; missing: vDrone-1"):
+        drone.start_app()
+
+
+def test_invalid_fault_and_name_are_refused_with_their_field(scene: Scene) -> None:
+    drone = scene.vDrone("v drone")
+    drone.set_pos(HOME)
+    drone.set_task(*TASK)
+    with pytest.raises(ExperimentError, match=r"vehicles\[0\]\.name"):
+        drone.start_app()
+    drone.node = "vdrone"
+    drone.add_fault("gpsLos", at=1)
+    with pytest.raises(ExperimentError, match="did you mean gpsLoss"):
+        drone.start_app()
+
+
+def test_configuration_cannot_change_after_the_start(scene: Scene) -> None:
+    drone = scene.vDrone("vDrone-1")
+    drone.set_pos(HOME)
+    drone.set_task(*TASK)
+    drone.start_app()
+    with pytest.raises(ExperimentError, match=r"set_pos\(\) must be called before the first start_app\(\)"):
+        drone.set_pos(HOME)

@@ -1,0 +1,173 @@
+"""Drills: bad applications that the platform must stop, and commands of the controller in flight."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from fractus_testing import (
+    ABORTED,
+    SUCCESS,
+    App,
+    ExperimentError,
+    FlightPlan,
+    Results,
+    Scene,
+    VirtualController,
+    VirtualDrone,
+    World,
+    circle,
+    malice,
+    no_fly,
+    until,
+)
+
+pytestmark = [pytest.mark.slow, pytest.mark.fractus(speedup=2)]
+
+HOME = (50.8637, 4.6785, 25.0)
+PATH = ((50.8640, 4.6785, 10.0), (50.8640, 4.6791, 10.0), (50.8637, 4.6791, 10.0))
+EXAMPLES = Path(__file__).parents[2] / "examples" / "testing"
+PILOT = """
+import fractus
+
+async def fly(drone, control):
+    await drone.arm()
+    await drone.takeoff(10)
+    async for waypoint in control.remaining():
+        try:
+            await drone.goto(waypoint.lat, waypoint.lon, waypoint.alt)
+        except fractus.PolicyDenied as refusal:
+            print(refusal)
+
+fractus.run(fly)
+"""
+
+
+def start(scene: Scene, app: App | str, *, camera: bool = False) -> tuple[VirtualController, VirtualDrone]:
+    controller = scene.vController()
+    drone = scene.vDrone("vDrone-1")
+    drone.set_pos(HOME)
+    drone.set_plan(FlightPlan(path=PATH))
+    drone.set_app(app)
+    if camera:
+        drone.set_camera(World(seed=3))
+    drone.start_app()
+    return controller, drone
+
+
+def pilot(folder: Path) -> str:
+    (folder / "pilot.py").write_text(PILOT)
+    return str(folder / "pilot.py")
+
+
+@pytest.mark.parametrize(
+    ("attack", "violation"),
+    [
+        (malice.leaves_corridor(), "flight_path"),
+        (malice.presses_border(), "flight_path"),
+        (malice.wrong_frames(), "altitude"),
+        (malice.floods(), None),
+        (malice.forges_identity(), None),
+        (malice.forces_arming(), None),
+    ],
+    ids=lambda value: value.command[-1] if isinstance(value, App) else "",
+)
+def test_attack_is_prevented_and_the_drone_returns(fractus: Scene, attack: App, violation: str | None) -> None:
+    _, drone = start(fractus, attack)
+    drone.wait_landed(240)
+    results = fractus.results()
+    results.check_app_status("vDrone-1", SUCCESS)
+    results.check_landed("vDrone-1", near_home=3)
+    results.check_audit()
+    if violation is not None:
+        results.check_violations("vDrone-1", type=violation)  # type: ignore[arg-type]
+    corridor_end = PATH[0][0] + 12 / 111_320
+    assert max(sample.place.lat for sample in results.track("vDrone-1").samples) < corridor_end
+
+
+def test_pictures_of_others_cannot_be_read_or_deleted(fractus: Scene) -> None:
+    _, drone = start(fractus, malice.reads_foreign_pictures(), camera=True)
+    drone.wait_landed(240)
+    fractus.results().check_app_status("vDrone-1", SUCCESS)
+
+
+@pytest.mark.parametrize("attack", [malice.stalls(), malice.crashes()], ids=["stalls", "crashes"])
+def test_drone_returns_if_its_program_stalls_or_crashes(fractus: Scene, attack: App) -> None:
+    _, drone = start(fractus, attack)
+    drone.wait_landed(240)
+    results = fractus.results()
+    results.check_landed("vDrone-1", near_home=3)
+    assert results.get_app_status("vDrone-1") != SUCCESS
+
+
+def test_emergency_landing_lands_the_drone_where_it_is(fractus: Scene, tmp_path: Path) -> None:
+    controller, drone = start(fractus, pilot(tmp_path))
+    controller.emergency_landing(drone, at=until(drone, reached=1))
+    drone.wait_landed(120)
+    results = fractus.results()
+    results.check_app_status("vDrone-1", ABORTED)
+    with pytest.raises(AssertionError, match="m from the takeoff position"):
+        results.check_landed("vDrone-1", near_home=10)
+
+
+def test_aborted_mission_ends_at_home(fractus: Scene, tmp_path: Path) -> None:
+    controller, drone = start(fractus, pilot(tmp_path))
+    controller.abort(drone, at=until(drone, altitude=8))
+    drone.wait_landed(200)
+    results = fractus.results()
+    results.check_landed("vDrone-1", near_home=3)
+    results.check_app_status("vDrone-1", ABORTED)
+
+
+def test_restriction_reaches_a_drone_only_after_its_contact_returns(fractus: Scene, tmp_path: Path) -> None:
+    controller, drone = start(fractus, pilot(tmp_path))
+    controller.lose_contact(drone, 1000, at=until(drone, altitude=8))
+    lat, lon, _ = PATH[2]
+    controller.update_restrictions(no_fly("closed", circle(lat, lon, 8)))
+    drone.wait_landed(200)
+    results = fractus.results()
+    results.check_no_violations("vDrone-1")
+    results.check_app_status("vDrone-1", SUCCESS)
+
+
+def test_results_of_a_folder_equal_those_of_the_run(fractus: Scene, tmp_path: Path) -> None:
+    _, drone = start(fractus, malice.leaves_corridor(60.0))
+    drone.wait_landed(240)
+    live = fractus.results()
+    usage = live.get_app_resources("vDrone-1")
+    assert 0 < usage.cpu < 2
+    assert 20 < usage.mean_memory_mib <= usage.peak_memory_mib < 300
+    violations = live.get_violations("vDrone-1")
+    fractus.write_report()
+    old = Results.read(fractus.folder)
+    assert [(v.code, v.reason) for v in old.get_violations("vdrone-1")] == [(v.code, v.reason) for v in violations]
+    assert old.get_violations("vdrone-1")[0].time_s == pytest.approx(violations[0].time_s, abs=2.0)
+    assert old.get_app_status("vdrone-1") == SUCCESS
+    assert old.get_app_resources("vdrone-1").cpu_s == pytest.approx(usage.cpu_s, rel=0.2)
+    old.check_landed("vdrone-1", near_home=3)
+    old.check_audit()
+
+
+def test_examples_pass(tmp_path: Path) -> None:
+    command = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-q",
+        "-p",
+        "no:cacheprovider",
+        "--fractus-out",
+        str(tmp_path),
+        str(EXAMPLES),
+    ]
+    result = subprocess.run(command, cwd=EXAMPLES, env=dict(os.environ), capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stdout + result.stderr
+
+
+def test_program_that_does_not_exist_is_reported(fractus: Scene) -> None:
+    with pytest.raises((ExperimentError, AssertionError), match=r"no_such_program\.py"):
+        _, drone = start(fractus, "no_such_program.py")
+        drone.wait_landed(5)

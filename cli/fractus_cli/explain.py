@@ -74,6 +74,7 @@ def collect(cluster: ClusterReader, namespace: str, name: str) -> dict[str, Any]
         "placements": list(plan.get("placements") or ()),
         "rejected": list(plan.get("rejected") or ()),
         "rejectedOmitted": plan.get("rejectedOmitted", 0),
+        "awaits": [component for grant in grants for component in grant.get("awaits") or ()],
         "policies": {
             grant["instance"]: [
                 {"name": p["name"], "type": p["spec"]["type"], "zones": [z["name"] for z in p.get("zones") or ()]}
@@ -103,6 +104,8 @@ def lines(summary: dict[str, Any], limit: int | None) -> Iterator[str]:
         yield "There is no plan."
     if summary["drone"]:
         yield from _drone(summary["drone"])
+    if summary["awaits"]:
+        yield f"Takeoff: when all components are ready (start: whenReady); not ready: {', '.join(summary['awaits'])}"
     for placement in summary["placements"]:
         yield from _placement(placement)
     yield from _rejections(summary, limit)

@@ -29,7 +29,7 @@ from fractus_operator.labels import FINALIZER
 from fractus_operator.operator_metrics import phase as timed
 from fractus_operator.operator_metrics import reconciling
 from fractus_operator.parsing import Submitted
-from fractus_operator.pods import refusal_of
+from fractus_operator.pods import PlanPods, refusal_of
 from fractus_operator.replanning import (
     choose_plan,
     flown_generation,
@@ -425,7 +425,11 @@ class ApplicationController:
         flown = flight(node, self._cache.drone(node), took_off=plan.flown is not None) if node is not None else None
         deployments = self._objects.of(observed.key, kinds.DEPLOYMENT)
         refused = {body["metadata"]["name"]: refusal_of(body) for body in deployments}
-        return status.deployed(plan, observed.pods, granted, flown, refused)
+        application = observed.submitted.application
+        awaits: tuple[str, ...] = ()
+        if application is not None:
+            awaits = PlanPods(plan, observed.pods, application.spec.start).awaited
+        return status.deployed(plan, observed.pods, granted, flown, refused, awaits=awaits)
 
 
 def _drone_of(plan: DeploymentPlanSpec | None) -> str | None:

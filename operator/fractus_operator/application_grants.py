@@ -16,6 +16,7 @@ from fractus_core.planning.inventory import Inventory, Settings
 from fractus_operator.cache import ClusterCache, ObservedApplication
 from fractus_operator.child_objects import ChildObjects
 from fractus_operator.kinds import Key
+from fractus_operator.pods import PlanPods
 from fractus_operator.store import Conflict, KubeError, NotFound
 
 log = logging.getLogger(__name__)
@@ -46,17 +47,21 @@ class ApplicationGrants:
         self._compiled: dict[Key, _Compiled] = {}
 
     async def refresh(self, observed: ObservedApplication) -> None:
-        """Update the policies in existing Grants. Grants are updated even if the Application cannot be planned.
+        """Update the policies and the awaited components in existing Grants, even if the Application cannot be planned.
 
         Raises:
             KubeError: The API server cannot be reached.
         """
         valid, versions = self._valid_grants(observed)
-        inputs = (observed.rules, *versions)
+        application = observed.submitted.application
+        awaits: tuple[str, ...] | None = None
+        if application is not None and observed.plan is not None:
+            awaits = PlanPods(observed.plan, observed.pods, application.spec.start).awaited
+        inputs = (observed.rules, awaits, *versions)
         if self._refreshed.get(observed.key) == inputs:
             return
         inventory = self._cache.snapshot(observed.key, observed.uid)
-        grants = [(grant, refresh(grant.spec, inventory)) for grant in valid]
+        grants = [(grant, refresh(grant.spec, inventory, awaits)) for grant in valid]
         stale = [(grant, spec) for grant, spec in grants if spec != grant.spec]
         if not stale:
             self._refreshed[observed.key] = inputs
@@ -85,11 +90,13 @@ class ApplicationGrants:
             InvalidObject: Nothing can be granted.
         """
         valid, versions = self._valid_grants(observed)
-        inputs = (observed.rules, *versions, application.metadata.uid, application.metadata.generation)
+        awaits = PlanPods(plan, observed.pods, application.spec.start).awaited
+        inputs = (observed.rules, awaits, *versions, application.metadata.uid, application.metadata.generation)
         known = self._compiled.get(observed.key)
         if known is not None and known.inputs == inputs and known.plan is plan:
             return known.grants
-        grants = compile_grants(application, plan, inventory, self._settings, [grant.spec for grant in valid])
+        present = [grant.spec for grant in valid]
+        grants = compile_grants(application, plan, inventory, self._settings, present, awaits=awaits)
         self._compiled[observed.key] = _Compiled(inputs, plan, tuple(grants))
         return tuple(grants)
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import NamedTuple
 
 from fractus_core.api.names import CLASS_LABEL
+from fractus_core.api.plans import DeploymentPlanSpec, PlannedInstance
 from fractus_core.planning.inventory import Host, amount_of
 
 from fractus_operator.kinds import Body
@@ -116,6 +117,42 @@ class PodView:
         if self.unschedulable_since is not None:
             return f"{self.instance} cannot be scheduled: {self.unschedulable_message}"
         return ""
+
+
+@dataclass(frozen=True, slots=True)
+class PlanPods:
+    """The pods of the instances of a plan.
+
+    Attributes:
+        plan: The plan.
+        pods: Pods of its Application.
+        start: The Application's `start`.
+    """
+
+    plan: DeploymentPlanSpec
+    pods: Sequence[PodView]
+    start: str = "immediately"
+
+    @property
+    def ready(self) -> dict[str, int]:
+        """Number of ready pods by instance, at most its number of replicas."""
+        alive = [pod.instance for pod in self.pods if pod.ready and not pod.terminating and not pod.finished]
+        return {p.instance: min(alive.count(p.instance), p.replicas) for p in self.plan.placements}
+
+    @property
+    def unready(self) -> list[PlannedInstance]:
+        """Instances with fewer ready pods than replicas."""
+        ready = self.ready
+        return [placed for placed in self.plan.placements if ready[placed.instance] < placed.replicas]
+
+    @property
+    def awaited(self) -> tuple[str, ...]:
+        """Components for which the takeoff of the drone waits. Empty after the takeoff, or if another Application flies."""
+        drone = self.plan.drone
+        waits = self.start == "whenReady" and self.plan.flown is None
+        if not waits or drone is None or drone.shared_with is not None:
+            return ()
+        return tuple(dict.fromkeys(placed.component for placed in self.unready))
 
 
 def parse_pod(body: Body) -> PodView:

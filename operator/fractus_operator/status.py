@@ -14,7 +14,7 @@ from fractus_core.api.plans import DeploymentPlanSpec, MissionRecord
 from fractus_core.control import Outcome, OutcomeKind, WaypointCounts
 
 from fractus_operator.parsing import SETTLED
-from fractus_operator.pods import PodView
+from fractus_operator.pods import PlanPods, PodView
 
 FlightPhase = Literal["Waiting", "TakingOff", "Flying", "Returning", "Landed", "Unknown"]
 Phase = Literal["Pending", "Queued", "Deploying", "Running", FlightPhase, "Completed", "Failed", "Invalid"]
@@ -219,6 +219,8 @@ def deployed(
     granted: int,
     flown: FlightStatus | None = None,
     refused: Mapping[str, str] = MappingProxyType({}),
+    *,
+    awaits: Sequence[str] = (),
 ) -> StatusUpdate:
     """Return the status of an Application whose child objects are all applied.
 
@@ -228,15 +230,10 @@ def deployed(
         granted: Number of instances with Grants.
         flown: Status of the flight, if the plan has a drone.
         refused: Reason why pods cannot be created, by instance. Empty if all pods can be created.
+        awaits: Components for which the takeoff waits.
     """
-    alive = [pod for pod in pods if not pod.terminating and not pod.finished]
-    missing: list[str] = []
-    ready = 0
-    for placed in plan.placements:
-        ready_pods = min(sum(pod.ready for pod in alive if pod.instance == placed.instance), placed.replicas)
-        ready += ready_pods
-        if ready_pods < placed.replicas:
-            missing.append(placed.instance)
+    running = PlanPods(plan, pods)
+    missing = [placed.instance for placed in running.unready]
     desired = sum(placed.replicas for placed in plan.placements)
     if missing:
         more = f" and {len(missing) - _MAX_NAMED} more" if len(missing) > _MAX_NAMED else ""
@@ -260,6 +257,8 @@ def deployed(
     phase: Phase = "Deploying" if missing else "Running"
     if flown is not None:
         message = f"{message}; {flown.activity}"
+        if awaits:
+            message += f"; the mission begins when {', '.join(awaits)} {'is' if len(awaits) == 1 else 'are'} ready"
         # A drone in the air is more important than a restarting pod.
         if not missing or flown.phase not in {"Waiting", "Landed"}:
             phase = flown.phase
@@ -281,7 +280,9 @@ def deployed(
         conditions.append(ConditionUpdate("MissionComplete", "False", "MissionWaiting", text, progress=True))
     drone = plan.drone.node if plan.drone is not None else None
     controller = flown.controller if flown is not None else None
-    return StatusUpdate(phase, message, tuple(conditions), drone, f"{ready}/{desired}", controller)
+    return StatusUpdate(
+        phase, message, tuple(conditions), drone, f"{sum(running.ready.values())}/{desired}", controller
+    )
 
 
 def queued_rollout(plan: DeploymentPlanSpec, others: int) -> StatusUpdate:

@@ -41,7 +41,7 @@ class StateError(FractusError):
 
 
 class NotReady(StateError):
-    """The motors cannot start yet: the autopilot, its link, or a log of the service is not ready."""
+    """The motors cannot start yet: the autopilot, its link, a log of the service, or an awaited component is not ready."""
 
     remedy = "wait and retry; `control(progress=print)` prints the reason"
 

@@ -8,11 +8,12 @@ from typing import Any
 
 import pytest
 from fractus_core.api.grants import GrantSpec
+from fractus_core.control import StreamState
 from fractus_core.control.events import Airborne, ArmingRequested
 from fractus_core.policy.decision_types import Airframe, TakeoffArgs
 from fractus_services.errors import AutopilotError
 from fractus_services.mobility.autopilot import FailsafeStatus
-from mobility_world import BRAKE, World, area, end, partial, refusal, spec
+from mobility_world import BRAKE, World, area, end, partial, refusal, spec, touring
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from virtual_time import fly
 
@@ -95,6 +96,80 @@ def test_arming_is_refused_by_grant_that_changes_while_autopilot_is_not_ready(tm
             world.plane.vehicle.ready = True
             assert (await refusal(call)).verdict.code == "MethodNotGranted"
             assert not world.plane.vehicle.armed
+
+    fly(flight)
+
+
+AWAITED = "the mission begins when all components are ready; not ready: ImageChecker, DataStore"
+
+
+def test_driver_gets_control_when_awaited_components_are_ready(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            grant = world.grants.put(spec(awaits=["ImageChecker", "DataStore"]))
+            driving = asyncio.ensure_future(world.drive(grant))
+            await asyncio.sleep(30)
+            assert [(event.state, event.reason) for event in world.events] == [(StreamState.WAITING, AWAITED)]
+            world.grants.put(spec())
+            await driving
+            assert world.events[-1].state is StreamState.GRANTED
+
+    fly(flight)
+
+
+@pytest.mark.parametrize("delay_s", [0.0, 2.0], ids=["before", "during"])
+def test_arming_waits_for_component_that_stops_being_ready(tmp_path: Path, delay_s: float) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            grant = world.grants.put(spec())
+            await world.drive(grant)
+            world.fence.raise_around = Slow(world)
+            call = asyncio.ensure_future(world.service.arm(grant, 60.0))
+            await asyncio.sleep(delay_s)
+            world.grants.put(spec(awaits=["ImageChecker", "DataStore"]))
+            await asyncio.sleep(20)
+            assert not world.plane.vehicle.armed
+            assert not call.done()
+            world.grants.put(spec())
+            await call
+            assert world.plane.vehicle.armed
+
+    fly(flight)
+
+
+def test_arming_is_refused_while_component_is_not_ready(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            grant = world.grants.put(spec())
+            await world.drive(grant)
+            world.grants.put(spec(awaits=["ImageChecker", "DataStore"]))
+            refused = await refusal(world.service.arm(grant, 5.0))
+            assert (refused.verdict.code, str(refused)) == ("NotReady", AWAITED)
+
+    fly(flight)
+
+
+def test_mission_that_has_begun_does_not_wait_for_components(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            grant = world.grants.put(spec())
+            await world.up(grant)
+            await end(world.service.land(grant))
+            world.grants.put(spec(awaits=["ImageChecker"]))
+            await world.service.arm(grant)
+            assert world.plane.vehicle.armed
+
+    fly(flight)
+
+
+def test_tour_begins_when_awaited_components_are_ready(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            world.grants.put(touring(tour=((0, 30),), awaits=["ImageChecker"]))
+            await asyncio.sleep(60)
+            assert not world.plane.vehicle.armed
+            world.grants.put(touring(tour=((0, 30),)))
+            await world.until(lambda: world.plane.vehicle.armed)
 
     fly(flight)
 

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from control_plane import wait_for
 from operator_world import FRACTUS, SYSTEM, OperatorProcess, World, fractus_object, traffic
-from test_operator import end_mission, running
+from test_operator import deployed, end_mission, running
 
 Body = dict[str, Any]
 COMPLETED = {
@@ -51,6 +51,41 @@ def flying(world: World, namespace: str) -> None:
     running(world, namespace)
     world.drone_status("drone-1", "flying")
     world.phase(namespace, "Flying")
+
+
+def awaits(world: World, namespace: str) -> list[str]:
+    """Return the components for which the driver's mission waits."""
+    (grant,) = (grant for grant in world.grants(namespace) if grant["spec"]["component"] == "Navigator")
+    return list(grant["spec"].get("awaits") or ())
+
+
+def set_ready(world: World, namespace: str, component: str, ready: str) -> None:
+    (pod,) = (pod for pod in world.pods(namespace) if pod["metadata"]["labels"]["fractus.dev/component"] == component)
+    path = f"/api/v1/namespaces/{namespace}/pods/{pod['metadata']['name']}/status"
+    conditions = [{**c, "status": ready} if c["type"] == "Ready" else c for c in pod["status"]["conditions"]]
+    world.api.merge(path, {"status": {"conditions": conditions}})
+
+
+def test_application_that_starts_when_ready_waits_for_its_components_until_takeoff(
+    world: World, operator: OperatorProcess, namespace: str
+) -> None:
+    manifest = traffic(namespace)
+    manifest["spec"]["start"] = "whenReady"
+    world.put(manifest)
+    wait_for(lambda: world.grants(namespace), "the Grants")
+    assert awaits(world, namespace) == ["Navigator", "AerialViewer", "GroundViewer", "ImageChecker", "DataStore"]
+    deployed(world, namespace)
+    wait_for(lambda: awaits(world, namespace) == [], lambda: f"no awaited component: {world.status(namespace)}")
+    set_ready(world, namespace, "DataStore", "False")
+    wait_for(lambda: awaits(world, namespace) == ["DataStore"], "the drone to wait for the DataStore")
+    wait_for(lambda: "the mission begins when DataStore is ready" in world.status(namespace)["message"], "the message")
+    set_ready(world, namespace, "DataStore", "True")
+    wait_for(lambda: awaits(world, namespace) == [], "no awaited component again")
+    world.drone_status("drone-1", "flying")
+    world.phase(namespace, "Flying")
+    set_ready(world, namespace, "DataStore", "False")
+    wait_for(lambda: "waiting for traffic-data-store" in world.status(namespace)["message"], "the message in flight")
+    assert awaits(world, namespace) == [], "a mission that has begun waits for no component"
 
 
 @pytest.mark.parametrize("restarted", [False, True], ids=["running", "restarted"])

@@ -49,6 +49,17 @@ def test_status_and_explain_show_permitted_namespace_and_name_forbidden_kinds() 
     assert "You are not permitted to list grants" in shown
 
 
+def test_explain_names_components_for_which_takeoff_waits() -> None:
+    class Granting(Client):
+        def list(self, path: str, **selectors: str) -> Sequence[Any]:
+            application = {"namespace": "team", "name": "patrol"}
+            spec = {"application": application, "instance": "patrol-navigator", "awaits": ["ImageChecker", "DataStore"]}
+            return [{"spec": spec}] if path.endswith("/grants") else super().list(path, **selectors)
+
+    shown = list(explain.lines(explain.collect(reader(Granting()), "team", "patrol"), None))
+    assert "Takeoff: when all components are ready (start: whenReady); not ready: ImageChecker, DataStore" in shown
+
+
 def test_status_of_all_namespaces_suggests_namespace_option_without_permission() -> None:
     with pytest.raises(click.ClickException, match="specify a namespace with --namespace"):
         status.collect(reader(Client()), "")

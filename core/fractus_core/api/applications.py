@@ -46,7 +46,7 @@ def _other(field: ReferenceField) -> Any:
     return _each(field, "n != c.name", "names the component itself; remove it", lambda _, c, name: name != c.name)
 
 
-_NOT_MISSION = {"update_policy", "ttl_after_finished"}
+_NOT_MISSION = {"start", "update_policy", "ttl_after_finished"}
 """Fields that may change without starting another mission."""
 
 
@@ -58,6 +58,11 @@ class ApplicationSpec(Model):
         max_length=50,
         json_schema_extra=keyed("name"),
         description="Components of the application; each has a container image and a placement.",
+    )
+    start: Literal["immediately", "whenReady"] = Field(
+        default="immediately",
+        description="When the mission may begin. immediately: as soon as the drone is ready. whenReady: the motors do not start"
+        " while a pod of a component is not ready. After the takeoff, the mission continues without it.",
     )
     update_policy: Literal["OnGround", "Immediate"] = Field(
         default="OnGround",
@@ -103,6 +108,13 @@ class ApplicationSpec(Model):
         aboard = self._where(lambda c: c.placement == "drone")
         flown = self.driver is not None or self.points_of_interest is not None
         return f"components[{aboard[0]}].pointsOfInterest" if aboard and not flown else None
+
+    @rule(
+        "!has(self.start) || self.start != 'whenReady' || self.components.exists(c, c.placement == 'drone')",
+        "start: whenReady delays the flight of a drone, and no component runs on a drone; remove it",
+    )
+    def _start_needs_drone(self) -> Violation:
+        return "start" if self.start == "whenReady" and not any(self.on("drone")) else None
 
     _known_ingress = _known("ingress")
     _known_egress = _known("egress")

@@ -104,6 +104,12 @@ class GrantSpec(Model):
     depot: Point | None = None
     home: Position | None = None
     limits: GrantedLimits | None = None
+    awaits: tuple[str, ...] = Field(
+        default=(),
+        max_length=50,
+        description="Components that are not ready yet, for a driver or a tour of an application with start: whenReady. The drone"
+        " does not take off for the mission while there are any.",
+    )
     policies: tuple[GrantedPolicy, ...] = Field(default=(), description="Policies that apply to the instance.")
     mission: str | None = Field(
         default=None,
@@ -142,6 +148,17 @@ class GrantSpec(Model):
         """
         flies = self.class_ or ("tour" if self.tour else "")
         return f"a {flies} needs operationArea" if flies and not self.operation_area else ""
+
+    @property
+    def begins_mission(self) -> bool:
+        """True if the drone takes off for the instance: a driver, or a passenger whose points of interest the system visits."""
+        return self.class_ == "driver" or bool(self.tour)
+
+    @property
+    def awaited(self) -> str:
+        """Reason why the mission must not begin yet; empty if it may."""
+        names = ", ".join(self.awaits)
+        return f"the mission begins when all components are ready; not ready: {names}" if names else ""
 
     def methods(self, service: str) -> frozenset[str]:
         """Return the granted methods of a service. A driver may always get and return control."""

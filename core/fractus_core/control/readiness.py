@@ -19,6 +19,7 @@ class Readiness:
         located: True if position and home are known.
         link: Problem of the link to the autopilot.
         absent: Reason why received messages do not come from the autopilot. Empty while the autopilot is connected.
+        awaited: Reason why the mission must not begin yet.
     """
 
     unverified: str
@@ -26,6 +27,7 @@ class Readiness:
     located: bool
     link: str = ""
     absent: str = ""
+    awaited: str = ""
 
 
 def not_ready_reason(state: ControlState, key: str, readiness: Readiness) -> str | None:
@@ -44,5 +46,6 @@ def not_ready_reason(state: ControlState, key: str, readiness: Readiness) -> str
         ),
         (not readiness.located, "position and home are not known yet"),
         (not vehicle.armed and bool(readiness.link), readiness.link),
+        (not vehicle.armed and bool(readiness.awaited), readiness.awaited),
     )
     return next((reason for holds, reason in reasons if holds), None)

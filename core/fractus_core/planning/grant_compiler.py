@@ -63,6 +63,8 @@ def compile_grants(
     inventory: Inventory,
     settings: Settings | None = None,
     present: Iterable[GrantSpec] = (),
+    *,
+    awaits: tuple[str, ...] = (),
 ) -> tuple[GrantSpec, ...]:
     """Compile a Grant for each planned instance that uses system services or has points of interest, in the plan's order.
 
@@ -76,6 +78,7 @@ def compile_grants(
         settings: Settings of the plan.
         present: Existing Grants of the application. An instance with a Grant on the same node keeps its last version of a
             policy that is now invalid.
+        awaits: Components for which the mission waits.
 
     Raises:
         InvalidObject: A policy for a new instance selects a missing or invalid zone, or a policy cannot be read. Then no
@@ -95,7 +98,7 @@ def compile_grants(
         if placed.node not in inventory.drones and placed.node not in inventory.edge_nodes:
             if last is None:
                 raise InvalidObject(f"node {placed.node}", "it has no Drone or EdgeNode; nothing can be granted there")
-            grants.append(refresh(last, inventory))
+            grants.append(refresh(last, inventory, awaits))
             continue
         if placed.placement == "drone" and area is not None:
             # All drone components run on one drone.
@@ -104,7 +107,10 @@ def compile_grants(
                 application, drone, inventory, area, component=component.name, instance=placed.instance
             )
             grant = _granted_aboard(aboard, component, placed, inventory)
-            grant = grant.model_copy(update={"tour": area.route}) if guides else grant
+            if guides:
+                grant = grant.model_copy(update={"tour": area.route})
+            if grant.begins_mission:
+                grant = grant.model_copy(update={"awaits": awaits})
         else:
             grant = _edge_grant(application, component, placed, inventory)
         if last is None:
@@ -124,13 +130,16 @@ def check_policies(inventory: Inventory) -> None:
         raise InvalidObject(f"Policy {name}", f"{problem}; correct or delete it")
 
 
-def refresh(grant: GrantSpec, inventory: Inventory) -> GrantSpec:
-    """Return a Grant with updated policies. Its other fields stay unchanged.
+def refresh(grant: GrantSpec, inventory: Inventory, awaits: tuple[str, ...] | None = None) -> GrantSpec:
+    """Return a Grant with updated policies and awaited components (None: no change). Its other fields stay unchanged.
 
     The update needs neither the application nor its plan, so an invalid application does not prevent the update of a
     Grant in use. If a policy or one of its zones is invalid, the last granted version is kept.
     """
-    return grant.model_copy(update={"policies": _policies(grant, inventory, grant.policies)})
+    fields: dict[str, Any] = {"policies": _policies(grant, inventory, grant.policies)}
+    if awaits is not None and grant.begins_mission:
+        fields["awaits"] = awaits
+    return grant.model_copy(update=fields)
 
 
 def flight_grant(application: Application, drone: Drone, inventory: Inventory, area: OperationArea) -> GrantSpec:

@@ -86,6 +86,7 @@ class Arming:
 
     async def _arm(self, grant: ActiveGrant, permit: Permit) -> None:
         self._require_verified()
+        self._require_components(grant)
         autopilot = self._control.autopilot
         if unready := autopilot.vehicle.arming_refusal(autopilot.now):
             raise PreconditionFailed("NotReady", f"the autopilot is not ready to arm: {unready}")
@@ -105,6 +106,7 @@ class Arming:
             def still_permitted() -> None:
                 permit()
                 self._require_verified(status)
+                self._require_components(grant)
 
             still_permitted()
             await self._start(home, still_permitted)
@@ -194,6 +196,15 @@ class Arming:
         if self._control.audit.failure:
             raise PreconditionFailed("AuditUnavailable", self._control.audit.failure)
         return status
+
+    def _require_components(self, grant: ActiveGrant) -> None:
+        """Require that the mission may begin.
+
+        Raises:
+            PreconditionFailed: Components for which the application waits are not ready.
+        """
+        if awaited := self._control.awaited(grant.key):
+            raise PreconditionFailed("NotReady", awaited)
 
     def _home_of(self, grant: ActiveGrant, mission: Mission) -> tuple[float, float, float]:
         """Return the home of the mission: where it armed for its first takeoff.

@@ -267,8 +267,16 @@ class ControlStore:
             located,
             self.autopilot.link_problem,
             vehicle.identity_problem,
+            self.awaited(key),
         )
         return not_ready_reason(self.state, key, readiness)
+
+    def awaited(self, key: str) -> str:
+        """Return why a mission must not begin yet, or an empty string if it may begin or has begun."""
+        mission = self._state.missions.get(key)
+        if mission is not None and mission.flown:
+            return ""
+        return next((grant.spec.awaited for grant in self._grants.active.values() if grant.key == key), "")
 
     @property
     def arming_problem(self) -> str:

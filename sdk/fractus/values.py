@@ -176,7 +176,7 @@ class Check(Result):
         altitude_m: Altitude of a takeoff, after correction.
         speed_mps: Speed, after correction.
         velocity: Velocity, after correction.
-        takeover: Action of the system if it took the drone over: hover, land, returnToLaunch or revoke; empty if it would not.
+        takeover: Action of the system if it took the drone over: hover, land, returnToLaunch, abort or revoke; empty if it would not.
         brake_first: True if the drone would stop before the leg.
     """
 

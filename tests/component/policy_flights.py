@@ -142,7 +142,7 @@ def scene(rng: np.random.Generator) -> Scene:
     slot = 0
     for _ in range(int(rng.integers(1, 5))):
         zone, active = _zone(rng, slot, rings, bands, rng.uniform(4, 28), rng.uniform(-70, 70, 2), minutes)
-        action = rng.choice(["ignore", "adjust", "adjust", "hover", "land", "returnToLaunch", "revoke"])
+        action = rng.choice(["ignore", "adjust", "adjust", "hover", "land", "returnToLaunch", "abort", "revoke"])
         window, valid = _validity(rng, minutes)
         policies.append(policy(f"out-{slot}", "GeofenceControl", "exclusion", [zone], action=str(action), **window))
         kinds[slot] = EXCLUSION if (active & valid).any() else 0

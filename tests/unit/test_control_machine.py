@@ -54,6 +54,7 @@ EVENTS: tuple[events.Event, ...] = (
     events.MotionCancelled(1), events.MotionCancelled(2), events.MotionStopped("Slower", "it is too fast"),
     events.TakeoverDemanded("hover", "X", "x"), events.TakeoverDemanded("land", "X", "x"),
     events.TakeoverDemanded("returnToLaunch", "X", "x"), events.TakeoverDemanded("revoke", "X", "x"),
+    events.TakeoverDemanded("abort", "X", "x"), events.TakeoverDemanded("abort", "X", "x", land_at=(39.0, 22.0)),
     events.BrakeDemanded("X", "x"), events.PositionLost("x"), events.PositionFound(),
     events.GrantChanged(None, DRIVER), events.GrantChanged(DRIVER, None), events.GrantChanged(DRIVER, DRIVER),
     events.GrantChanged(None, TOUR), events.GrantChanged(TOUR, None),

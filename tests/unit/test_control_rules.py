@@ -87,19 +87,27 @@ def test_mission_fails_if_no_leg_of_its_path_was_flown(done: tuple[events.Event,
     assert state.returning, "the drone returns home with either outcome"
 
 
-@pytest.mark.parametrize("action", ["hover", "land", "returnToLaunch", "revoke"])
+@pytest.mark.parametrize("action", ["hover", "land", "returnToLaunch", "abort", "revoke"])
 def test_takeover_ends_mission_unless_action_is_hover(action: Any) -> None:
     state, _ = apply_events(*FLY, events.TakeoverDemanded(action, "Code", "why"))
     kinds = {
         "hover": None,
         "land": OutcomeKind.FAILED,
         "returnToLaunch": OutcomeKind.FAILED,
+        "abort": OutcomeKind.REVOKED,
         "revoke": OutcomeKind.REVOKED,
     }
     outcome = state.missions["a"].outcome
     assert (outcome.kind if outcome is not None else None) is kinds[action]
     assert (state.grace is not None) is (action == "hover")
     assert state.lease is None
+
+
+@pytest.mark.parametrize(("land_at", "kind"), [((39.1, 22.9), TaskKind.LAND_AT), (None, TaskKind.RETURN)])
+def test_abort_leads_to_landing_place_or_home(land_at: tuple[float, float] | None, kind: TaskKind) -> None:
+    state, _ = apply_events(*FLY, events.TakeoverDemanded("abort", "Code", "why", land_at=land_at))
+    assert (state.task is not None and state.task.kind, state.missions["a"].land_at) == (kind, land_at)
+    assert state.home_for_good
 
 
 def test_vehicle_returns_home_after_grace_of_lost_driver() -> None:

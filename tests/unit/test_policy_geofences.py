@@ -144,7 +144,7 @@ def test_zone_with_altitude_band_may_be_overflown() -> None:
     )
 
 
-@pytest.mark.parametrize("action", ["hover", "land", "returnToLaunch", "revoke"])
+@pytest.mark.parametrize("action", ["hover", "land", "returnToLaunch", "abort", "revoke"])
 def test_geofence_action_determines_takeover(action: str) -> None:
     grant = compiled(exclusion(box(50, -20, 80, 20), action))
     verdict = ask(grant, goto(60, 0))
@@ -159,6 +159,10 @@ def test_most_restrictive_fence_decides() -> None:
     verdict = ask(compiled(*zones), goto(60, 0))
     assert (verdict.action, verdict.takeover) == ("takeover", "land")
     assert verdict.policies == ("p-land", "p-returntolaunch", "p-hover", "p-ignore", "p-adjust")
+    zones.append(exclusion(box(50, -20, 80, 20), "abort", "p-abort"))
+    assert ask(compiled(*zones), goto(60, 0)).takeover == "abort"
+    zones.append(exclusion(box(50, -20, 80, 20), "revoke", "p-revoke"))
+    assert ask(compiled(*zones), goto(60, 0)).takeover == "revoke"
 
 
 def test_adjust_action_shortens_leg_before_exclusion_zone() -> None:

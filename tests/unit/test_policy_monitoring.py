@@ -34,7 +34,7 @@ def test_monitor_stops_drone_while_it_can_still_brake() -> None:
     raise AssertionError("it never braked")
 
 
-@pytest.mark.parametrize("action", ["hover", "land", "returnToLaunch", "revoke"])
+@pytest.mark.parametrize("action", ["hover", "land", "returnToLaunch", "abort", "revoke"])
 def test_monitor_takes_over_by_action_of_policy(action: str) -> None:
     grant = compiled(exclusion(WALL, action))
     for state in (at(0, 70), at(0, 40, north_mps=8)):

@@ -66,7 +66,7 @@ def test_velocity_leg_includes_latency_hold_and_stop() -> None:
     assert max(already) <= 30 - stop - 2.5
 
 
-@pytest.mark.parametrize("action", ["ignore", "hover", "land", "returnToLaunch", "revoke"])
+@pytest.mark.parametrize("action", ["ignore", "hover", "land", "returnToLaunch", "abort", "revoke"])
 def test_velocity_into_zone_is_denied_or_taken_over(action: str) -> None:
     grant = compiled(exclusion(box(-50, 10, 50, 60), action), operationArea=[])
     verdict = ask(grant, fly(8, hold=2.0))

@@ -132,3 +132,8 @@ async def test_journal_writes_one_record_at_a_time(tmp_path: Path, monkeypatch: 
     assert most == [1]
     assert Journal(tmp_path).record.missions["k"].outcome == Outcome(OutcomeKind.FAILED, "driver lost: it left")
     assert journal.failure == ""
+
+
+async def test_journal_restores_landing_place(tmp_path: Path) -> None:
+    await Journal(tmp_path).save(record(land_at=(39.25, 22.5)))
+    assert Journal(tmp_path).record.missions["k"].land_at == (39.25, 22.5)

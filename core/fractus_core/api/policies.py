@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, get_args
 from pydantic import Field
 from pydantic.alias_generators import to_snake
 
-from fractus_core.api.geometry import Altitude, AltitudeBand, Area, Reference
+from fractus_core.api.geometry import Altitude, AltitudeBand, Area, Point, Reference
 from fractus_core.api.methods import CAMERA_METHODS, Method
 from fractus_core.api.model import AGE, READY, Conditions, Model, ObservedGeneration, OpenModel, Resource
 from fractus_core.api.names import ComponentName, Name
@@ -133,7 +133,7 @@ AccessKind = Literal["grant", "denial"]
 LimitKind = Literal["speed", "altitude"]
 GeofenceKind = Literal["inclusion", "exclusion"]
 LimitAction = Literal["enforce", "refuse"]
-GeofenceAction = Literal["ignore", "adjust", "hover", "land", "returnToLaunch", "revoke"]
+GeofenceAction = Literal["ignore", "adjust", "hover", "land", "returnToLaunch", "abort", "revoke"]
 FilterAction = Literal["black", "blurAverage", "blurMedian", "blurFaces", "removeBackground"]
 PrivacyAction = Literal["refuse", FilterAction]
 FaceMethod = Literal["pixelate", "gaussian"]
@@ -202,6 +202,11 @@ class PolicySpec(Validity):
     action: Literal[LimitAction, GeofenceAction, FilterAction] | None = Field(
         default=None,
         description="Repair action on a violation. Default: enforce for limits, ignore (discard the request) for geofences.",
+    )
+    land_at: Point | None = Field(
+        default=None,
+        description="For abort: place on the ground at which the system lands the drone; unset, or if it cannot be reached"
+        " legally: home.",
     )
     faces: FaceMethod | None = Field(
         default=None, description="For blurFaces: anonymisation method; default: pixelate."
@@ -360,6 +365,14 @@ class PolicySpec(Validity):
     )
     def _geofence_action(self) -> Violation:
         return "action" if self.type == "GeofenceControl" and not self._acts(GeofenceAction) else None
+
+    @rule(
+        "!has(self.landAt) || (self.type == 'GeofenceControl' && has(self.action) && self.action == 'abort')",
+        "landAt is only allowed for GeofenceControl with action abort",
+    )
+    def _landing(self) -> Violation:
+        aborts = self.type == "GeofenceControl" and self.action == "abort"
+        return "landAt" if self.land_at is not None and not aborts else None
 
     @rule(
         _for("PrivacyControl", f"(self.kind == 'camera' && has(self.action) && {_among('action', PrivacyAction)})"),

@@ -150,12 +150,14 @@ class TakeoverDemanded:
         code: Code of the verdict.
         reason: Reason of the verdict.
         policies: Names of the policies that require it.
+        land_at: Latitude and longitude of the landing place, for the takeover `abort`; None: home.
     """
 
     takeover: Takeover
     code: str
     reason: str
     policies: tuple[str, ...] = ()
+    land_at: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -85,6 +85,7 @@ TAKEOVERS: dict[Takeover, tuple[TaskKind, OutcomeKind | None]] = exhaustive(
         "hover": (TaskKind.HOVER, None),
         "land": (TaskKind.LAND, OutcomeKind.FAILED),
         "returnToLaunch": (TaskKind.RETURN, OutcomeKind.FAILED),
+        "abort": (TaskKind.LAND_AT, OutcomeKind.REVOKED),
         "revoke": (TaskKind.RETURN, OutcomeKind.REVOKED),
     },
 )
@@ -483,6 +484,8 @@ def _take_over(update: StateUpdate, event: TakeoverDemanded) -> None:
             kind = TaskKind.RETURN
             outcome = OutcomeKind.FAILED
             reason = f"{reason}; {repeated}"
+    if kind is TaskKind.LAND_AT:
+        kind = update.plan_landing(mission, event.land_at)
     update.seize(kind, event.code, reason, event.policies, outcome)
 
 
@@ -516,6 +519,8 @@ def _change_grant(update: StateUpdate, event: GrantChanged) -> None:
         return
     lease = update.state.lease
     mission = update.state.missions.get(before.key)
+    if mission is not None and mission.outcome is not None and update.state.flies_for(before.key):
+        update.set(removed=before.key)  # its constraints apply until the drone has landed
     concerned = (lease is not None and lease.key == before.key) or update.state.active == before.key
     if mission is None or mission.outcome is not None or not concerned:
         return

@@ -159,6 +159,7 @@ class Mission:
         counts: Waypoints of all control points so far.
         legs: Legs that ended since the last completed waypoint.
         corrected_legs: Number of these legs that a policy corrected.
+        land_at: Latitude and longitude at which the system lands the drone after the end of the mission; None: at home.
     """
 
     key: str
@@ -175,6 +176,7 @@ class Mission:
     counts: WaypointCounts = WaypointCounts()
     legs: int = 0
     corrected_legs: int = 0
+    land_at: tuple[float, float] | None = None
 
 
 class StreamState(Enum):
@@ -236,11 +238,15 @@ class ControlLease:
 
 
 class TaskKind(Enum):
-    """Task of the system. The values equal the values of a policy's takeover."""
+    """Task of the system. The values appear in the audit log.
+
+    LAND_AT: Fly to the landing place of the mission and land there. Without a legal route, return home.
+    """
 
     HOVER = "hover"
     RETURN = "returnToLaunch"
     LAND = "land"
+    LAND_AT = "landAt"
     TOUR = "tour"
 
 

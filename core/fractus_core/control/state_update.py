@@ -189,7 +189,7 @@ class StateUpdate:
         """
         if mission.outcome is not None or not self.state.grant_in_force:
             self.end_mission(mission, OutcomeKind.REVOKED, GRANT_REMOVED)
-            self.start(TaskKind.RETURN)
+            self.start(TaskKind.RETURN if mission.land_at is None else TaskKind.LAND_AT)
         else:
             self.start(TaskKind.HOVER)
             self.begin_grace(mission, DRIVER_LOST)
@@ -210,6 +210,13 @@ class StateUpdate:
         self.start(kind)
         if mission is not None and mission.outcome is None:
             self.begin_grace(mission, reason)
+
+    def plan_landing(self, mission: Mission | None, land_at: tuple[float, float] | None) -> TaskKind:
+        """Store the landing place of a mission that is about to end. Return the task that brings the drone down."""
+        if mission is None or land_at is None:
+            return TaskKind.RETURN
+        self.update_mission(mission, land_at=land_at)
+        return TaskKind.LAND_AT
 
     def give_to_pilot(self, event: str) -> None:
         """Give control authority to a human pilot. Applications lose it at once, and the system sends no more commands.

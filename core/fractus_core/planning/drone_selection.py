@@ -12,7 +12,8 @@ from fractus_core.api.plans import Alternative, DroneChoice, PlannedMission
 from fractus_core.geo import ground_point
 from fractus_core.planning.candidates import SUITABLE, Check, check_host, check_resources, check_services, readiness
 from fractus_core.planning.inventory import DroneFacts
-from fractus_core.planning.legality import MissionRoute, RouteJudge
+from fractus_core.planning.landing_places import check_landing_places
+from fractus_core.planning.legality import MAX_ROUTES, MissionRoute, RouteJudge
 from fractus_core.planning.mission import (
     Estimate,
     MissionEstimator,
@@ -129,6 +130,7 @@ def _legal_first(
     """
     judge = RouteJudge(builder.application, area, builder.inventory, builder.settings)
     forbids = builder.settings.policy_conflicts == "forbid"
+    ranked = _with_legal_landings(builder, area, ranked, leader)
     tried: list[tuple[_Ranked, MissionRoute | None, str | None]] = []
     for candidate in ranked:
         if judge.exhausted:
@@ -152,6 +154,35 @@ def _legal_first(
         message = f"it was not checked because policies do not allow the routes of {len(tried)} other drones"
         builder.reject(leader, candidate.drone.name, Check("NotJudged", message))
     raise builder.infeasible(leader, "PolicyConflict", f"no drone may fly {leader.name}", "")
+
+
+def _with_legal_landings(
+    builder: PlanBuilder, area: OperationArea, ranked: Sequence[_Ranked], leader: Component
+) -> list[_Ranked]:
+    """Return the drones that could land at every landing place of the application, and reject the others.
+
+    Further drones are not checked when `MAX_ROUTES` were found. A drone of the previous plan is kept, because it may be in
+    flight: without a legal landing place, it returns home.
+
+    Raises:
+        Infeasible: No drone could land there.
+    """
+    suitable: list[_Ranked] = []
+    for candidate in ranked:
+        problem = ""
+        if not candidate.used and not builder.was_selected(candidate.drone.name, shared=False):
+            problem = check_landing_places(
+                builder.application, candidate.drone, area, builder.inventory, builder.settings
+            )
+        if problem:
+            builder.reject(leader, candidate.drone.name, Check("LandingPlaceIllegal", problem))
+            continue
+        suitable.append(candidate)
+        if len(suitable) == MAX_ROUTES:
+            break
+    if not suitable:
+        raise builder.infeasible(leader, "LandingPlaceIllegal", f"no drone may fly {leader.name}", "")
+    return suitable
 
 
 # -- drones in range --

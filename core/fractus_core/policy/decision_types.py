@@ -17,7 +17,7 @@ STATIONARY_MPS = 0.5
 margin."""
 
 Action = Literal["allow", "correct", "deny", "takeover"]
-Takeover = Literal["hover", "land", "returnToLaunch", "revoke"]
+Takeover = Literal["hover", "land", "returnToLaunch", "abort", "revoke"]
 
 
 @dataclass(frozen=True, slots=True)

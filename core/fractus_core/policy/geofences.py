@@ -26,7 +26,8 @@ from fractus_core.policy.decision_types import Situation, Takeover, Verdict, den
 from fractus_core.policy.kinematics import XY, Leg, altitude_range_to_stop_m, vertical_leg
 
 SEVERITY: dict[GeofenceAction, int] = exhaustive(
-    GeofenceAction, {"adjust": 0, "ignore": 1, "hover": 2, "returnToLaunch": 3, "land": 4, "revoke": 5}
+    GeofenceAction,
+    {"adjust": 0, "ignore": 1, "hover": 2, "returnToLaunch": 3, "land": 4, "abort": 5, "revoke": 6},
 )
 """Severity of each action. A higher value takes more control from the application."""
 
@@ -115,6 +116,7 @@ TAKEOVERS: dict[GeofenceAction, Takeover | None] = exhaustive(
         "hover": "hover",
         "land": "land",
         "returnToLaunch": "returnToLaunch",
+        "abort": "abort",
         "revoke": "revoke",
     },
 )
@@ -126,6 +128,7 @@ _EFFECTS: dict[Takeover, str] = exhaustive(
         "hover": "the system takes the drone and hovers",
         "land": "the system takes the drone and lands it",
         "returnToLaunch": "the system takes the drone and flies it home",
+        "abort": "access is revoked and the system flies the drone to its landing place",
         "revoke": "access is revoked and the system flies the drone home",
     },
 )

@@ -11,7 +11,7 @@ from shapely.geometry.base import BaseGeometry
 from fractus_core.policy.compiled_grant import MAX_FRAME_REACH_M, AirVolume, CompiledGrant, altitude_above_home_m
 from fractus_core.policy.decision_types import Situation
 from fractus_core.policy.geofences import find_breaches
-from fractus_core.policy.kinematics import Leg, stop_point, vertical_leg
+from fractus_core.policy.kinematics import XY, Leg, stop_point, vertical_leg
 from fractus_core.policy.limits import altitude_bounds, lowest_ceiling_m, speed_bounds
 
 MIN_RETURN_ALTITUDE_M = 10.0
@@ -27,8 +27,10 @@ The drone waits during a search, and a search without a result takes a second or
 """
 
 
-def return_altitudes_m(now: Situation, grant: CompiledGrant, worthwhile_m: float) -> tuple[float, ...]:
-    """Return the altitudes above home at which the system flies a drone home, best first.
+def return_altitudes_m(
+    now: Situation, grant: CompiledGrant, worthwhile_m: float, goal: XY | None = None
+) -> tuple[float, ...]:
+    """Return the altitudes above home at which the system flies a drone home or to a landing place, best first.
 
     The preferred altitude is the return altitude, or the present altitude if that is higher. The first result is this
     altitude limited to the altitude limits along the straight route. The next results are limited to the limits at the
@@ -38,12 +40,14 @@ def return_altitudes_m(now: Situation, grant: CompiledGrant, worthwhile_m: float
         now: Position, home and airframe. Position and home are known.
         grant: Permissions and restrictions that apply.
         worthwhile_m: Altitude up to which a climb is worthwhile.
+        goal: Landing place in metres of the grant's frame; None: home.
     """
     position = grant.locate(now)
     if position is None or now.home is None:
         return (now.altitude_m,)
-    home = grant.frame.xy(now.home.lat, now.home.lon)
-    lane = shapely.linestrings((position, home)) if position != home else shapely.points(position)
+    if goal is None:
+        goal = grant.frame.xy(now.home.lat, now.home.lon)
+    lane = shapely.linestrings((position, goal)) if position != goal else shapely.points(position)
     best = max(now.altitude_m, min(now.airframe.return_altitude_m, worthwhile_m))
     altitudes = []
     for ground in (lane, shapely.points(position), shapely.Point()):
@@ -127,3 +131,31 @@ def descent_enters_fence(now: Situation, grant: CompiledGrant) -> bool:
     present = vertical_leg(position, now.altitude_m, now.altitude_m)
     column = vertical_leg(position, 0.0, now.altitude_m)
     return not find_breaches(present, now, grant, *room) and bool(find_breaches(column, now, grant, *room))
+
+
+def landing_problem(place: XY, altitude_m: float, now: Situation, grant: CompiledGrant) -> str:
+    """Return why a drone must not land at a place, or an empty string if it may.
+
+    The column from the ground to the altitude must be inside the area of the grant and its inclusion zones, and outside
+    all exclusion zones, each with the margin of a leg. The ground may be lower than home.
+
+    Args:
+        place: Landing place, in metres of `grant.frame`.
+        altitude_m: Altitude above home at which the drone arrives.
+        now: Time, home and position errors. The position in it is not used.
+        grant: Permissions and restrictions that apply. Its flight area includes the corridor.
+    """
+    ground = shapely.points(place)
+    margin_m = now.margin_m
+    area = grant.flight_area
+    if area is not None and not (area.covers(ground) and area.boundary.distance(ground) >= margin_m):
+        return f"it is not inside the area of the Grant with a margin of {margin_m:.1f} m"
+    air = AirVolume(ground, margin_m, -math.inf, altitude_m + now.height_margin_m)
+    for zone in grant.exclusions.near(air, now, grant.flat_terrain):
+        return f"it is inside zone {zone.name} of policy {zone.rule.name}, or within {margin_m:.1f} m of it"
+    for fence in grant.inclusions:
+        if fence.rule.in_force(now.time_s):
+            shape = fence.near_altitudes(0.0, altitude_m, now, grant.flat_terrain)
+            if not (shape.covers(ground) and shape.boundary.distance(ground) >= margin_m):
+                return f"it is not inside the zones of policy {fence.rule.name} with a margin of {margin_m:.1f} m"
+    return ""

@@ -203,6 +203,12 @@ class ControlStore:
         return motion.binding if self.autopilot.now < motion.binding_until else None
 
     @property
+    def landing_place(self) -> tuple[float, float] | None:
+        """Latitude and longitude at which the system lands the drone of the active mission; None: at home."""
+        mission = self._state.mission
+        return mission.land_at if mission is not None else None
+
+    @property
     def constraints(self) -> FlightConstraints | None:
         """Constraints of the current system flight, or None."""
         flight = self._state.flight
@@ -575,7 +581,26 @@ class ControlStore:
 
     def take_over(self, verdict: Verdict) -> None:
         """Take the drone from its driver, as a policy or the monitor requires."""
-        self.dispatch(TakeoverDemanded(verdict.takeover or "hover", verdict.code, verdict.reason, verdict.policies))
+        self.dispatch(
+            TakeoverDemanded(
+                verdict.takeover or "hover",
+                verdict.code,
+                verdict.reason,
+                verdict.policies,
+                self._landing_place(verdict) if verdict.takeover == "abort" else None,
+            )
+        )
+
+    def _landing_place(self, verdict: Verdict) -> tuple[float, float] | None:
+        """Return the landing place of the most restrictive policy of a verdict with the takeover `abort`."""
+        grant = self.mission_grant
+        aborting = {
+            policy.name: policy.spec.land_at
+            for policy in (grant.spec.policies if grant is not None else ())
+            if policy.spec.action == "abort"
+        }
+        place = next((aborting[name] for name in verdict.policies if name in aborting), None)
+        return (place.lat, place.lon) if place is not None else None
 
     def _grant_changed(self, old: ActiveGrant | None, new: ActiveGrant | None) -> None:
         lease = self.lease

@@ -59,6 +59,9 @@ def _mission(stored: dict[str, Any]) -> Mission:
     if known.get("home") is not None:
         lat, lon, amsl_m = known["home"]
         known["home"] = (float(lat), float(lon), float(amsl_m))
+    if known.get("land_at") is not None:
+        lat, lon = known["land_at"]
+        known["land_at"] = (float(lat), float(lon))
     return Mission(**known)
 
 

@@ -213,7 +213,7 @@ class MotionMonitor:
         if control.authority is Authority.DRIVER:
             return True
         task = control.state.task
-        by_system = task is not None and task.kind is TaskKind.RETURN and not task.begun_by_others
+        by_system = task is not None and task.kind in {TaskKind.RETURN, TaskKind.LAND_AT} and not task.begun_by_others
         returns = by_system and mode.kind is ModeKind.RETURNING
         return returns and control.authority is Authority.SYSTEM
 

@@ -1,4 +1,4 @@
-"""Return flights: the system flies home on legal legs. The autopilot's own return is the last resort."""
+"""Return flights: the system flies home, or to a landing place, on legal legs. The autopilot's own return is the last resort."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from fractus_core.policy.compiled_grant import CompiledGrant
 from fractus_core.policy.geofences import RTL_CONE_SLOPE, check_straight_return
 from fractus_core.policy.return_route import (
     descent_enters_fence,
+    landing_problem,
     may_change_altitude,
     return_altitudes_m,
 )
@@ -37,7 +38,7 @@ log = logging.getLogger(__name__)
 
 
 class ReturnFlight:
-    """Flies the drone home.
+    """Flies the drone home, or to the landing place of a mission that a policy has aborted.
 
     Args:
         control: Control state.
@@ -63,7 +64,7 @@ class ReturnFlight:
         a zone into which it would descend, it waits longer.
 
         Args:
-            kind: Task of the system: land or return.
+            kind: Task of the system: land, return, or land at the landing place of the mission.
             is_current: Returns True while the task is current.
             attempts: Number of attempts that failed.
 
@@ -79,7 +80,7 @@ class ReturnFlight:
         vehicle = control.autopilot.vehicle
         stack = control.autopilot.stack
         self.given_up = None
-        if kind is TaskKind.RETURN and attempts < SETTINGS.max_route_attempts:
+        if kind is not TaskKind.LAND and attempts < SETTINGS.max_route_attempts:
             await self._restore_home()
         # A landing in progress was chosen by a failsafe or a pilot. The battery may be too low for any other flight.
         landing = vehicle.mode.kind is ModeKind.LANDING
@@ -100,9 +101,18 @@ class ReturnFlight:
         grant = control.last_grant  # Not earlier: the Grant may have changed while the drone waited.
         if grant is None or not vehicle.in_air or vehicle.mode.comes_down or self._blind():
             return stack.return_straight
+        place = control.landing_place if kind is TaskKind.LAND_AT and attempts < SETTINGS.max_route_attempts else None
+        if place is not None and await self._fly_to_landing(grant, is_current, place):
+            return stack.land
+        return await self._return_home(grant, is_current, attempts)
+
+    async def _return_home(self, grant: ActiveGrant, is_current: Callable[[], bool], attempts: int) -> FlightMode:
+        """Fly home, and return the mode for the rest of the return, as `approach` does."""
+        control = self._control
+        stack = control.autopilot.stack
         try:
             if attempts < SETTINGS.max_route_attempts:
-                problem = await self._fly_home(grant, is_current)
+                problem = await self._fly_back(grant, is_current)
             elif self._straight_return_legal(control.for_transit(grant)):
                 problem = ""
             else:
@@ -169,8 +179,35 @@ class ReturnFlight:
         """
         return self._control.retraces and self._control.home_moved
 
-    async def _fly_home(self, grant: ActiveGrant, is_current: Callable[[], bool]) -> str:
-        """Fly home. Return the reason if that is impossible, or an empty string.
+    async def _fly_to_landing(
+        self, grant: ActiveGrant, is_current: Callable[[], bool], place: tuple[float, float]
+    ) -> bool:
+        """Fly to a landing place. Return False, and record the reason, if the drone cannot land there.
+
+        Raises:
+            AutopilotError: The drone did not follow its commands.
+        """
+        try:
+            problem = await self._fly_back(grant, is_current, place)
+        except AutopilotError:
+            raise
+        except Exception:
+            log.exception("return: route planner failed")
+            problem = "the route planner failed"
+        if not problem and (
+            self._blind() or self._control.autopilot.vehicle.distance_m(*place) > 2 * SETTINGS.reached_m
+        ):
+            problem = "the drone did not arrive"
+        if problem:
+            lat, lon = place
+            reason = f"the drone cannot land at {lat:.6f}, {lon:.6f} and returns home: {problem}"
+            self._control.note("returnToLaunch", reason, "NoLegalWay")
+        return not problem
+
+    async def _fly_back(
+        self, grant: ActiveGrant, is_current: Callable[[], bool], place: tuple[float, float] | None = None
+    ) -> str:
+        """Fly home, or to a landing place. Return the reason if that is impossible, or an empty string.
 
         Raises:
             AutopilotError: The drone did not follow its commands.
@@ -185,10 +222,10 @@ class ReturnFlight:
         flight = SystemFlight(constraints, "Homeward", lambda motion: _both(permit, motion))
         try:
             await control.modes.change_mode(control.autopilot.stack.guided, permit)
-            async for _ in self._routes.follow(flight, lambda: self._next_leg(flight)):
+            async for _ in self._routes.follow(flight, lambda: self._next_leg(flight, place)):
                 pass
         except Refused as refusal:
-            if self._cannot_rest(refusal, flight):
+            if place is None and self._cannot_rest(refusal, flight):
                 return ""
             if refusal.verdict.code == "NoLegalWay" or refusal.verdict.code in REPLAN_CODES:
                 return str(refusal)
@@ -272,30 +309,41 @@ class ReturnFlight:
         vehicle = self._control.autopilot.vehicle
         return vehicle.distance_m(vehicle.home.lat, vehicle.home.lon) if vehicle.home is not None else math.inf
 
-    async def _next_leg(self, flight: SystemFlight) -> NextLeg | None:
+    async def _next_leg(self, flight: SystemFlight, place: tuple[float, float] | None = None) -> NextLeg | None:
         """Return the next leg home, or None if the drone has settled at home, or if position or home is unknown.
 
         The last leg ends when the drone has settled, because a drone that lands while it flies past home comes down up to a
         metre away. Within a metre of home, the drone keeps its altitude, and lands where it is if there is no legal leg.
 
+        Args:
+            flight: The return flight.
+            place: Latitude and longitude of a landing place to fly to instead of home.
+
         Raises:
-            Refused: There is no legal route, or the position is not trusted.
+            Refused: There is no legal route, the position is not trusted, or the landing place is not legal.
         """
         self._require_trusted_position()
         if self._control.home_moved:
             raise Unavailable("AutopilotUnavailable", "another station moved home; it must be set back first")
         now = self._gate.situation()
-        distance_m = self._home_distance_m()
         if now.lat is None or now.lon is None or now.home is None:
             return None
-        if has_settled(self._control.autopilot.vehicle, distance_m):
+        compiled = flight.constraints.compiled
+        goal = (now.home.lat, now.home.lon) if place is None else place
+        goal_xy = compiled.frame.xy(*goal)
+        distance_m = self._control.autopilot.vehicle.distance_m(*goal)
+        settled = has_settled(self._control.autopilot.vehicle, distance_m)
+        problem = "" if place is None else landing_problem(goal_xy, now.altitude_m, now, compiled)
+        if settled and not problem:
             return None
         near = distance_m <= SETTINGS.reached_m
         heights: tuple[float, ...] = (now.altitude_m,)
         if not near:
-            heights = return_altitudes_m(now, flight.constraints.compiled, RTL_CONE_SLOPE * distance_m)
+            heights = return_altitudes_m(now, compiled, RTL_CONE_SLOPE * distance_m, goal_xy)
         for height in heights:
-            vertical_first = may_change_altitude(now, flight.constraints.compiled, height)
+            if place is not None and landing_problem(goal_xy, height, now, compiled):
+                continue
+            vertical_first = may_change_altitude(now, compiled, height)
             # Normally the autopilot's straight return must be legal from each waypoint of a route. The system itself
             # flies this route home, so `retraces` disables that condition.
             planned = replace(
@@ -303,23 +351,24 @@ class ReturnFlight:
                 airframe=replace(now.airframe, retraces=True),
                 altitude_m=height if vertical_first else now.altitude_m,
             )
-            first = await first_leg((now.home.lat, now.home.lon), (height,), planned, flight)
+            first = await first_leg(goal, (height,), planned, flight)
             if first is None:
                 continue
             leg, last, _ = first
             if vertical_first and abs(height - now.altitude_m) > SETTINGS.return_level_m:
                 leg = replace(leg, lat=now.lat, lon=now.lon)
                 last = False
-            speed_mps = limited_mps(self._control.cruise_mps, leg, now, flight.constraints.compiled)
+            speed_mps = limited_mps(self._control.cruise_mps, leg, now, compiled)
             return NextLeg(
                 replace(leg, speed_mps=speed_mps),
                 last,
                 reached_m=SETTINGS.return_last_leg_m if last else SETTINGS.reached_m,
                 settles=last,
             )
-        if near:
+        if near and not problem:
             return None
-        raise PreconditionFailed("NoLegalWay", "zones surround the drone or its home")
+        ends = "home" if place is None else "landing place"
+        raise PreconditionFailed("NoLegalWay", problem or f"zones surround the drone or its {ends}")
 
 
 def _both(permit: Callable[[], None], motion: Motion) -> Callable[[], None]:

@@ -165,6 +165,15 @@ def power(state: str, node: str, name: str | None) -> None:
 
 
 @cluster.command()
+@click.argument("drone")
+@_name_option
+def charge(drone: str, name: str | None) -> None:
+    """Fill the battery of a landed drone at once, as if it was swapped."""
+    Cluster.existing(name, report=print_report).charge(drone)
+    click.echo(f"{drone}: the battery is full")
+
+
+@cluster.command()
 @click.argument("state", type=click.Choice(["cut", "heal"]))
 @click.argument("node")
 @_name_option

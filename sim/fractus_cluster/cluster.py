@@ -31,6 +31,7 @@ from fractus_cluster.radio import Radio
 from fractus_cluster.spec import ClusterSpec, load_spec
 from fractus_cluster.startup import CONTROL_PLANE, Startup, claim, wiring_of
 from fractus_cluster.state import ClusterRecord, StateDirectory, only_cluster, state_of
+from fractus_cluster.vehicle_link import vehicle_link
 
 _LOCK_TIMEOUT_S = 300.0
 _API_TIMEOUT_S = 120.0
@@ -170,15 +171,16 @@ class Cluster:
     def up(self, *, images: Sequence[str] = ()) -> None:
         """Start the cluster, or update a running cluster to its specification.
 
-        This also restarts processes, vehicles and cameras that have ended, powers nodes on, and restores links. Nothing
-        changes if the cluster is up to date.
+        This also restarts vehicles and cameras whose arguments changed, restarts processes that have ended, powers nodes
+        on, and restores links. Nothing changes if the cluster is up to date.
 
         Args:
             images: Images in buildah's storage to deliver to every node before it starts pods.
 
         Raises:
             PrerequisiteError: The machine lacks a requirement.
-            ClusterError: A part did not start. The message names its log.
+            ClusterError: A part did not start, and the message names its log. Or a vehicle whose arguments changed is
+                armed, and nothing was changed.
         """
         started = time.monotonic()
         check_root()
@@ -188,6 +190,7 @@ class Cluster:
         for sentence in (text for node in self.spec.nodes for text in shortfalls(node, describe_machine())):
             self._report(f"note: {sentence}")
         with self._locked():
+            known = self.check_vehicles()
             record = claim(self.spec, self._state, chosen_kubernetes(), self._report)
             self._state.write_spec(self.spec)
             startup = self._startup(record)
@@ -195,7 +198,9 @@ class Cluster:
             nodes = self.nodes
             store = ImageStore.default(report=self._report)
             fetched = store.fetch(images)
-            startup.place_nodes(nodes, binaries, store, fetched)
+            for name in startup.place_nodes(nodes, binaries, store, fetched):
+                if name in known:
+                    self._report(f"node {name}: its configuration has changed; restarting it")
             self.radio.start(nodes, self.spec.air)
             with startup.api() as api:
                 api.wait_ready(_API_TIMEOUT_S)
@@ -204,6 +209,7 @@ class Cluster:
                 since = datetime.now(UTC).replace(microsecond=0)
                 started_nodes = {node.name for node in nodes if node.power_on()}
                 for node in nodes:
+                    self._restart_changed_hardware(node)
                     node.start_hardware()
                 startup.write_kubeconfig()
                 startup.wait_nodes(api, [(node, since if node.name in started_nodes else None) for node in nodes])
@@ -253,6 +259,18 @@ class Cluster:
             for node in self.nodes
         ]
 
+    def charge(self, node: str) -> None:
+        """Fill the battery of a drone's vehicle at once.
+
+        Raises:
+            ClusterError: The node has no vehicle, or its vehicle is armed or does not answer.
+        """
+        check_root()
+        with vehicle_link(self.node(node)) as link:
+            if link.armed():
+                raise ClusterError(f"{node} is armed; wait until it has landed and disarmed, then charge it")
+            link.charge()
+
     def set_power(self, node: str, *, on: bool) -> None:
         """Power a node on or off. This does not wait until its kubelet is Ready."""
         check_root()
@@ -299,6 +317,34 @@ class Cluster:
         program = ensure_binaries(["kubectl"], report=self._report)["kubectl"]
         environment = {**os.environ, "KUBECONFIG": str(self.kubeconfig)}
         return run([program, *arguments], input_text=input_text, timeout_s=timeout_s, check=check, env=environment)
+
+    def check_vehicles(self) -> set[str]:
+        """Check that no vehicle must be restarted while it is armed, and return the names of the existing nodes.
+
+        Raises:
+            ClusterError: A vehicle is armed or does not answer.
+        """
+        previous = self._state.read_spec()
+        if previous is None or self._state.read_record() is None:
+            return set()
+        # The running vehicle listens on the address of the previous cluster file.
+        running_nodes = {node.name: node for node in Cluster(previous).nodes}
+        for node in self.nodes:
+            if "vehicle" not in node.changed_hardware():
+                continue
+            with vehicle_link(running_nodes[node.name]) as link:
+                if link.armed():
+                    raise ClusterError(
+                        f"node {node.name}: its vehicle has changed in the cluster file, and it is armed; "
+                        "wait until it has landed and disarmed, then run this command again"
+                    )
+        return set(running_nodes)
+
+    def _restart_changed_hardware(self, node: Node) -> None:
+        for part, arguments in node.changed_hardware().items():
+            after = f"restarting it with {arguments}" if arguments else "removing it"
+            self._report(f"node {node.name}: its {part} has changed; {after}")
+            node.stop_part(part)
 
     def _locked(self, *, remove: bool = False) -> AbstractContextManager[None]:
         return locked(

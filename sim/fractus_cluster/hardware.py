@@ -10,7 +10,7 @@ from pathlib import Path
 from fractus_core.api.nodes import CameraMount, NodeServices
 
 from fractus_cluster.errors import ClusterError
-from fractus_cluster.spec import NodeSpec, Place, camera_address
+from fractus_cluster.spec import NodeSpec, Place, VehicleHardware, camera_address
 
 CAMERA_LINKS = ("tcp:127.0.0.1:5762", "tcp:127.0.0.1:5763")
 """Possible MAVLink endpoints for the camera. The second is used if the first is the endpoint for the services."""
@@ -50,7 +50,9 @@ def vehicle_command(node: NodeSpec) -> list[str] | None:
         links += ["--listen", _camera_link(listen)]
     if node.hardware.wifi is not None:
         links += ["--listen", RADIO_LINK]
-    return [program("fractus-vehicle"), *links, "--home", f"{home.lat},{home.lon},{home.alt}", *arguments]
+    charge = (node.hardware.vehicle or VehicleHardware()).charge
+    place = f"{home.lat},{home.lon},{home.alt}"
+    return [program("fractus-vehicle"), *links, "--home", place, "--charge", f"{charge:g}", *arguments]
 
 
 def camera_command(node: NodeSpec, origin: Place | None) -> list[str] | None:

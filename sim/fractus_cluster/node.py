@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import shlex
 import shutil
 import subprocess
 import sys
@@ -24,12 +25,13 @@ from fractus_cluster.errors import ClusterError
 from fractus_cluster.hardware import hardware_commands, hardware_environment
 from fractus_cluster.pki import Authority, write_private
 from fractus_cluster.prerequisites import machine, plugin_directory
-from fractus_cluster.processes import kill_recorded, running, spawn, write_record
+from fractus_cluster.processes import command_line, kill_recorded, running, spawn, write_record
 from fractus_cluster.spec import NodeSpec, Place
 from fractus_cluster.state import StateDirectory
 from fractus_cluster.supervisor import ENVIRONMENT
 
 _PROGRAMS = ("kubelet", "kube-proxy")
+_HARDWARE = ("vehicle", "camera")
 _FOLDERS = ("etc", "etc-work", "var-lib", "var-log", "config")
 
 
@@ -200,12 +202,36 @@ class Node:
             )
             write_record(self.state.process(f"{name}.{self.name}"), record)
 
+    def changed_hardware(self) -> dict[str, str]:
+        """Return the running hardware that no longer matches the cluster file.
+
+        Returns:
+            The arguments in the cluster file, by `vehicle` and `camera`. They are empty if the file has no such hardware.
+        """
+        commands = hardware_commands(self.spec, self.world_origin)
+        changed: dict[str, str] = {}
+        for name in _HARDWARE:
+            record = running(self.state.process(f"{name}.{self.name}"))
+            if record is None:
+                continue
+            program, *arguments = commands.get(name, [""])
+            words = command_line(record)
+            # A script is run by its interpreter, so the program is not the first word.
+            at = next((at for at, word in enumerate(words) if Path(word).name == Path(program).name), len(words))
+            if words[at + 1 :] != arguments or name not in commands:
+                changed[name] = shlex.join(arguments)
+        return changed
+
+    def stop_part(self, name: str) -> None:
+        """Stop `vehicle` or `camera`."""
+        path = self.state.process(f"{name}.{self.name}")
+        kill_recorded(path)
+        path.unlink(missing_ok=True)
+
     def stop_hardware(self) -> None:
         """Stop the node's vehicle and camera."""
-        for name in ("vehicle", "camera"):
-            path = self.state.process(f"{name}.{self.name}")
-            kill_recorded(path)
-            path.unlink(missing_ok=True)
+        for name in _HARDWARE:
+            self.stop_part(name)
         self._hardware_cgroup.kill_all()
         self._hardware_cgroup.remove()
 

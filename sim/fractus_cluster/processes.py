@@ -64,6 +64,14 @@ def record_of(pid: int) -> ProcessRecord | None:
     return None if present is None else ProcessRecord(pid, present[1], boot_id())
 
 
+def command_line(record: ProcessRecord) -> list[str]:
+    """Return the program and arguments of a process. The list is empty if the process has ended."""
+    try:
+        return Path(f"/proc/{record.pid}/cmdline").read_bytes().decode(errors="replace").split("\0")[:-1]
+    except (FileNotFoundError, ProcessLookupError):
+        return []
+
+
 def spawn(
     argv: Sequence[str | Path],
     *,

@@ -61,11 +61,13 @@ class VehicleHardware(_Frozen):
     Attributes:
         home: Start position. Default: `description.location`.
         listen: Autopilot endpoint in the node's network namespace. Default: `description.services.mobility.connection`.
+        charge: Percent per minute by which the battery charges while the vehicle is disarmed within 20 m of `home`.
         arguments: Additional arguments of `fractus-vehicle`.
     """
 
     home: VehicleHome | None = None
     listen: str | None = None
+    charge: Annotated[float, Field(ge=0, le=6000, allow_inf_nan=False)] = 10.0
     arguments: tuple[str, ...] = ()
 
 

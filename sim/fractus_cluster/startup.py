@@ -91,16 +91,25 @@ class Startup:
         )
         write_record(record_path, record)
 
-    def place_nodes(self, nodes: list[Node], binaries: Binaries, store: ImageStore, images: Sequence[Image]) -> None:
-        """Connect the nodes and write their files. Unpack images on the disks of new nodes before they start."""
+    def place_nodes(
+        self, nodes: list[Node], binaries: Binaries, store: ImageStore, images: Sequence[Image]
+    ) -> list[str]:
+        """Connect the nodes and write their files. Unpack images on the disks of new nodes before they start.
+
+        Returns:
+            Names of the nodes whose files changed. They are powered off.
+        """
+        changed = []
         for node in nodes:
             network.wire_node(node.wiring, node.name, node.index, mobile=node.spec.hardware.uplink is not None)
-            node.write_files(node.files(binaries, self.authority))
+            if node.write_files(node.files(binaries, self.authority)):
+                changed.append(node.name)
         new = [node for node in nodes if not has_storage(node)]
         if new:
             template = store.template(images, binaries["pause"])
             with ThreadPoolExecutor(max_workers=2) as pool:
                 list(pool.map(template.copy_to, new))
+        return changed
 
     def api(self) -> AbstractContextManager[BlockingClient]:
         """Return an API server client with administrator rights."""

@@ -177,6 +177,14 @@ def _parameters(_context: click.Context, _option: click.Parameter, texts: tuple[
     help="Distance between vehicles to the east, metres.",
 )
 @click.option(
+    "--charge",
+    type=click.FloatRange(0.0, 6000.0),
+    default=0.0,
+    show_default=True,
+    callback=_finite,
+    help="Percent per minute by which the battery charges while the vehicle is disarmed within 20 m of its start position.",
+)
+@click.option(
     "--throttle",
     type=click.IntRange(900, 2100),
     default=1000,
@@ -208,6 +216,7 @@ def vehicle(
     ready_after: float,
     count: int,
     spacing: float,
+    charge: float,
     throttle: int,
     store: Path | None,
     tlog: Path | None,
@@ -222,6 +231,7 @@ def vehicle(
     signal.signal(signal.SIGINT, stop)
     config = VehicleConfig(
         start=home,
+        charge_percent_per_min=charge,
         heading_deg=heading_deg,
         sysid=sysid,
         seed=seed,

@@ -6,7 +6,7 @@ import math
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from fractus_vehicle.state import VehicleState
+from fractus_vehicle.state import CONTROL_STEP_S, VehicleState
 
 RELAYS = 6
 SERVOS = 32
@@ -14,6 +14,8 @@ RELAY_FUNCTION = 1
 # SERVOn_FUNCTION values of outputs that commands may set. Other values assign the output to a motor or another device.
 FREE_FUNCTIONS = frozenset({0, 1})
 MAX_MOTOR_TEST_S = 600.0
+# Radius of the depot, the area around the start position in which the battery charges.
+DEPOT_RADIUS_M = 20.0
 # RCn_OPTION values of switches that select a flight mode in the high position.
 SWITCHED_MODES = {
     4: mavlink.COPTER_MODE_RTL,
@@ -113,7 +115,32 @@ def reset_battery(v: VehicleState, batteries: float, percent: float) -> int:
         return mavlink.MAV_RESULT_FAILED
     if int(batteries) & 1:
         v.battery.used_mah = v.battery.capacity_mah * (1.0 - min(max(percent, 0.0), 100.0) / 100.0)
+        _end_battery_failsafe(v)
     return mavlink.MAV_RESULT_ACCEPTED
+
+
+def charge_at_depot(v: VehicleState) -> None:
+    """Charge the battery for one control step if the disarmed vehicle stands on the ground at its depot."""
+    if v.config.charge_percent_per_min <= 0.0 or v.battery.used_mah <= 0.0 or not v.body.on_ground:
+        return
+    north_m, east_m, _ = (v.config.depot or v.config.start).vector_to(v.true_place)
+    if math.hypot(north_m, east_m) > DEPOT_RADIUS_M:
+        return
+    charged_mah = v.battery.capacity_mah * v.config.charge_percent_per_min / 100.0 * CONTROL_STEP_S / 60.0
+    v.battery.used_mah = max(v.battery.used_mah - charged_mah, 0.0)
+    if v.failsafes.battery:
+        _end_battery_failsafe(v)
+
+
+def _end_battery_failsafe(v: VehicleState) -> None:
+    """End the battery failsafe if charge and voltage are above its limits, like ArduCopter after BATTERY_RESET."""
+    battery = v.battery
+    battery.step(0.0, 0.0)  # updates the voltage
+    p = v.params
+    left_mah = battery.capacity_mah - battery.used_mah
+    low = 0.0 < battery.voltage_v < max(p["BATT_LOW_VOLT"], p["BATT_CRT_VOLT"])
+    if not low and left_mah >= max(p["BATT_LOW_MAH"], p["BATT_CRT_MAH"]):
+        v.failsafes.battery = v.failsafes.battery_critical = False
 
 
 def start_motor_test(v: VehicleState, motor: float, duration_s: float) -> int:

@@ -77,7 +77,13 @@ class Craft:
         place = replace(old.true_place, alt_m=self.config.start.alt_m)
         heading_deg = math.degrees(old.body.euler()[2]) % 360.0
         self.vehicle = Vehicle(
-            replace(self.config, start=place, heading_deg=heading_deg, parameters=old.params.changes())
+            replace(
+                self.config,
+                start=place,
+                depot=old.config.depot or old.config.start,
+                heading_deg=heading_deg,
+                parameters=old.params.changes(),
+            )
         )
         self.vehicle.signing_key = key
         restore(self.vehicle.state, old)

@@ -38,9 +38,16 @@ REPEATABLE_EPOCH_US = 1_700_000_000_000_000
 
 @dataclass(frozen=True, slots=True)
 class VehicleConfig:
-    """Configuration of one vehicle."""
+    """Configuration of one vehicle.
+
+    Attributes:
+        depot: Place where the battery charges. Default: the start position.
+        charge_percent_per_min: Charging rate at the depot, percent of the capacity per minute.
+    """
 
     start: Place
+    depot: Place | None = None
+    charge_percent_per_min: float = 0.0
     heading_deg: float = 0.0
     sysid: int = 1
     seed: int = 1

@@ -8,7 +8,7 @@ from fractus_services.mavlink_server.channel import Channel
 from fractus_services.mavlink_server.mission_transfer import Transfers
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from fractus_vehicle.accessories import end_motor_test
+from fractus_vehicle.accessories import charge_at_depot, end_motor_test
 from fractus_vehicle.estimator import HOME_SET_S
 from fractus_vehicle.failsafes import Failsafes
 from fractus_vehicle.home import set_home
@@ -97,6 +97,7 @@ class Vehicle:
         else:
             self.modes.flight.wait(v)
             end_motor_test(v)
+            charge_at_depot(v)
             self._report_while_disarmed()
         if v.item_reached is not None:
             v.last_item_reached = v.item_reached

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
+from fractus_vehicle.simulation import Simulation
 from fractus_vehicle.state import VehicleState
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from vehicle_pilot import Pilot
-from vehicle_world import START, airborne, alone, distance_m, upload
+from vehicle_world import CONFIG, START, airborne, alone, distance_m, upload
 
 
 def _square(command: int, half_m: float, north_m: float = 0.0) -> list[dict[str, float]]:
@@ -276,3 +279,55 @@ def test_battery_capacity_failsafe_acts_only_on_a_set_limit(limits: dict[str, fl
     else:
         assert vehicle.mode == mavlink.COPTER_MODE_LAND
         assert any(text.startswith(f"Battery 1 is {level}") for text in pilot.texts)
+
+
+def test_battery_charges_at_depot_until_full_and_ends_failsafe():
+    vehicle, pilot = alone(config=replace(CONFIG, charge_percent_per_min=60.0), BATT_LOW_MAH=900.0)
+    pilot.fly_on(3.0)
+    vehicle.battery.used_mah = 0.8 * vehicle.battery.capacity_mah
+    vehicle.failsafes.battery = True
+    pilot.fly_on(10.0)
+    assert vehicle.battery.percent == 30
+    assert not vehicle.failsafes.battery
+    pilot.fly_on(80.0)
+    assert vehicle.battery.used_mah == 0.0
+
+
+def test_battery_does_not_charge_away_from_depot_in_the_air_or_without_charger():
+    def used_after(north_m: float, rate: float, *, airborne: bool) -> float:
+        vehicle, pilot = alone(config=replace(CONFIG, charge_percent_per_min=rate, depot=START.offset(north_m, 0.0)))
+        if airborne:
+            pilot.take_off(10.0)
+        vehicle.battery.used_mah = 1000.0
+        pilot.fly_on(10.0)
+        return vehicle.battery.used_mah
+
+    assert used_after(15.0, 60.0, airborne=False) < 1000.0
+    assert used_after(25.0, 60.0, airborne=False) == 1000.0
+    assert used_after(0.0, 0.0, airborne=False) == 1000.0
+    assert used_after(0.0, 60.0, airborne=True) > 1000.0
+
+
+def test_battery_reset_ends_battery_failsafe():
+    vehicle, pilot = alone(BATT_LOW_MAH=1000.0)
+    pilot.fly_on(3.0)
+    vehicle.battery.used_mah = vehicle.battery.capacity_mah
+    vehicle.failsafes.battery = vehicle.failsafes.battery_critical = True
+    assert pilot.command(mavlink.MAV_CMD_BATTERY_RESET, 1, 10) == mavlink.MAV_RESULT_ACCEPTED
+    assert vehicle.failsafes.battery
+    assert pilot.command(mavlink.MAV_CMD_BATTERY_RESET, 0xFFFF, 100) == mavlink.MAV_RESULT_ACCEPTED
+    assert not vehicle.failsafes.battery
+    assert not vehicle.failsafes.battery_critical
+
+
+def test_depot_stays_at_the_start_after_a_reboot_elsewhere():
+    simulation = Simulation([replace(CONFIG, charge_percent_per_min=60.0)])
+    craft = simulation.crafts[0]
+    pilot = Pilot(simulation, craft)
+    craft.vehicle.state.body.north = 100.0
+    pilot.command(mavlink.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN, 1)
+    pilot.fly_on(1.0)
+    craft.vehicle.state.battery.used_mah = 1000.0
+    pilot.fly_on(10.0)
+    assert craft.vehicle.state.start != START
+    assert craft.vehicle.state.battery.used_mah == 1000.0

@@ -13,17 +13,20 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from control_plane import wait_for
 from fractus_agent.redirector.netlink import in_namespace
 from fractus_cluster import network
 from fractus_cluster.addressing import Addressing, choose_block
 from fractus_cluster.cgroups import cluster_branch
+from fractus_cluster.cluster import Cluster
 from fractus_cluster.errors import ClusterError
 from fractus_cluster.network import Wiring, networks_in_use
 from fractus_cluster.node import Node
 from fractus_cluster.processes import read_record
 from fractus_cluster.radio import Radio
 from fractus_cluster.spec import ClusterSpec, parse_spec
-from fractus_cluster.state import state_of
+from fractus_cluster.state import ClusterRecord, state_of
+from fractus_runtime.mavlink_codec import Endpoint
 
 pytestmark = [pytest.mark.root, pytest.mark.skipif(os.geteuid() != 0, reason="needs root")]
 
@@ -202,3 +205,52 @@ def test_cluster_radio_is_replaced_after_its_process_was_killed(site: Site) -> N
     site.wire()
     site.wait_until_reachable("drone-1", hub, reachable=True)
     assert "default via" in site.run("drone-1", "ip", "route")
+
+
+def _with_arguments(spec: ClusterSpec, *arguments: str) -> ClusterSpec:
+    content = spec.model_dump(by_alias=True)
+    content["nodes"][0]["hardware"]["vehicle"]["arguments"] = ["--ready-after", "2", *arguments]
+    return parse_spec(content, source="test")
+
+
+def _arm(node: Node) -> None:
+    """Arm the vehicle of a node without its arming checks."""
+    path = node.wiring.namespace_path(node.name)
+    link = Endpoint(255, 190)
+    with in_namespace(path, lambda: socket.create_connection(("127.0.0.1", 5760), 10.0)) as connection:
+        arm = {"target_system": 1, "target_component": 1, "command": 400, "param1": 1.0, "param2": 21196.0}
+        armed = False
+        while not armed:  # a vehicle that is still starting refuses
+            connection.sendall(link.encode("COMMAND_LONG", arm))
+            messages = link.decode(connection.recv(9999))
+            armed = any(m.name == "HEARTBEAT" and m.integer("base_mode") & 128 for m in messages)
+
+
+def test_cluster_charges_a_disarmed_vehicle_and_restarts_it_only_when_its_arguments_changed(site: Site) -> None:
+    site.spec = _with_arguments(site.spec)
+    site.state.write_spec(site.spec)
+    site.state.write_record(ClusterRecord(site.wiring.addressing.block, {"drone-1": 0, "edge-1": 1}))
+    cluster = Cluster(site.spec)
+    drone = cluster.node("drone-1")
+    drone.start_hardware()
+    wait_for(lambda: _charged(cluster), "a charged battery", timeout_s=20.0)
+    assert drone.changed_hardware() == {}
+    changed = Cluster(_with_arguments(site.spec, "--wind", "5,270"))
+    assert changed.node("drone-1").changed_hardware()["vehicle"].endswith("--ready-after 2 --wind 5,270")
+    assert changed.check_vehicles() == {"drone-1", "edge-1"}
+    _arm(drone)
+    with pytest.raises(ClusterError, match=r"drone-1.* changed in the cluster file, and it is armed; wait until"):
+        changed.check_vehicles()
+    with pytest.raises(ClusterError, match="drone-1 is armed; wait until it has landed"):
+        cluster.charge("drone-1")
+    with pytest.raises(ClusterError, match="edge-1 has no simulated vehicle"):
+        cluster.charge("edge-1")
+
+
+def _charged(cluster: Cluster) -> bool:
+    """Charge the drone, and return False while its vehicle does not accept connections yet."""
+    try:
+        cluster.charge("drone-1")
+    except ClusterError:
+        return False
+    return True

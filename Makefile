@@ -254,7 +254,13 @@ packages: ## Install missing Debian packages, as root, without removing packages
 env: .venv/.synced
 uv: $(if $(filter .tools/bin/uv,$(UV)),.tools/bin/uv)
 
+# An environment contains absolute paths. In a moved or copied checkout, it would run the code of the old one.
+MOVED := $(if $(wildcard .venv/bin/activate),$(shell grep -qF "'$(CURDIR)/.venv'" .venv/bin/activate || echo yes))
+ifdef MOVED
+.PHONY: .venv/.synced
+endif
 .venv/.synced: pyproject.toml sim/pyproject.toml uv.lock | uv
+	@[ -z "$(MOVED)" ] || { echo "this checkout was moved or copied; creating its environment .venv again" >&2; rm -rf .venv; }
 	$(UV) sync --frozen --all-extras --quiet
 	@touch $@
 

@@ -84,7 +84,9 @@ def vehicle_link(node: Node) -> Iterator[VehicleLink]:
     kind, _, address = listen.partition(":")
     host, _, port = address.rpartition(":")
     if kind != "tcp" or not port.isdigit():
-        raise ClusterError(f"node {node.name}: its vehicle listens on {listen}; set hardware.vehicle.listen to tcp:HOST:PORT")
+        raise ClusterError(
+            f"node {node.name}: its vehicle listens on {listen}; set hardware.vehicle.listen to tcp:HOST:PORT"
+        )
     try:
         connection = in_namespace(
             node.wiring.namespace_path(node.name), lambda: socket.create_connection((host, int(port)), _TIMEOUT_S)

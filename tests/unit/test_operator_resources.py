@@ -11,8 +11,9 @@ import yaml
 from fractus_core.api import Application, Drone
 from fractus_core.api.grants import ApplicationReference, GrantSpec
 from fractus_core.api.plans import DeploymentPlanSpec
+from fractus_operator import kinds
 from fractus_operator.pods import PodView
-from fractus_operator.resources.children import deployment_plan
+from fractus_operator.resources.children import children, deployment_plan
 from fractus_operator.resources.deployment import deployment
 from fractus_operator.resources.grant import grant
 from fractus_operator.resources.secret import tls_secret
@@ -108,3 +109,11 @@ def test_drone_without_autonomy_limit_tolerates_taints_forever() -> None:
     tolerations = deployment(APPLICATION, placed, bare)["spec"]["template"]["spec"]["tolerations"]
     assert all("tolerationSeconds" not in t for t in tolerations)
     assert {t["key"] for t in tolerations} >= {"node.kubernetes.io/unreachable", "node.kubernetes.io/not-ready"}
+
+
+def test_disruption_budget_protects_all_instances_on_drone_without_their_controllers() -> None:
+    (budget,) = children(APPLICATION, PLAN, [], [], lambda _: DRONE)[kinds.DISRUPTION_BUDGET]
+    on_drone = [p for p in PLAN.placements if p.placement == "drone"]
+    assert budget["spec"]["minAvailable"] == len(on_drone) > 0
+    # Kubernetes looks up controllers, which kept pods do not have, for maxUnavailable and for percentages.
+    assert "maxUnavailable" not in budget["spec"]

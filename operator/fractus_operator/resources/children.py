@@ -46,9 +46,11 @@ def children(
             if component.placement == "hybrid":
                 desired[kinds.ENDPOINT_SLICE].append(endpoint_slice(application, component, plan, pods))
     if plan.drone is not None:
-        # Prevents evictions on the drone, for example by kubectl drain.
+        # Prevents evictions on the drone, for example by kubectl drain. With maxUnavailable, Kubernetes would look for the
+        # controllers of the pods, and warn (UnmanagedPods) about pods of a finished mission, whose Deployment is deleted.
         on_drone = {labels.APPLICATION_LABEL: label_value(application.name), labels.PLACEMENT_LABEL: "drone"}
-        budget = {"maxUnavailable": 0, "selector": {"matchLabels": on_drone}}
+        instances = sum(placed.placement == "drone" for placed in plan.placements)
+        budget = {"minAvailable": instances, "selector": {"matchLabels": on_drone}}
         name = application.name
         desired[kinds.DISRUPTION_BUDGET] = [owned_object(kinds.DISRUPTION_BUDGET, application, name, {}, spec=budget)]
     for placed in plan.placements:

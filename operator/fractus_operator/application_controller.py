@@ -19,6 +19,7 @@ from fractus_core.validation import check_application
 from fractus_runtime.backoff import Backoff
 
 from fractus_operator import kinds, status
+from fractus_operator.after_flight import AfterFlight, after_flight, until_deleted
 from fractus_operator.application_grants import REFUSALS, ApplicationGrants
 from fractus_operator.cache import ClusterCache, ObservedApplication
 from fractus_operator.child_objects import ChildObjects, NameTaken
@@ -28,7 +29,6 @@ from fractus_operator.kinds import Key
 from fractus_operator.labels import FINALIZER
 from fractus_operator.operator_metrics import phase as timed
 from fractus_operator.operator_metrics import reconciling
-from fractus_operator.parsing import Submitted
 from fractus_operator.pods import PlanPods, refusal_of
 from fractus_operator.replanning import (
     choose_plan,
@@ -248,9 +248,9 @@ class ApplicationController:
             if record is None:
                 return None
             flown = flown.model_copy(update={"flown": record})
-        elif application is not None and mission_changed(application, flown):
+        elif application is not None and self._next_mission_begins(application, flown):
             # A remaining plan of the last mission would claim its drone, and exempt the next mission from checks.
-            removed = await self._start_over(observed.key)
+            removed = await self._start_over(observed.key, until_deleted(application, flown), _drone_of(flown))
             # The Grants of the last mission must be deleted before a new one begins.
             return 1.0 if removed else None
         # An invalid manifest describes no new mission. The record of the last mission stays until the manifest is valid.
@@ -260,13 +260,27 @@ class ApplicationController:
         drone = self._cache.drone(name) if name is not None else None
         # A drone that has landed may later fly for another Application.
         if name is None or (drone is not None and not drone.in_air):
-            record = record.model_copy(update={"landed": True})
+            landed_at = None if record.landed else self._clock().replace(microsecond=0)
+            record = record.model_copy(update={"landed": True, "landed_at": record.landed_at or landed_at})
         if record != flown.flown:
             flown = flown.model_copy(update={"flown": record})
         await self._rollout.keep_plan(submitted, flown)
         generation = flown_generation(application, flown) if application is not None else None
-        await self._reporter.report(submitted, status.over(record, name, drone), generation)
-        return await self._finish(submitted)
+        ends = after_flight(application, flown, self._clock())
+        update = status.over(record, name, drone)
+        if generation is not None and application is not None and not self._next_mission_begins(application, flown):
+            update = status.waiting_for_components(update)
+        await self._reporter.report(submitted, update, generation)
+        return await self._finish(observed, flown, ends)
+
+    def _next_mission_begins(self, application: Application, flown: DeploymentPlanSpec) -> bool:
+        """Return True if the Application has another mission, and nothing of the last one must continue to run."""
+        if not mission_changed(application, flown):
+            return False
+        return (
+            application.spec.update_policy == "Immediate"
+            or after_flight(application, flown, self._clock()).flight_ended
+        )
 
     def _observed_record(self, observed: ObservedApplication, flown: DeploymentPlanSpec) -> MissionRecord | None:
         """Return the record of a mission that is over according to its Grants, or None."""
@@ -298,7 +312,7 @@ class ApplicationController:
         if not over and mission_outcome(observed.uid, observed.grants) is None:
             return None
         await self._reporter.report(submitted, status.without_record())
-        return await self._finish(submitted)
+        return await self._finish(observed, None, AfterFlight())
 
     def _record_takeoff(self, observed: ObservedApplication) -> ObservedApplication:
         """Record in the active plan that its drone has taken off. The rollout of the plan stores the record."""
@@ -399,26 +413,52 @@ class ApplicationController:
             self._route_checks.put(observed.key, choice.plan, observed.rules)
         return choice.plan, (recheck_s or RESYNC_S) if choice.fits else RESYNC_S
 
-    async def _start_over(self, key: Key) -> bool:
-        """Delete all objects of an Application, including its plan. Return True if there were any."""
-        removed = await self._objects.remove(key, *_RIGHTS, kinds.DEPLOYMENT, *_AFTER_PODS, kinds.DEPLOYMENT_PLAN)
-        pods = await self._finished_pods.remove(key)
-        self._cache.forget(key)
-        return removed or pods
+    async def _start_over(self, key: Key, ends: AfterFlight | None = None, drone: str | None = None) -> bool:
+        """Delete the objects of an Application, including its plan.
 
-    async def _finish(self, submitted: Submitted) -> float:
-        """Delete the objects of a finished mission, except its plan and the pods that are kept for their logs.
+        Args:
+            key: The Application.
+            ends: Instances that continue to run. By default, none.
+            drone: Drone of the last mission, if there was one.
+
+        Returns:
+            True if there were any objects, or if pods of the last mission still run on the drone.
+        """
+        ends = ends or AfterFlight()
+        rights = await self._objects.remove(key, *_RIGHTS)
+        others = await self._objects.remove(key, kinds.DEPLOYMENT, *_AFTER_PODS, keeps=ends.keeps)
+        pods = await self._finished_pods.remove(key, ends.instances)
+        if drone is not None and self._finished_pods.run_on(key, drone):
+            # A program of the last mission must not use the Grants of the next one.
+            return True
+        plan = await self._objects.remove(key, kinds.DEPLOYMENT_PLAN)
+        self._cache.forget(key)
+        return rights or others or pods or plan
+
+    async def _finish(
+        self, observed: ObservedApplication, flown: DeploymentPlanSpec | None, ends: AfterFlight
+    ) -> float:
+        """Delete the objects of a finished mission, except its plan, what still runs, and the pods that are kept for their logs.
+
+        Args:
+            observed: The Application.
+            flown: The plan, if it exists.
+            ends: Instances that continue to run.
 
         Returns:
             Seconds until the next step.
         """
-        key = submitted.key
+        key = observed.key
+        submitted = observed.submitted
         rights = await self._objects.remove(key, *_RIGHTS)
-        pods = await self._finished_pods.stop(submitted)
-        others = await self._objects.remove(key, *_AFTER_PODS)
+        pods = await self._finished_pods.stop(submitted, ends.instances)
+        others = await self._objects.remove(key, *_AFTER_PODS, keeps=ends.keeps)
         if rights or pods or others:
             self._cache.forget(key)
-        return min(await self._finished_pods.expire(submitted), RESYNC_S)
+        if flown is not None and ends.running:
+            present = flown.model_copy(update={"placements": ends.running})
+            await self._rollout.keep_running(key, submitted.application, present, self._cache.pods_of(key))
+        return min(await self._finished_pods.expire(submitted), ends.next_s, RESYNC_S)
 
     def _deployed_status(self, observed: ObservedApplication, plan: DeploymentPlanSpec, granted: int) -> StatusUpdate:
         node = plan.drone.node if plan.drone is not None else None

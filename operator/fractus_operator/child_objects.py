@@ -10,7 +10,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from http import HTTPStatus
 
 from fractus_core.api import Application, Grant, InvalidObject
@@ -263,19 +263,23 @@ class ChildObjects:
                     await self._delete(kind, child)
         await self._delete_remaining_secrets(application.key)
 
-    async def remove(self, key: Key, *of: Kind, orphan: bool = False) -> bool:
-        """Delete all child objects of some kinds, one kind after the other. Return True if there were any.
+    async def remove(
+        self, key: Key, *of: Kind, orphan: bool = False, keeps: Callable[[Body], bool] | None = None
+    ) -> bool:
+        """Delete child objects of some kinds, one kind after the other. Return True if there were any.
 
         Args:
             key: The Application.
             of: The kinds.
             orphan: Keep the objects that the deleted objects own.
+            keeps: Returns True for objects that are not deleted. By default, all are deleted.
         """
         removed = False
         for kind in of:
             for child in self.of(key, kind):
-                removed = True
-                await self._delete(kind, child, orphan=orphan)
+                if keeps is None or not keeps(child):
+                    removed = True
+                    await self._delete(kind, child, orphan=orphan)
         await self._delete_remaining_secrets(key)
         return removed
 

@@ -19,6 +19,7 @@ from fractus_operator.labels import (
     APPLICATION_LABEL,
     FINISHED_FORMAT,
     FINISHED_LABEL,
+    INSTANCE_LABEL,
     MANAGED_SELECTOR,
     label_key,
     label_value,
@@ -49,20 +50,24 @@ class FinishedPods:
         self._objects = objects
         self._clock = clock
 
-    async def stop(self, submitted: Submitted) -> bool:
+    async def stop(self, submitted: Submitted, running: Collection[str] = ()) -> bool:
         """Stop the pods of an Application permanently. Return True if anything was changed.
+
+        Args:
+            submitted: The Application.
+            running: Names of the instances that continue to run.
 
         Raises:
             KubeError: The API server refused a change, or could not be reached.
         """
         key = submitted.key
         if _ttl(submitted) == timedelta(0):
-            deployments = await self._objects.remove(key, kinds.DEPLOYMENT)
-            return await self.remove(key) or deployments
-        removed = await self._objects.remove(key, kinds.DEPLOYMENT, orphan=True)
-        pods = _managed_pods(self._cache.pods_of(key))
+            deployments = await self._objects.remove(key, kinds.DEPLOYMENT, keeps=_of_instances(running))
+            return await self.remove(key, running) or deployments
+        removed = await self._objects.remove(key, kinds.DEPLOYMENT, orphan=True, keeps=_of_instances(running))
+        pods = [pod for pod in _managed_pods(self._cache.pods_of(key)) if pod.instance not in running]
         if removed or pods:
-            await self._remove_replica_sets(key)
+            await self._remove_replica_sets(key, running)
         for pod in pods:
             if pod.node is None:
                 await self._store.delete(kinds.POD, (pod.namespace, pod.name))
@@ -92,20 +97,30 @@ class FinishedPods:
                 next_s = min(next_s, remaining_s)
         return next_s
 
-    async def remove(self, key: Key) -> bool:
-        """Delete all pods of an Application that has no Deployments, including kept pods. Return True if there were any.
+    async def remove(self, key: Key, running: Collection[str] = ()) -> bool:
+        """Delete the pods of an Application that have no Deployment, including kept pods. Return True if there were any.
+
+        Args:
+            key: The Application.
+            running: Names of the instances that continue to run.
 
         Raises:
             KubeError: The API server refused a deletion, or could not be reached.
         """
-        running = _managed_pods(self._cache.pods_of(key))
-        if running:
+        ending = [pod for pod in _managed_pods(self._cache.pods_of(key)) if pod.instance not in running]
+        if ending:
             # An operator that was killed in `stop` has left ReplicaSets that would start the pods again.
-            await self._remove_replica_sets(key)
-        pods = [*running, *_managed_pods(self._cache.pods_of(key, kept=True))]
+            await self._remove_replica_sets(key, running)
+        pods = [*ending, *_managed_pods(self._cache.pods_of(key, kept=True))]
         for pod in pods:
             await self._store.delete(kinds.POD, (pod.namespace, pod.name))
         return bool(pods)
+
+    def run_on(self, key: Key, node: str) -> bool:
+        """Return True if a pod of an Application still runs on a node that is ready, even if it is being stopped."""
+        host = self._cache.hosts.get(("", node))
+        pods = [*self._cache.pods_of(key), *self._cache.pods_of(key, kept=True)]
+        return host is not None and host.ready and any(p.managed and p.node == node and not p.finished for p in pods)
 
     async def tear_down(self, key: Key) -> None:
         """Delete all objects of an Application that is being deleted, including pods without an owner.
@@ -136,8 +151,11 @@ class FinishedPods:
             if _managed_pods([parse_pod(body)]) and not owned_by(collected, body):
                 await self._store.delete(kinds.POD, key_of(body), body["metadata"]["uid"])
 
-    async def _remove_replica_sets(self, key: Key) -> None:
+    async def _remove_replica_sets(self, key: Key, running: Collection[str]) -> None:
+        keeps = _of_instances(running)
         for body in await list_objects(self._store, kinds.REPLICA_SET, key):
+            if keeps(body):
+                continue
             await self._store.delete(kinds.REPLICA_SET, key_of(body), body["metadata"]["uid"], orphan=True)
 
     async def _stop_pod(self, pod: PodView, submitted: Submitted) -> None:
@@ -269,6 +287,11 @@ async def list_objects(store: Store, kind: Kind, key: Key) -> list[Body]:
 def owned_by(uids: Collection[str], body: Body) -> bool:
     """Return True if an object has an owner with one of the uids."""
     return any(owner["uid"] in uids for owner in body["metadata"].get("ownerReferences") or ())
+
+
+def _of_instances(instances: Collection[str]) -> Callable[[Body], bool]:
+    """Return a test if an object belongs to one of the instances."""
+    return lambda body: body["metadata"]["labels"].get(INSTANCE_LABEL) in instances
 
 
 def _ttl(submitted: Submitted) -> timedelta:

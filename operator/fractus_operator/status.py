@@ -331,6 +331,22 @@ def waiting_for_landing(present: StatusUpdate, drone: str) -> StatusUpdate:
     return replace(present, message=f"{present.message}; {message}", conditions=(*present.conditions, update))
 
 
+def waiting_for_components(present: StatusUpdate) -> StatusUpdate:
+    """Return the status of a finished mission after which a changed manifest waits for the components of the flight.
+
+    The phase is not Completed or Failed, because the Application has another mission to fly.
+    """
+    message = (
+        "the changed manifest is applied when the components that end with the flight have stopped, spec.afterFlight seconds after"
+        " the landing; set spec.updatePolicy: Immediate to apply it at once"
+    )
+    update = ConditionUpdate("Updated", "False", "WaitsForComponents", message, progress=True)
+    phase: Phase = present.phase if present.phase == "Returning" else "Landed"
+    return replace(
+        present, phase=phase, message=f"{present.message}; {message}", conditions=(*present.conditions, update)
+    )
+
+
 def over(record: MissionRecord, name: str | None, drone: Drone | None) -> StatusUpdate:
     """Return the status of an Application whose mission is over, even if its drone is still returning.
 

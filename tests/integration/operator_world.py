@@ -77,6 +77,7 @@ def viewer(**more: Any) -> Body:
 
 
 def traffic(namespace: str, name: str = "traffic", *components: Body) -> Body:
+    """Return an Application. Its components stop at the landing."""
     parts = components or (
         navigator(),
         viewer(),
@@ -88,9 +89,9 @@ def traffic(namespace: str, name: str = "traffic", *components: Body) -> Body:
             egress=["ImageChecker"],
         ),
         component("ImageChecker", "hybrid", hybridTo=["AerialViewer"], egress=["DataStore"]),
-        component("DataStore", "cloud"),
+        component("DataStore", "cloud", endsWith="flight"),
     )
-    return fractus_object("Application", name, {"components": list(parts)}, namespace)
+    return fractus_object("Application", name, {"components": list(parts), "afterFlight": 0}, namespace)
 
 
 class World:
@@ -234,6 +235,14 @@ class World:
                 "conditions": [_condition("Ready", "True", ""), _condition("PodScheduled", "True", "")],
             }
             self.api.merge(f"/api/v1/namespaces/{namespace}/pods/{name}/status", {"status": status})
+
+    def end_pods(self, namespace: str) -> None:
+        """End the pods that were deleted or stopped, as a kubelet does. They do not disappear."""
+        for pod in self.api.list(f"/api/v1/namespaces/{namespace}/pods"):
+            ends = "deletionTimestamp" in pod["metadata"] or "activeDeadlineSeconds" in pod["spec"]
+            if ends and pod["status"].get("phase") != "Failed":
+                path = f"/api/v1/namespaces/{namespace}/pods/{pod['metadata']['name']}/status"
+                self.api.merge(path, {"status": {"phase": "Failed"}})
 
     def clear(self) -> None:
         """Remove cluster-scoped objects of tests. Also remove all pods, because no kubelet removes them."""

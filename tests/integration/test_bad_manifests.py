@@ -89,6 +89,8 @@ BAD: list[tuple[str, Body, str]] = [
     ("full control at two control points", app(DRIVER | {"controlPoints": [PATH, PATH]}), "a driver with full control has one control point"),
     ("driver without mobility", app(DRIVER | {"services": [CAMERA]}), "a driver requires the mobility service with the methods that it calls"),
     ("drone component without class", app({k: v for k, v in GUIDED.items() if k != "class"}), "class (driver or passenger) is required for placement drone, and not allowed otherwise"),
+    ("drone component that stays", app(DRIVER | {"endsWith": "application"}), "a component on a drone ends with the flight"),
+    ("two hours after the flight", body("Application", {"components": [CLOUD], "afterFlight": 7200}), "spec.afterFlight"),
     ("path without waypoints", driver(path=[]), "spec.components[0].controlPoints[0].path"),
     ("path and region", driver(region=DISC), "give either path or region, and only one of them"),
     ("region without region", app(DRIVER | {"controlPoints": [{"navigation": "regionBased"}]}), "regionBased navigation needs region"),

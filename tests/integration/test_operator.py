@@ -27,7 +27,12 @@ INSTANCES = {
 
 def deployed(world: World, namespace: str, name: str = "traffic", pods: int = 7) -> dict[str, Any]:
     """Bind and start the pods like scheduler and kubelet. Return the status when the Application is Ready."""
-    wait_for(lambda: len(world.pods(namespace)) >= pods, lambda: f"{pods} pods; {world.status(namespace, name)}")
+
+    def created() -> bool:
+        world.end_pods(namespace)
+        return len(world.pods(namespace)) >= pods
+
+    wait_for(created, lambda: f"{pods} pods; {world.status(namespace, name)}")
     world.run_pods(namespace)
     wait_for(lambda: world.condition(namespace, "Ready", name).get("status") == "True", "the condition Ready")
     return world.status(namespace, name)
@@ -200,10 +205,8 @@ def test_complete_mission_keeps_only_its_plan(world: World, operator: OperatorPr
     end_mission(world, namespace, "Complete", "all control points were returned")
     status = world.phase(namespace, "Returning")
     assert status["message"] == "all control points were returned; drone-1 is returning"
-    wait_for(
-        lambda: set(world.children(namespace)) == {"deploymentplans/traffic"},
-        "all child objects except the plan to be deleted",
-    )
+    wait_for(lambda: not granted(world, namespace), "all Grants and DirectLinks to be deleted")
+    assert len([name for name in world.children(namespace) if name.startswith("deployments/")]) == 7
     world.drone_status("drone-1", "inactive")
     status = world.phase(namespace, "Completed")
     assert world.condition(namespace, "MissionComplete")["status"] == "True"
@@ -219,6 +222,79 @@ def test_complete_mission_keeps_only_its_plan(world: World, operator: OperatorPr
         f"MissionOver: {namespace}/traffic no longer flies drone-1: all control points were returned",
         "Landed: drone-1 landed",
     ], "Events of planning and deploying, or repeated Events, would cost requests in vain"
+
+
+def granted(world: World, namespace: str) -> set[str]:
+    """Return the names of the child objects that permit a flight, a call or a direct link."""
+    return {name for name in world.children(namespace) if name.startswith(("grants/", "directlinks/"))}
+
+
+def test_components_end_as_declared_after_the_mission(world: World, operator: OperatorProcess, namespace: str) -> None:
+    manifest = traffic(namespace)
+    del manifest["spec"]["components"][4]["endsWith"]
+    manifest["spec"]["afterFlight"] = 3600
+    world.put(manifest)
+    deployed(world, namespace)
+    store = {pod["metadata"]["uid"] for pod in world.pods(namespace) if component_of(pod) == "DataStore"}
+    world.drone_status("drone-1", "flying")
+    end_mission(world, namespace, "Failed", "driver lost")
+    world.drone_status("drone-1", "inactive")
+    world.phase(namespace, "Failed")
+    wait_for(lambda: not granted(world, namespace), "all Grants and DirectLinks to be deleted")
+    operator.stop(signal.SIGKILL)
+    operator.start()
+    # A changed mission does not begin before the components of the last flight have stopped.
+    manifest["spec"]["components"][0]["container"]["env"] = [{"name": "COLOUR", "value": "red"}]
+    world.put(manifest)
+    wait_for(lambda: world.condition(namespace, "Updated"), "the change to wait")
+    assert world.condition(namespace, "Updated")["reason"] == "WaitsForComponents"
+    assert world.status(namespace)["phase"] == "Landed"
+    assert len(world.pods(namespace)) == 7
+    assert not any("fractus.dev/finished" in labels_of(pod) for pod in world.pods(namespace))
+    del manifest["spec"]["components"][0]["container"]["env"]
+    manifest["spec"]["afterFlight"] = 1
+    world.put(manifest)
+    wait_for(
+        lambda: (
+            {p["metadata"]["uid"] for p in world.pods(namespace) if "fractus.dev/finished" not in labels_of(p)} == store
+        ),
+        "the pods of all components except DataStore to stop",
+    )
+    remaining = {f"{kind}/traffic-data-store" for kind in ("services", "deployments")}
+    remaining |= {"deploymentplans/traffic", "secrets/traffic-data-store-tls"}
+    wait_for(
+        lambda: {n for n in world.children(namespace) if not n.startswith("networkpolicies/")} == remaining,
+        "the child objects of the other components to be deleted",
+    )
+    assert "networkpolicies/traffic-data-store" in world.children(namespace)
+    # The component that ends with the Application continues to run in the next mission.
+    before = {pod["metadata"]["uid"] for pod in world.pods(namespace)}
+    manifest["spec"]["components"][0]["container"]["env"] = [{"name": "COLOUR", "value": "red"}]
+    world.put(manifest)
+    wait_for(lambda: len(fresh(world, namespace, before)) == 6, "the pods of the next mission")
+    deployed(world, namespace)
+    assert store <= {pod["metadata"]["uid"] for pod in world.pods(namespace)}
+    world.api.delete(f"{FRACTUS}/namespaces/{namespace}/applications/traffic")
+    wait_for(lambda: not world.pods(namespace), "all pods to be deleted")
+
+
+def test_application_is_deleted_while_its_components_transfer_data(
+    world: World, operator: OperatorProcess, namespace: str
+) -> None:
+    manifest = traffic(namespace)
+    manifest["spec"]["afterFlight"] = 3600
+    world.put(manifest)
+    deployed(world, namespace)
+    end_mission(world, namespace, "Complete", "done")
+    world.phase(namespace, "Completed")
+    assert len(world.pods(namespace)) == 7
+    world.api.delete(f"{FRACTUS}/namespaces/{namespace}/applications/traffic")
+    wait_for(lambda: not world.pods(namespace), "all pods to be deleted")
+    wait_for(lambda: not world.children(namespace), "all child objects to be deleted")
+
+
+def component_of(pod: dict[str, Any]) -> str:
+    return labels_of(pod)["fractus.dev/component"]
 
 
 def flight_events(world: World) -> list[str]:
@@ -341,6 +417,8 @@ def labels_of(pod: dict[str, Any]) -> dict[str, str]:
 
 
 def fresh(world: World, namespace: str, before: set[str]) -> set[str]:
+    """End the stopped pods, and return the uids of the pods that were created since."""
+    world.end_pods(namespace)
     return {pod["metadata"]["uid"] for pod in world.pods(namespace)} - before
 
 
@@ -772,9 +850,17 @@ def test_change_pending_at_end_of_mission_starts_another_mission(
     world.put(manifest)
     wait_for(lambda: world.condition(namespace, "Updated"), "the condition Updated")
     end_mission(world, namespace, "Complete", "done")
-    world.phase(namespace, "Queued")
+    status = world.phase(namespace, "Returning")
+    assert (
+        "the changed manifest is applied when the components that end with the flight have stopped" in status["message"]
+    )
     world.drone_status("drone-1", "inactive")
-    world.phase(namespace, "Deploying")
+
+    def begins() -> bool:
+        world.end_pods(namespace)
+        return bool(world.status(namespace)["phase"] == "Deploying")
+
+    wait_for(begins, "the next mission")
     assert driver_env(world, namespace).get("COLOUR") == "red"
     assert world.grants(namespace)
 

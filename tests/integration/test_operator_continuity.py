@@ -228,8 +228,14 @@ def test_returning_drone_belongs_to_no_application(world: World, operator: Opera
     world.phase(namespace, "Returning")
     again = traffic(namespace)
     again["spec"]["components"][4]["replicas"] = 2
+    again["spec"]["updatePolicy"] = "Immediate"
     world.put(again)
-    world.phase(namespace, "Queued")
+
+    def queued() -> bool:
+        world.end_pods(namespace)
+        return bool(world.status(namespace)["phase"] == "Queued")
+
+    wait_for(queued, "the phase Queued")
     world.drone_status("drone-1", "inactive", ready="False")
     # The drone no longer belongs to the Application, so the requirements of the new mission are checked again.
     reason(world, namespace, "NoDrone")

@@ -606,10 +606,12 @@ async def test_applications_wake_when_edge_node_becomes_ready() -> None:
         assert await inputs.changed(1)
 
 
-def test_update_policy_and_ttl_do_not_change_the_mission() -> None:
+def test_update_policy_and_ends_of_pods_do_not_change_the_mission() -> None:
     spec = application().spec
-    same_mission = spec.model_copy(update={"ttl_after_finished": 5, "update_policy": "Immediate"})
+    same_mission = spec.model_copy(update={"ttl_after_finished": 5, "after_flight": 0, "update_policy": "Immediate"})
     assert same_mission.mission_digest == spec.mission_digest
+    lasting = tuple(c.model_copy(update={"ends_with": "flight"}) for c in spec.components)
+    assert spec.model_copy(update={"components": lasting}).mission_digest == spec.mission_digest
     same_mission = tuple(c.model_copy(update={"name": f"{c.name}2"}) for c in spec.components)
     assert spec.model_copy(update={"components": same_mission}).mission_digest != spec.mission_digest
     # A field with its default value has the same digest as an omitted field.

@@ -46,7 +46,13 @@ def _other(field: ReferenceField) -> Any:
     return _each(field, "n != c.name", "names the component itself; remove it", lambda _, c, name: name != c.name)
 
 
-_NOT_MISSION = {"start", "update_policy", "ttl_after_finished"}
+_NOT_MISSION: dict[str, Any] = {
+    "start": True,
+    "update_policy": True,
+    "after_flight": True,
+    "ttl_after_finished": True,
+    "components": {"__all__": {"ends_with"}},
+}
 """Fields that may change without starting another mission."""
 
 
@@ -68,6 +74,13 @@ class ApplicationSpec(Model):
         default="OnGround",
         description="When changes of a running application take effect. OnGround: after the drone has landed. Immediate: also"
         " in flight, which restarts the changed components, including the driver.",
+    )
+    after_flight: int = Field(
+        default=30,
+        ge=0,
+        le=3600,
+        description="Seconds for which components that end with the flight continue to run after the landing, for example to"
+        " transfer their data. They have no control and no access to services of nodes in this time.",
     )
     ttl_after_finished: int = Field(
         default=600,
@@ -158,7 +171,7 @@ class ApplicationSpec(Model):
 
     @property
     def mission_digest(self) -> str:
-        """Hash of the fields that define the mission: all fields except the update policy and the pod retention."""
+        """Hash of the fields that define the mission: all fields except those of `_NOT_MISSION`."""
         mission = self.model_dump(mode="json", by_alias=True, exclude_defaults=True, exclude=_NOT_MISSION)
         return hashlib.sha256(json.dumps(mission, sort_keys=True).encode()).hexdigest()
 

@@ -276,8 +276,14 @@ def _repeated(keys: Iterable[Hashable]) -> list[int]:
 Placement = Literal["drone", "edge", "hybrid", "cloud"]
 ComponentClass = Literal["driver", "passenger"]
 ControlScope = Literal["full", "partial"]
+Lifetime = Literal["flight", "application"]
 ReferenceField = Literal["ingress", "egress", "hybridTo"]
 """A field of a component that names other components."""
+
+
+def default_lifetime(placement: Placement) -> Lifetime:
+    """Return the end of a component that declares none."""
+    return "application" if placement == "cloud" else "flight"
 
 
 def _belong(service: Service) -> Any:
@@ -442,6 +448,11 @@ class Component(Model):
     replicas: int | None = Field(
         default=None, ge=1, le=1000, description="For placement cloud: number of pods; default: 1."
     )
+    ends_with: Lifetime | None = Field(
+        default=None,
+        description="End of the component. flight: it stops spec.afterFlight seconds after the landing. application: it runs"
+        " until the application is deleted; not on a drone. Default: application for placement cloud, otherwise flight.",
+    )
     services: tuple[ServiceRequest, ...] = Field(
         default=(), max_length=8, description="System services that the component calls, with the methods."
     )
@@ -464,6 +475,11 @@ class Component(Model):
                 return self.hybrid_to
             case _:
                 assert_never(field)
+
+    @property
+    def lifetime(self) -> Lifetime:
+        """The declared or default end of the component."""
+        return self.ends_with or default_lifetime(self.placement)
 
     @property
     def slug(self) -> str:
@@ -539,6 +555,13 @@ class Component(Model):
     @rule("!has(self.replicas) || self.placement == 'cloud'", "replicas are for placement cloud")
     def _replicated(self) -> Violation:
         return "replicas" if self.replicas is not None and self.placement != "cloud" else None
+
+    @rule(
+        "!has(self.endsWith) || self.endsWith != 'application' || self.placement != 'drone'",
+        "a component on a drone ends with the flight, so that other applications can use the drone; remove endsWith",
+    )
+    def _leaves_the_drone(self) -> Violation:
+        return "endsWith" if self.ends_with == "application" and self.placement == "drone" else None
 
     @rule("!has(self.heuristic) || self.placement == 'hybrid'", "heuristic is for placement hybrid")
     def _choosing(self) -> Violation:

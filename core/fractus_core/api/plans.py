@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from datetime import datetime
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, WithJsonSchema
@@ -138,6 +139,9 @@ class MissionRecord(Model):
     )
     landed: bool = Field(
         default=False, description="True if the drone was on the ground at the outcome, or has landed since."
+    )
+    landed_at: datetime | None = Field(
+        default=None, description="Time at which the operator first observed the drone on the ground after the outcome."
     )
 
 

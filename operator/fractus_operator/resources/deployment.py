@@ -55,7 +55,7 @@ def deployment(application: Application, placed: PlannedInstance, drone: Drone |
     # fields with defaults.
     called = [application.spec.component(name).container.ports for name in component.egress]
     content = [
-        component.model_dump(mode="json", by_alias=True, exclude_defaults=True),
+        component.model_dump(mode="json", by_alias=True, exclude_defaults=True, exclude={"ends_with"}),
         [[port.port for port in ports] for ports in called],
     ]
     digest = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:12]

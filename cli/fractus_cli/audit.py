@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,9 +16,11 @@ from fractus_cli.audit_logs import Window, entries, find_logs, is_decision, veri
 from fractus_cli.output import output_option, printable
 
 if TYPE_CHECKING:
+    from fractus_core.api import Zone
     from fractus_runtime.audit_checkpoints import Checkpoint
 
-    from fractus_cli.flight_export import Areas
+    Shape = tuple[Zone, str, str]
+    """A shape, its kind, and its component."""
 
 _FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
 _PATHS = click.argument("paths", nargs=-1, required=True, type=click.Path(exists=True, path_type=Path))
@@ -133,7 +135,18 @@ def _line(entry: dict[str, Any]) -> str:
     "--zones",
     multiple=True,
     type=click.Path(exists=True, path_type=Path),
-    help="Manifests (file or directory) to export with the flight: Zones, and the zones and areas of Grants. May be repeated.",
+    help="Manifests (file or directory) to export with the flight: Zones, the operation areas of DeploymentPlans, and the zones and"
+    " areas of Grants. May be repeated.",
+)
+@click.option(
+    "--application",
+    metavar="[NAMESPACE/]NAME",
+    help="Export the operation area of this Application of the cluster, and the Zones of the cluster, with the flight.",
+)
+@click.option(
+    "--kubeconfig",
+    type=click.Path(exists=True, dir_okay=False),
+    help="Kubeconfig of the cluster of --application.  [default: KUBECONFIG, then ~/.kube/config]",
 )
 @_window_options
 def export(
@@ -142,18 +155,24 @@ def export(
     target: str,
     file: Path | None,
     zones: tuple[Path, ...],
+    application: str | None,
+    kubeconfig: str | None,
     after: int | None,
     before: int | None,
 ) -> None:
     """Export flight paths, verdicts, takeovers and zones from the audit logs in PATHS.
 
     PATHS are as for `verify`, for one or several drones. geojson and kml contain flight paths and decisions. csv has a row for each
-    entry. mcap contains all data for Foxglove. If the chain of a log is not sound, a warning is printed, and written to geojson, kml and mcap.
+    entry. mcap contains all data for Foxglove. After the mission, the operation area is in the DeploymentPlan (--application, or --zones with
+    its manifest), because the Grants are deleted. If the chain of a log is not sound, a warning is printed, and written to geojson, kml and mcap.
     """
-    from fractus_cli.flight_export import WRITERS, Export  # noqa: PLC0415 - only this command needs geometry
+    from fractus_cli.flight_export import WRITERS, Areas, Export  # noqa: PLC0415 - only this command needs geometry
 
     logs = find_logs(paths)
-    data = Export(entries(logs, Window(after, before)), _areas(zones), _problems(logs))
+    shapes = _manifest_shapes(zones)
+    if application is not None:
+        shapes += _cluster_shapes(application, kubeconfig)
+    data = Export(entries(logs, Window(after, before)), Areas(shapes), _problems(logs))
     if file is None:
         if target == "mcap" and sys.stdout.isatty():
             raise click.ClickException("mcap is a binary format; specify --file or redirect standard output")
@@ -163,26 +182,67 @@ def export(
         WRITERS[target](data, out)
 
 
-def _areas(paths: Sequence[Path]) -> Areas:
-    from fractus_core.api import Grant, Zone  # noqa: PLC0415
-    from fractus_services.recording.map_features import areas_of, zones_of  # noqa: PLC0415
+def _manifest_shapes(paths: Sequence[Path]) -> list[Shape]:
+    """Return the zones and areas of manifests."""
+    if not paths:
+        return []
+    from fractus_core.api import DeploymentPlan, Grant, Zone  # noqa: PLC0415
+    from fractus_services.recording.map_features import area_of_plan, areas_of, zones_of  # noqa: PLC0415
 
-    from fractus_cli.flight_export import Areas  # noqa: PLC0415
     from fractus_cli.manifests import BadManifest, read_manifests  # noqa: PLC0415
 
     try:
-        manifests = read_manifests(paths, (Grant, Zone)) if paths else None
+        manifests = read_manifests(paths, (Grant, Zone, DeploymentPlan))
     except BadManifest as error:
         raise click.ClickException(str(error)) from None
-    if manifests is None:
-        return Areas()
     specs = [grant.spec for grant in manifests.of(Grant).values()]
-    zones_by_name = {zone.name: zone for zone in zones_of(specs)} | manifests.of(Zone)
-    shapes = [(zone, "zone", "") for _, zone in sorted(zones_by_name.items())]
+    plans = [loaded.resource for loaded in manifests.objects.values() if isinstance(loaded.resource, DeploymentPlan)]
+    shapes = _zone_shapes({zone.name: zone for zone in zones_of(specs)} | manifests.of(Zone))
     shapes += [(area, area.name, spec.component) for spec in specs for area in areas_of(spec)]
+    shapes += [(area, area.name, "") for plan in plans for area in area_of_plan(plan.spec)]
     if not shapes:
-        raise click.ClickException(f"--zones {', '.join(map(str, paths))}: the manifests contain no Zone and no Grant")
-    return Areas(shapes)
+        raise click.ClickException(
+            f"--zones {', '.join(map(str, paths))}: the manifests contain no Zone, no Grant and no DeploymentPlan with an"
+            " operation area"
+        )
+    return shapes
+
+
+def _cluster_shapes(application: str, config: str | None) -> list[Shape]:
+    """Return the Zones of a cluster and the operation area of an Application, which may be finished."""
+    from fractus_core.api import DeploymentPlan, InvalidObject, Zone  # noqa: PLC0415
+    from fractus_services.recording.map_features import area_of_plan  # noqa: PLC0415
+
+    try:
+        from fractus_cli.cluster_reader import GROUP, open_cluster  # noqa: PLC0415
+    except ImportError as error:
+        raise click.ClickException(f"--application requires {error.name}; install fractus-drones[kube]") from None
+
+    namespace, _, name = application.rpartition("/")
+    with open_cluster(config) as cluster:
+        body = cluster.get(f"{GROUP}/namespaces/{namespace or 'default'}/deploymentplans/{name}")
+        bodies = cluster.list(f"{GROUP}/zones")
+    if body is None:
+        raise click.ClickException(
+            f"--application {application}: there is no DeploymentPlan of this name; `kubectl get fplan -A` lists them"
+        )
+    try:
+        plan = DeploymentPlan.from_body(dict(body))
+        zones = [Zone.from_body(dict(zone)) for zone in bodies]
+    except InvalidObject as error:
+        raise click.ClickException(
+            f"--application {application}: an object of the cluster is invalid: {error}"
+        ) from None
+    areas = area_of_plan(plan.spec)
+    if not areas:
+        raise click.ClickException(
+            f"--application {application}: its plan has no operation area, because no drone flies it"
+        )
+    return [*_zone_shapes({zone.name: zone for zone in zones}), *((area, area.name, "") for area in areas)]
+
+
+def _zone_shapes(zones: Mapping[str, Zone]) -> list[Shape]:
+    return [(zone, "zone", "") for _, zone in sorted(zones.items())]
 
 
 def _checkpoints(since: tuple[str, ...], ca: Path | None) -> dict[str, Checkpoint]:

@@ -227,6 +227,37 @@ def test_export_reads_zones_and_areas_from_a_grant(log: Path, tmp_path: Path) ->
     assert properties["operationArea"]["component"] == "Navigator"
 
 
+PLAN = {
+    "apiVersion": "fractus.dev/v1alpha1", "kind": "DeploymentPlan", "metadata": {"name": "traffic", "namespace": "city"},
+    "spec": {
+        "application": "traffic",
+        "operationArea": {
+            "type": "MultiPolygon",
+            "coordinates": [[
+                [[4.67, 50.86], [4.69, 50.86], [4.69, 50.87], [4.67, 50.86]],
+                [[4.68, 50.862], [4.685, 50.862], [4.685, 50.864], [4.68, 50.862]],
+            ]],
+        },
+        "flown": {"outcome": "Complete", "landed": True, "landedAt": "2026-06-01T12:00:00Z"},
+    },
+}  # fmt: skip
+
+
+def exported_area(result: Result) -> Any:
+    features = json.loads(result.stdout)["features"]
+    (area,) = [f for f in features if f["properties"]["kind"] == "operationArea"]
+    return shapely.geometry.shape(area["geometry"])
+
+
+def test_export_reads_the_operation_area_from_the_plan_of_a_finished_mission(log: Path, tmp_path: Path) -> None:
+    listed = {"apiVersion": "v1", "kind": "List", "items": [PLAN]}
+    (tmp_path / "plan.json").write_text(json.dumps(listed))
+    area = exported_area(run("export", log, "--to", "geojson", "--zones", tmp_path / "plan.json"))
+    assert area.equals(shapely.geometry.shape(PLAN["spec"]["operationArea"]))  # type: ignore[index]
+    for target in ("kml", "mcap"):
+        assert run("export", log, "--to", target, "--zones", tmp_path / "plan.json").stdout_bytes
+
+
 def test_show_prints_decisions(log: Path) -> None:
     lines = run("show", log).stdout.splitlines()
     assert len(lines) == 8

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any, get_args
 
 from fractus_core.api import Zone
+from fractus_core.api.geometry import Area, Point, Polygon
 from fractus_core.api.grants import GrantSpec
 from fractus_core.api.model import Metadata
+from fractus_core.api.plans import DeploymentPlanSpec
 from fractus_core.api.policies import ZoneShape, ZoneSpec, ZoneUse
 from fractus_core.geo.formats.geojson import zone_feature
 
@@ -32,6 +34,21 @@ def areas_of(spec: GrantSpec) -> list[Zone]:
     """Return the operation areas and corridors of a Grant as Zones."""
     areas_by_kind = (("operationArea", spec.operation_area), ("corridor", spec.corridor))
     return [_to_zone(kind, ZoneShape(area=area)) for kind, areas in areas_by_kind for area in areas]
+
+
+def area_of_plan(plan: DeploymentPlanSpec) -> list[Zone]:
+    """Return the operation area of a plan as Zones, one for each polygon."""
+    multipolygon = plan.operation_area or {}
+    zones = []
+    for exterior, *holes in multipolygon.get("coordinates", ()):
+        polygon = Polygon(exterior=_ring(exterior), holes=tuple(map(_ring, holes)))
+        zones.append(_to_zone("operationArea", ZoneShape(area=Area(polygon=polygon))))
+    return zones
+
+
+def _ring(coordinates: Sequence[Sequence[float]]) -> tuple[Point, ...]:
+    """Return a GeoJSON ring, whose last position repeats the first one."""
+    return tuple(Point(lat=lat, lon=lon) for lon, lat, *_ in coordinates[:-1])
 
 
 def grant_features(specs: Iterable[GrantSpec]) -> list[Feature]:

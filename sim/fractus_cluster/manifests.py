@@ -14,6 +14,13 @@ from fractus_cluster.spec import NodeSpec
 Json = dict[str, Any]
 
 DNS_USER = "fractus-sim:dns"
+STORAGE_CLASS = "local"
+VOLUMES_PER_NODE = 4
+VOLUME_SIZE = "10Gi"
+"""Size of a volume that claims can request. It is not enforced."""
+VOLUMES = "/var/lib/fractus-volumes"
+"""Directory of the volumes on a node."""
+_OURS = {"app.kubernetes.io/managed-by": "fractus-sim"}
 
 
 def node_object(node: NodeSpec, index: int, addressing: Addressing) -> tuple[str, Json]:
@@ -99,6 +106,48 @@ def dns_objects(listen: IPv4Address) -> list[tuple[str, Json]]:
         (f"{rbac}/clusterroles/{DNS_USER}", role),
         (f"{rbac}/clusterrolebindings/{DNS_USER}", binding),
     ]
+
+
+def storage_class() -> tuple[str, Json]:
+    """Return path and content of the default StorageClass. Its volumes exist already, so it has no provisioner."""
+    return f"/apis/storage.k8s.io/v1/storageclasses/{STORAGE_CLASS}", {
+        "apiVersion": "storage.k8s.io/v1",
+        "kind": "StorageClass",
+        "metadata": {
+            "name": STORAGE_CLASS,
+            "labels": _OURS,
+            "annotations": {"storageclass.kubernetes.io/is-default-class": "true"},
+        },
+        "provisioner": "kubernetes.io/no-provisioner",
+        # The scheduler selects a volume on the node of the first pod.
+        "volumeBindingMode": "WaitForFirstConsumer",
+    }
+
+
+def volume_object(node: str, number: int) -> tuple[str, Json]:
+    """Return path and content of a PersistentVolume: a directory of a node."""
+    name = f"{node}-{number}"
+    on_node = {"key": "kubernetes.io/hostname", "operator": "In", "values": [node]}
+    return f"/api/v1/persistentvolumes/{name}", {
+        "apiVersion": "v1",
+        "kind": "PersistentVolume",
+        "metadata": {"name": name, "labels": _OURS},
+        "spec": {
+            "storageClassName": STORAGE_CLASS,
+            "capacity": {"storage": VOLUME_SIZE},
+            "accessModes": ["ReadWriteOnce"],
+            "persistentVolumeReclaimPolicy": "Retain",
+            "local": {"path": f"{VOLUMES}/{number}"},
+            "nodeAffinity": {"required": {"nodeSelectorTerms": [{"matchExpressions": [on_node]}]}},
+        },
+    }
+
+
+def volume_place(volume: Json) -> tuple[str, int] | None:
+    """Return node and number of a PersistentVolume of `volume_object`, or None if it is another one."""
+    labels = volume["metadata"].get("labels") or {}
+    node, _, number = volume["metadata"]["name"].rpartition("-")
+    return (node, int(number)) if labels.items() >= _OURS.items() else None
 
 
 def extended_resources_patch(node: NodeSpec, present: Json) -> tuple[str, Json] | None:

@@ -23,6 +23,7 @@ from fractus_cluster.controlplane import server_url
 from fractus_cluster.disk import mount_disk, unmount_below
 from fractus_cluster.errors import ClusterError
 from fractus_cluster.hardware import hardware_commands, hardware_environment
+from fractus_cluster.manifests import VOLUMES
 from fractus_cluster.pki import Authority, write_private
 from fractus_cluster.prerequisites import machine, plugin_directory
 from fractus_cluster.processes import command_line, kill_recorded, running, spawn, write_record
@@ -88,6 +89,10 @@ class Node:
     def fractus_state(self) -> Path:
         """Directory that is mounted as /var/lib/fractus on the node."""
         return self.directory / "var-lib" / "fractus"
+
+    def volume(self, number: int) -> Path:
+        """Return the directory of a volume of the node."""
+        return self.directory / "var-lib" / Path(VOLUMES).name / str(number)
 
     @property
     def powered(self) -> bool:

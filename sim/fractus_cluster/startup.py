@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -117,7 +118,7 @@ class Startup:
         return administrating(server, self.authority.credential.certificate, administrator(self.authority))
 
     def apply_objects(self, api: BlockingClient, nodes: list[Node]) -> None:
-        """Create or update the objects of nodes and DNS. Delete the Nodes that are not part of the description."""
+        """Create or update the objects of nodes, DNS and storage. Delete the Nodes that are not part of the description."""
         addressing = self.wiring.addressing
         names = {node.name for node in nodes}
         for present in api.list("/api/v1/nodes"):
@@ -129,6 +130,7 @@ class Startup:
             _apply_node(api, node, addressing)
         for path, body in manifests.dns_objects(addressing.control_plane):
             api.apply(path, body)
+        apply_volumes(api, nodes)
 
     def write_kubeconfig(self) -> None:
         """Write the administrator's kubeconfig if it changed."""
@@ -251,6 +253,25 @@ def claim(spec: ClusterSpec, state: StateDirectory, kubernetes: str, report: Rep
     if record != previous:
         state.write_record(record)
     return record
+
+
+def apply_volumes(api: BlockingClient, nodes: Sequence[Node]) -> None:
+    """Create the volumes of nodes, empty those whose claim was deleted, and delete those of removed nodes."""
+    api.apply(*manifests.storage_class())
+    by_name = {node.name: node for node in nodes}
+    for volume in api.list("/api/v1/persistentvolumes"):
+        place = manifests.volume_place(volume)
+        path = f"/api/v1/persistentvolumes/{volume['metadata']['name']}"
+        if place is not None and place[0] not in by_name:
+            api.call("DELETE", path)
+        elif place is not None and volume.get("status", {}).get("phase") == "Released":
+            name, number = place
+            shutil.rmtree(by_name[name].volume(number), ignore_errors=True)
+            api.merge(path, {"spec": {"claimRef": None}})
+    for node in nodes:
+        for number in range(1, manifests.VOLUMES_PER_NODE + 1):
+            node.volume(number).mkdir(parents=True, exist_ok=True)
+            api.apply(*manifests.volume_object(node.name, number))
 
 
 def _apply_node(api: BlockingClient, node: Node, addressing: Addressing) -> None:

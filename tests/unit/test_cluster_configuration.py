@@ -6,7 +6,8 @@ import json
 from datetime import UTC, datetime, timedelta
 from ipaddress import IPv4Network
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 import yaml
@@ -18,6 +19,7 @@ from fractus_cluster.manifests import dns_objects, extended_resources_patch, is_
 from fractus_cluster.network import host_link
 from fractus_cluster.nodeconfig import Machine, cni_config, kubelet_config, node_units, shortfalls
 from fractus_cluster.spec import NodeSpec
+from fractus_cluster.startup import apply_volumes
 
 ADDRESSING = Addressing(IPv4Network("10.200.0.0/16"))
 MACHINE = Machine(cpus=4, memory_bytes=16 * 2**30)
@@ -171,3 +173,48 @@ def test_error_names_missing_cgroup_controller() -> None:
         find_hierarchies(V1.replace("memory", "misc"))
     with pytest.raises(PrerequisiteError, match="no control groups"):
         find_hierarchies("proc /proc proc rw 0 0\n")
+
+
+class FakeVolumes:
+    """API server with PersistentVolumes, and claims that are bound to some of them."""
+
+    def __init__(self) -> None:
+        self.objects: dict[str, dict[str, Any]] = {}
+
+    def apply(self, path: str, body: dict[str, Any]) -> dict[str, Any]:
+        return self.objects.setdefault(path, {**body, "status": {"phase": "Available"}})
+
+    def list(self, path: str) -> list[dict[str, Any]]:
+        return [body for key, body in self.objects.items() if key.startswith(path)]
+
+    def call(self, method: str, path: str) -> None:
+        assert method == "DELETE"
+        del self.objects[path]
+
+    def merge(self, path: str, patch: dict[str, Any]) -> None:
+        assert patch == {"spec": {"claimRef": None}}
+        self.objects[path]["status"]["phase"] = "Available"
+
+
+def test_volumes_are_kept_until_their_claim_or_node_is_removed(tmp_path: Path) -> None:
+    api = FakeVolumes()
+
+    def up(*names: str) -> dict[str, str]:
+        nodes = [
+            SimpleNamespace(name=name, volume=lambda number, name=name: tmp_path / name / str(number)) for name in names
+        ]
+        apply_volumes(cast(Any, api), cast(Any, nodes))
+        return {body["metadata"]["name"]: body["status"]["phase"] for body in api.list("/api/v1/persistentvolumes")}
+
+    api.objects["/api/v1/persistentvolumes/other"] = {"metadata": {"name": "other"}, "status": {"phase": "Released"}}
+    assert len(up("cloud-1", "drone-1")) == 9
+    (default,) = api.list("/apis/storage.k8s.io/v1/storageclasses")
+    assert default["metadata"]["annotations"] == {"storageclass.kubernetes.io/is-default-class": "true"}
+    for number, phase in ((1, "Bound"), (2, "Released")):
+        (tmp_path / "cloud-1" / str(number) / "result").write_text("x")
+        api.objects[f"/api/v1/persistentvolumes/cloud-1-{number}"]["status"]["phase"] = phase
+    phases = up("cloud-1")
+    assert (phases["cloud-1-1"], phases["cloud-1-2"], phases["other"]) == ("Bound", "Available", "Released")
+    assert not any(name.startswith("drone-1") for name in phases)
+    assert [str(p.relative_to(tmp_path)) for p in tmp_path.rglob("result")] == ["cloud-1/1/result"]
+    assert (tmp_path / "cloud-1" / "2").is_dir()

@@ -66,6 +66,7 @@ COMMANDS: dict[str, Entry] = {
     "check": Entry("fractus_cli.check:check", "Check driver programs without running them."),
     "cluster": Entry("fractus_cluster.cli:cluster", "Run a Kubernetes cluster of several nodes on this machine.", "sim"),
     "completion": Entry("fractus_cli.completion:completion", "Print the completion script of a shell."),
+    "cp": Entry("fractus_cli.cp:cp", "Copy files of a component, also after its mission.", "model"),
     "doctor": Entry("fractus_cli.doctor:doctor", "Check a cluster and print a remedy for each problem.", "operator"),
     "experiment": Entry("fractus_sim.experiment_command:experiment", "Run experiments with faults, checks and a report.", "sim"),
     "explain": Entry("fractus_cli.explain:explain", "Explain the plan of an Application.", "kube"),

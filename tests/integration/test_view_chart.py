@@ -25,7 +25,7 @@ def test_view_is_rendered_only_if_enabled_and_without_write_permissions() -> Non
     assert view_objects() == {}
     objects = view_objects("--set", "view.enabled=true", "--set", "view.hostnames={view.example.org}")
     assert set(objects) == {
-        "ServiceAccount", "ClusterRole", "ClusterRoleBinding", "Deployment", "Service", "NetworkPolicy",
+        "ServiceAccount", "ClusterRole", "ClusterRoleBinding", "Role", "RoleBinding", "Deployment", "Service", "NetworkPolicy",
     }  # fmt: skip
     (rule,) = objects["ClusterRole"]["rules"]
     assert set(rule["resources"]) == {kind.PLURAL for kind in KINDS}
@@ -47,6 +47,15 @@ def test_view_is_rendered_only_if_enabled_and_without_write_permissions() -> Non
     assert f"--metrics=:{container['ports'][1]['containerPort']}" in container["args"]
 
 
+def test_view_account_may_read_logs_only_if_verdicts_are_shown() -> None:
+    shown = view_objects("--set", "view.enabled=true")
+    granted = {(resource, *rule["verbs"]) for rule in shown["Role"]["rules"] for resource in rule["resources"]}
+    assert granted == {("pods", "list"), ("pods/log", "get")}
+    assert f"--system-namespace={SYSTEM}" in shown["Deployment"]["spec"]["template"]["spec"]["containers"][0]["args"]
+    hidden = view_objects("--set", "view.enabled=true", "--set", "view.verdicts=false")
+    assert not hidden.keys() & {"Role", "RoleBinding"}
+
+
 def test_view_has_pod_monitor_if_enabled() -> None:
     monitored = ("--set", "metrics.podMonitor.enabled=true")
     assert view_objects(*monitored) == {}
@@ -56,7 +65,7 @@ def test_view_has_pod_monitor_if_enabled() -> None:
 
 def test_view_account_may_only_list_displayed_kinds(control_plane: ControlPlane, world: World) -> None:
     objects = view_objects("--set", "view.enabled=true")
-    access = [objects[kind] for kind in ("ServiceAccount", "ClusterRole", "ClusterRoleBinding")]
+    access = [objects[kind] for kind in ("ServiceAccount", "ClusterRole", "ClusterRoleBinding", "Role", "RoleBinding")]
     for body in access:
         world.api.apply(fractus_chart.path_of(body), body)
     try:
@@ -65,7 +74,14 @@ def test_view_account_may_only_list_displayed_kinds(control_plane: ControlPlane,
         api = control_plane.with_token(str(world.api.call("POST", path, request)["status"]["token"]))
         for kind in KINDS:
             api.list(f"{FRACTUS}/{kind.PLURAL}")
-        for refused in (f"{FRACTUS}/grants", "/api/v1/secrets", "/api/v1/pods", "/api/v1/nodes"):
+        api.list(f"/api/v1/namespaces/{SYSTEM}/pods")
+        for refused in (
+            f"{FRACTUS}/grants",
+            "/api/v1/secrets",
+            f"/api/v1/namespaces/{SYSTEM}/secrets",
+            "/api/v1/pods",
+            "/api/v1/nodes",
+        ):
             with pytest.raises(KubeError) as error:
                 api.list(refused)
             assert error.value.status == 403

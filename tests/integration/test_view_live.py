@@ -103,12 +103,20 @@ def test_view_page_shows_cluster_live_and_stale_when_api_server_is_unreachable(
         expect(page.locator("#policies")).to_contain_text("no-school exclusion, ignore; in school")
         expect(page.locator("#applications")).to_contain_text(f"{namespace}/traffic")
         expect(page.locator("#drones")).to_contain_text("on the ground")
-        expect(page.locator("#verdicts-section")).to_be_hidden()
+        expect(page.locator("#verdicts")).to_contain_text("No interventions by policies yet.")
+        expect(page.locator("#pictures-section")).to_be_hidden()
         world.api.merge(
             drone, {"status": {"flightState": "flying", "position": at(30, 30, alt=15), "controller": "system"}}
         )
         expect(page.locator("#drones")).to_contain_text("in the air", timeout=TIMEOUT_MS)
         expect(page.locator("#drones")).to_contain_text("altitude 15.0 m")
+        world.api.merge(
+            f"{FRACTUS}/namespaces/{namespace}/applications/traffic/status",
+            {"status": {"phase": "Flying", "drone": "drone-1"}},
+        )
+        expect(page.locator("#verdicts-problem")).to_contain_text(
+            "no services in namespace fractus-system on drone-1", timeout=TIMEOUT_MS
+        )
         page.wait_for_selector("#map[data-map=ready]")
         results = Axe().run(page)
         assert results.violations_count == 0, results.generate_report()

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import pytest
 from axe_playwright_python.sync_playwright import Axe
 from browser import CHROMIUM, SOFTWARE_GL, TIMEOUT_MS, launched, opened
-from fractus_view.events import Areas, Contact, Event, Feature, Fix, Policies, Policy, State
+from fractus_view.events import Areas, Contact, Event, Feature, Fix, Policies, Policy, Records, State, Verdict
 from page_server import PageSource
 from PIL import Image
 from playwright.sync_api import Browser, Page, expect, sync_playwright
@@ -168,3 +168,19 @@ def test_view_map_zooms_to_the_flight_and_separates_earlier_paths(browser: Brows
         expect(page.locator("#drones")).to_contain_text("in the air")
         source.publish(*drone(start_ms + 11_000, 0.0, phase="returning", flight_ms=start_ms))
         expect(page.locator("#drones .badge")).to_have_text("returning", timeout=TIMEOUT_MS)
+
+
+def test_view_of_a_cluster_shows_verdicts_and_states_why_some_may_be_missing(
+    browser: Browser, source: PageSource
+) -> None:
+    verdict = Verdict("drone-1", T_MS, "call", "Navigator", "Goto", "deny", "X", "inside zone a", ["no-a"], None, None)
+    source.publish(Contact(T_MS, None, ""), Records(T_MS, ""), *drone(T_MS, 0.0), verdict)
+    with source.serving() as address, opened(browser, address) as page:
+        expect(page.locator("#verdicts .deny")).to_contain_text("inside zone a", timeout=TIMEOUT_MS)
+        expect(page.get_by_label("Show", exact=True)).to_be_hidden()
+        expect(page.locator("#verdicts-problem")).to_be_empty()
+        source.publish(Records(T_MS + 1_000, "drone-1: no route to host"))
+        expect(page.locator("#verdicts-problem")).to_have_text("Verdicts may be missing: drone-1: no route to host")
+        # A page that is opened later receives the same problem.
+        page.reload()
+        expect(page.locator("#verdicts-problem")).to_contain_text("no route to host", timeout=TIMEOUT_MS)

@@ -111,6 +111,9 @@ class ApiServer:
         while (event := await events.get()) is not None:
             yield event
 
+    async def list_whole(self, kind: Kind, **_: Any) -> Page:
+        return Page({"metadata": {}, "items": []})
+
     async def send_event(self, type_: str, body: Body) -> None:
         body = json.loads(json.dumps(body))
         body["metadata"]["resourceVersion"] = "2"

@@ -17,6 +17,7 @@ from fractus_view import objects
 from fractus_view.events import Applications, Areas, Contact, Event, Gone, Links, Policies, Problem
 from fractus_view.flight_times import FlightTimes
 from fractus_view.hub import Hub
+from fractus_view.log_verdicts import LogVerdicts
 
 PUBLISH_INTERVAL_S = 0.2
 """Interval between two publications of changes, in seconds."""
@@ -45,10 +46,15 @@ class ClusterSource:
         client: Client of the API server.
         namespace: Namespace of the shown applications. An empty string shows all namespaces.
         now_ms: Returns the current time in Unix milliseconds.
+        system_namespace: Namespace of the mobility and camera services.
     """
 
     def __init__(
-        self, client: Client, namespace: str = "", now_ms: Callable[[], int] = lambda: round(time.time() * 1000)
+        self,
+        client: Client,
+        namespace: str = "",
+        now_ms: Callable[[], int] = lambda: round(time.time() * 1000),
+        system_namespace: str = "fractus-system",
     ) -> None:
         self._client = client
         self._namespace = namespace
@@ -59,6 +65,14 @@ class ClusterSource:
         self._returning: frozenset[str] = frozenset()
         self._flights = FlightTimes()
         self._last_contact_ms = now_ms()
+        self._verdicts = LogVerdicts(
+            client,
+            system_namespace,
+            namespace=namespace,
+            drones=self._drones_with_verdicts,
+            publish=self._hub.publish,
+            now_ms=now_ms,
+        )
         self._informers: dict[type[api.Resource], Informer[Any]] = {
             model: self._informer(model, namespace if model.NAMESPACED else "") for model in KINDS
         }
@@ -88,6 +102,7 @@ class ClusterSource:
                 group.create_task(informer.run())
             group.create_task(self._report_contact())
             group.create_task(self._publish_changes())
+            group.create_task(self._verdicts.run())
 
     def metrics(self) -> Iterator[Metric]:
         """Yield the metrics of the watches."""
@@ -172,6 +187,13 @@ class ClusterSource:
         fix = objects.fix(drone, now_ms)
         if fix is not None:
             yield fix
+
+    def _drones_with_verdicts(self) -> frozenset[str]:
+        """Return the drones with a running application, and without a selected namespace also all drones in the air."""
+        drones = set(objects.assigned_drones(self._all(api.Application)))
+        if not self._namespace:
+            drones |= {drone.name for drone in self._all(api.Drone) if objects.in_air(drone)}
+        return frozenset(drones)
 
     def _all(self, model: type[T]) -> Iterator[T]:
         return self._informers[model].values()

@@ -76,6 +76,12 @@ def _parse_address(_context: click.Context, _option: click.Parameter, text: str)
     help="Follow the recordings that services are writing below this directory.",
 )
 @click.option("-n", "--namespace", default="", help="Show only the applications of this namespace.")
+@click.option(
+    "--system-namespace",
+    default="fractus-system",
+    show_default=True,
+    help="Namespace of the mobility and camera services, whose logs contain the verdicts.",
+)
 @click.option("--context", help="Context of the kubeconfig. Default: its current context.")
 @click.option(
     "--kubeconfig",
@@ -114,6 +120,7 @@ def view(
     recordings: tuple[Path, ...],
     directory: Path | None,
     namespace: str,
+    system_namespace: str,
     context: str | None,
     config: Path | None,
     listen: tuple[str, int],
@@ -137,7 +144,7 @@ def view(
     elif recordings:
         asyncio.run(_serve(_replay(recordings), options))
     else:
-        asyncio.run(_serve_cluster(config, context, namespace, options))
+        asyncio.run(_serve_cluster(config, context, namespace, system_namespace, options))
 
 
 def _read_token(path: Path) -> str:
@@ -195,14 +202,16 @@ def _replay(recordings: tuple[Path, ...]) -> Source:
     return Replay(recordings)
 
 
-async def _serve_cluster(config: Path | None, context: str | None, namespace: str, options: ServerOptions) -> None:
+async def _serve_cluster(
+    config: Path | None, context: str | None, namespace: str, system_namespace: str, options: ServerOptions
+) -> None:
     try:
         access = await (kubeconfig(config, context) if config is not None else from_environment(context))
         client = Client(access, "fractus-view")
     except Unconfigured as error:
         raise click.ClickException(f"{error}; or specify recordings to replay") from error
     async with aclosing(client):
-        cluster = ClusterSource(client, namespace)
+        cluster = ClusterSource(client, namespace, system_namespace=system_namespace)
         try:
             await cluster.check()
         except KubeError as error:

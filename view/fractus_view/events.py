@@ -237,6 +237,18 @@ class Contact:
 
 
 @dataclass(frozen=True, slots=True)
+class Records:
+    """Completeness of the verdicts. Without this event, the source always has all verdicts.
+
+    Attributes:
+        verdicts_problem: Reason why verdicts may be missing, or an empty string.
+    """
+
+    time_ms: int
+    verdicts_problem: str
+
+
+@dataclass(frozen=True, slots=True)
 class Picture:
     """Picture after privacy filters. The page requests it by `id`."""
 
@@ -253,7 +265,21 @@ class Problem:
     text: str
 
 
-Event = Fix | State | Gone | Verdict | Note | Areas | Applications | Links | Policies | Contact | Picture | Problem
+Event = (
+    Fix
+    | State
+    | Gone
+    | Verdict
+    | Note
+    | Areas
+    | Applications
+    | Links
+    | Policies
+    | Contact
+    | Records
+    | Picture
+    | Problem
+)
 
 RESET = '{"type":"reset"}'
 """Earlier events are void. The complete current state follows."""

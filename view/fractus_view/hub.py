@@ -21,6 +21,7 @@ from fractus_view.events import (
     Picture,
     Policies,
     Problem,
+    Records,
     State,
     Verdict,
     encode,
@@ -96,7 +97,7 @@ class Hub:
                 self._current[State, event.drone] = event
             case Areas():
                 self._current[Areas, event.origin] = event
-            case Applications() | Links() | Policies() | Contact():
+            case Applications() | Links() | Policies() | Contact() | Records():
                 self._current[type(event), ""] = event
             case Gone():
                 self._trails.pop(event.drone, None)

@@ -78,6 +78,12 @@ def state(drone: api.Drone, now_ms: int, flight_ms: int | None = None, *, return
     )
 
 
+def assigned_drones(applications: Iterable[api.Application]) -> frozenset[str]:
+    """Return the names of the drones of applications that have not ended."""
+    statuses = (resource.status for resource in applications)
+    return frozenset(s.drone for s in statuses if s is not None and s.drone and s.phase not in ENDED_PHASES)
+
+
 def returning_drones(applications: Iterable[api.Application]) -> frozenset[str]:
     """Return the names of the drones that fly home after the mission of an application."""
     statuses = (resource.status for resource in applications)

@@ -212,6 +212,18 @@ export interface Contact {
   text: string;
 }
 
+/**
+ * Completeness of the verdicts. Without this event, the source always has all verdicts.
+ *
+ * Attributes:
+ *     verdicts_problem: Reason why verdicts may be missing, or an empty string.
+ */
+export interface Records {
+  type: "records";
+  time_ms: number;
+  verdicts_problem: string;
+}
+
 /** Picture after privacy filters. The page requests it by `id`. */
 export interface Picture {
   type: "picture";
@@ -238,6 +250,7 @@ export type Event =
   | Links
   | Policies
   | Contact
+  | Records
   | Picture
   | Problem;
 

@@ -100,9 +100,14 @@ export class Lists {
     this.showZones(time);
     this.showLegend(time);
     const model = this.model;
-    // Hide these lists for a cluster, which reports no calls, pictures or logs. Empty lists would suggest that there were none.
-    const fromCluster = model.contact !== undefined && model.verdicts.values.length === 0;
-    for (const id of ["verdicts", "pictures", "log"]) byId(`${id}-section`).hidden = fromCluster;
+    // Hide lists that a cluster does not report. An empty list would suggest that there were no pictures or log lines.
+    const fromCluster = model.contact !== undefined;
+    byId("pictures-section").hidden = fromCluster;
+    byId("log-section").hidden = fromCluster;
+    // A cluster reports only calls that policies changed or refused.
+    byId("verdict-filter-label").hidden = fromCluster;
+    const problem = model.records?.verdicts_problem;
+    setText(byId("verdicts-problem"), problem ? `Verdicts may be missing: ${problem}` : "");
     this.showSection("applications", model.applications.at(time)?.applications, applicationItem, "No applications.");
     this.showSection("links", model.linksAt(time), linkItem, "No direct links.");
     const unlisted = model.contact === undefined && model.drones.size > 0;

@@ -37,6 +37,7 @@ const ACTIONS: Record<string, string> = {
   correct: "corrected",
   deny: "refused",
   takeover: "taken over",
+  alarm: "alarm",
 };
 
 /** Class of a feature, which determines its colour. For a zone, it is the class of its most restrictive use. */

@@ -2,58 +2,60 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import logging
-import threading
-from email.message import Message
 from pathlib import Path
-from typing import Any
 
-from web import serve
+import fractus
 
 PORT = 8080
 RESULTS = Path("/tmp/results.jsonl")  # nosec B108  # an emptyDir: it survives a restart of the container
 MAX_BYTES = 32 * 2**20
 log = logging.getLogger("data-store")
-lock = threading.Lock()
-stored: set[str | None] = set()
-"""Ids of the requests whose results are stored."""
 
 
-def store(body: bytes, headers: Message) -> dict[str, Any]:
-    """Store a result once. Two ImageCheckers may check the same picture if the path of the traffic changes.
+class DataStore:
+    """Results in a file.
 
-    Raises:
-        ValueError: The body is not a JSON object.
-        OSError: The store is full.
+    Args:
+        path: The file. Its results are kept.
     """
-    result = json.loads(body)
-    if not isinstance(result, dict):
-        raise ValueError("a result must be a JSON object")  # noqa: TRY004 (the sender receives status 400)
-    line = json.dumps(result, separators=(",", ":")) + "\n"
-    request = result.get("request")
-    with lock:
-        if request is not None and request in stored:
-            return {"stored": False}
-    with lock, RESULTS.open("a") as file:
-        if file.tell() + len(line) > MAX_BYTES:
-            raise OSError(f"the store is full at {MAX_BYTES} bytes")
-        file.write(line)
-        stored.add(request)
-    log.info("stored %s of %s", result.get("picture"), result.get("source"))
-    return {"stored": True}
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        lines = path.read_text().splitlines() if path.exists() else []
+        self._stored = {json.loads(line).get("request") for line in lines}
+
+    async def store(self, request: fractus.Request) -> bytes:
+        """Store a result once. Two ImageCheckers may check the same picture if the path of the traffic changes.
+
+        Raises:
+            ValueError: The body is not a JSON object.
+            OSError: The store is full.
+        """
+        result = json.loads(request.body)
+        if not isinstance(result, dict):
+            raise ValueError("a result must be a JSON object")  # noqa: TRY004 (the sender must not repeat the request)
+        if result.get("request") in self._stored:
+            return b""
+        line = json.dumps(result, separators=(",", ":")) + "\n"
+        with self._path.open("a") as file:
+            if file.tell() + len(line) > MAX_BYTES:
+                raise OSError(f"the store is full at {MAX_BYTES} bytes")
+            file.write(line)
+        self._stored.add(result.get("request"))
+        log.info("stored %s of %s", result.get("picture"), result.get("source"))
+        return b""
 
 
-def results(body: bytes, headers: Message) -> list[Any]:
-    """Return all stored results, oldest first."""
-    with lock:
-        lines = RESULTS.read_text().splitlines() if RESULTS.exists() else []
-    return [json.loads(line) for line in lines]
+async def main() -> None:
+    """Serve requests until SIGTERM."""
+    store = DataStore(RESULTS)
+    log.info("listening on port %d", PORT)
+    await fractus.Responder({"store": store.store}, PORT).serve()
 
 
 if __name__ == "__main__":
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S")
-    earlier = results(b"", Message())
-    stored.update(result.get("request") for result in earlier)
-    log.info("listening on port %d (stored results: %d)", PORT, len(earlier))
-    serve(PORT, get={"/results": results}, post={"/results": store})
+    asyncio.run(main())

@@ -10,38 +10,48 @@ import os
 import struct
 
 import fractus
-from web import post
 
 PORT = 8080
+STORE_TIMEOUT_S = 5.0
 log = logging.getLogger("image-checker")
 
 
-async def check(request: fractus.Request) -> bytes:
-    """Return the properties of a picture, and send them to the DataStore. The request id identifies repeated requests.
+class ImageChecker:
+    """Checks pictures.
 
-    Raises:
-        ValueError: The request contains no picture.
-        OSError: The DataStore is unreachable. The sender repeats its request.
+    Args:
+        store: Client of the DataStore.
     """
-    first_line, _, picture = request.body.partition(b"\n")
-    header = json.loads(first_line)
-    kind, width, height = measure(picture)
-    result = {
-        "request": request.id,
-        "picture": str(header.get("picture", "")),
-        "source": str(header.get("source", "")),
-        "by": os.environ.get("FRACTUS_INSTANCE", "") + "@" + os.environ.get("FRACTUS_NODE", ""),
-        "kind": kind,
-        "width": width,
-        "height": height,
-        "bytes": len(picture),
-        "sha256": hashlib.sha256(picture).hexdigest(),
-        "summary": f"{kind} {width}x{height}, {8 * len(picture) / (width * height):.2f} bits per pixel",
-    }
-    headers = {"Content-Type": "application/json"}
-    await asyncio.to_thread(post, fractus.egress("DataStore"), "/results", json.dumps(result).encode(), headers)
-    log.info("%s from %s: %s", result["picture"], result["source"], result["summary"])
-    return json.dumps(result).encode()
+
+    def __init__(self, store: fractus.Requester) -> None:
+        self._store = store
+
+    async def check(self, request: fractus.Request) -> bytes:
+        """Return the properties of a picture, and send them to the DataStore. The request id identifies repeated requests.
+
+        Raises:
+            ValueError: The request contains no picture.
+            Unavailable: The DataStore is unreachable. The sender repeats its request.
+        """
+        first_line, _, picture = request.body.partition(b"\n")
+        header = json.loads(first_line)
+        kind, width, height = measure(picture)
+        result = {
+            "request": request.id,
+            "picture": str(header.get("picture", "")),
+            "source": str(header.get("source", "")),
+            "by": os.environ.get("FRACTUS_INSTANCE", "") + "@" + os.environ.get("FRACTUS_NODE", ""),
+            "kind": kind,
+            "width": width,
+            "height": height,
+            "bytes": len(picture),
+            "sha256": hashlib.sha256(picture).hexdigest(),
+            "summary": f"{kind} {width}x{height}, {8 * len(picture) / (width * height):.2f} bits per pixel",
+        }
+        body = json.dumps(result).encode()
+        await self._store.request("store", body, timeout_s=STORE_TIMEOUT_S, request_id=request.id)
+        log.info("%s from %s: %s", result["picture"], result["source"], result["summary"])
+        return body
 
 
 def measure(picture: bytes) -> tuple[str, int, int]:
@@ -64,7 +74,13 @@ def measure(picture: bytes) -> tuple[str, int, int]:
     raise ValueError("the picture is neither a PNG nor a JPEG")
 
 
+async def main() -> None:
+    """Serve requests until SIGTERM."""
+    log.info("listening on port %d", PORT)
+    async with fractus.requester("DataStore") as store:
+        await fractus.Responder({"check": ImageChecker(store).check}, PORT).serve()
+
+
 if __name__ == "__main__":
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S")
-    log.info("listening on port %d", PORT)
-    asyncio.run(fractus.Responder({"check": check}, PORT).serve())
+    asyncio.run(main())

@@ -6,7 +6,8 @@ import importlib
 import json
 import os
 import sys
-from email.message import Message
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -21,44 +22,72 @@ EXAMPLE = EXAMPLES / "traffic-monitoring"
 
 
 @pytest.fixture
-def programs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> dict[str, Any]:
-    """Return the modules of the example. Their ImageCheckers send results to one DataStore, without a network."""
+def programs(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """Return the modules of the example."""
     monkeypatch.setattr(sys, "path", [str(EXAMPLE), *sys.path])
-    names = ("data_store", "image_checker", "pictures", "web")
+    names = ("data_store", "image_checker", "pictures")
     for name in names:
         monkeypatch.delitem(sys.modules, name, raising=False)
     modules = {name: importlib.import_module(name) for name in names}
     for name in names:
         monkeypatch.setitem(sys.modules, name, modules[name])
-    monkeypatch.setattr(modules["data_store"], "RESULTS", tmp_path / "results.jsonl")
-    monkeypatch.setenv("FRACTUS_SERVICE_DATA_STORE", "data-store:8080")
-    monkeypatch.setattr(
-        modules["image_checker"],
-        "post",
-        lambda _to, _path, body, _headers: modules["data_store"].store(body, Message()),
-    )
     return modules
 
 
-async def test_repeated_picture_counts_once_across_instances(programs: dict[str, Any]) -> None:
-    check = programs["image_checker"].check
+@asynccontextmanager
+async def serving(**handlers: Any) -> AsyncIterator[Requester]:
+    """Yield a client of a server with these handlers."""
+    responder = Responder(handlers, 0)
+    await responder.start()
+    async with Requester(f"127.0.0.1:{responder.port}") as client:
+        yield client
+    await responder.stop(0.0)
+
+
+async def test_repeated_picture_counts_once_across_instances(programs: dict[str, Any], tmp_path: Path) -> None:
     pictures = programs["pictures"]
     body = pictures.pack("picture-1", "viewer-1", pictures.render(160, 120, 1))
-    for _ in range(2):  # two instances without shared state
-        responder = Responder({"check": check}, 0)
-        await responder.start()
-        async with Requester(f"127.0.0.1:{responder.port}") as asking:
-            response = json.loads(await asking.request("check", body, request_id="r1"))
-        await responder.stop(0.0)
-        assert (response["picture"], response["source"], response["kind"]) == ("picture-1", "viewer-1", "PNG")
-    (stored,) = programs["data_store"].results(b"", Message())
-    assert stored["request"] == "r1"
+    path = tmp_path / "results.jsonl"
+    store = programs["data_store"].DataStore(path)
+    async with serving(store=store.store) as data_store:
+        for _ in range(2):  # two instances without shared state
+            checker = programs["image_checker"].ImageChecker(data_store)
+            async with serving(check=checker.check) as asking:
+                response = json.loads(await asking.request("check", body, request_id="r1"))
+            assert (response["picture"], response["source"], response["kind"]) == ("picture-1", "viewer-1", "PNG")
+    (stored,) = path.read_text().splitlines()
+    assert json.loads(stored) == response
+    restarted = programs["data_store"].DataStore(path)
+    await restarted.store(Request("r2", "store", json.dumps(response | {"by": "another"}).encode()))
+    assert len(path.read_text().splitlines()) == 1, "a restarted DataStore knows the results in its file"
+
+
+async def test_picture_is_checked_again_until_result_is_stored(
+    programs: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    attempts = 0
+
+    async def store(_: Request) -> bytes:
+        nonlocal attempts
+        attempts += 1
+        if attempts == 1:
+            raise OSError("the store is full")
+        return b""
+
+    monkeypatch.setattr(programs["image_checker"], "STORE_TIMEOUT_S", 0.05)
+    pictures = programs["pictures"]
+    async with serving(store=store) as data_store:
+        checker = programs["image_checker"].ImageChecker(data_store)
+        async with serving(check=checker.check) as asking:
+            await asking.request("check", pictures.pack("picture-1", "viewer-1", pictures.render(160, 120, 1)))
+            assert asking.repeated >= 1
 
 
 async def test_example_refuses_invalid_picture(programs: dict[str, Any]) -> None:
+    checker = programs["image_checker"].ImageChecker(Requester("127.0.0.1:1"))
     for body in (b"", b"not json\nx", programs["pictures"].pack("p", "s", b"no picture")):
         with pytest.raises(ValueError, match=" "):
-            await programs["image_checker"].check(Request("r", "check", body))
+            await checker.check(Request("r", "check", body))
 
 
 class FullCamera:

@@ -26,6 +26,7 @@ from fractus_core.policy.decision_types import (
 from fractus_core.policy.engine import judge
 from fractus_core.policy.limits import limit_forbids_altitudes
 from fractus_core.policy.monitoring import monitor
+from fractus_core.policy.return_route import may_change_altitude
 from fractus_core.policy.route_search import find_route
 from policy_world import (
     FRAME,
@@ -125,6 +126,27 @@ def test_equal_lower_and_upper_limit_forbids_other_altitudes() -> None:
         altitude(zones=[zone("level", box(0, 0, 9, 9))], lowerLimit=height, upperLimit=height)
     ).altitude_limits.zones
     assert [limit_forbids_altitudes(level, m, m, at(), flat=False) for m in (19.0, 20.0, 21.0)] == [True, False, True]
+
+
+@pytest.mark.parametrize(
+    ("present_m", "target_m", "permitted"),
+    [
+        (50.0, 21.0, False),
+        (50.0, 49.0, True),
+        (35.0, 21.0, True),
+        (20.0, 40.0, False),
+        (20.0, 16.0, True),
+        (5.0, 16.0, True),
+        (5.0, 40.0, False),
+    ],
+)
+def test_return_flight_changes_altitude_only_where_limit_of_zone_permits_it(
+    present_m: float, target_m: float, permitted: bool
+) -> None:
+    limited = altitude(
+        zones=[zone("limited", box(-50, -50, 50, 50), lower=10, upper=45)], lowerLimit=5.0, upperLimit=22.0
+    )
+    assert may_change_altitude(at(alt=present_m), compiled(limited), target_m) == permitted
 
 
 def _court() -> dict[str, Any]:

@@ -8,11 +8,23 @@ from dataclasses import dataclass
 import shapely
 from shapely.geometry.base import BaseGeometry
 
-from fractus_core.policy.compiled_grant import MAX_FRAME_REACH_M, AirVolume, CompiledGrant, altitude_above_home_m
+from fractus_core.policy.compiled_grant import (
+    MAX_FRAME_REACH_M,
+    AirVolume,
+    CompiledGrant,
+    altitude_above_home_m,
+    band_may_overlap,
+)
 from fractus_core.policy.decision_types import Situation
 from fractus_core.policy.geofences import find_breaches
-from fractus_core.policy.kinematics import XY, Leg, stop_point, vertical_leg
-from fractus_core.policy.limits import altitude_bounds, lowest_ceiling_m, speed_bounds
+from fractus_core.policy.kinematics import XY, Leg, altitude_range_to_stop_m, stop_point, vertical_leg
+from fractus_core.policy.limits import (
+    altitude_bounds,
+    limit_forbids_altitudes,
+    limiting_zones,
+    lowest_ceiling_m,
+    speed_bounds,
+)
 
 MIN_RETURN_ALTITUDE_M = 10.0
 """Lowest altitude above home of a return flight below a zone, because the terrain is not known."""
@@ -105,12 +117,17 @@ def may_change_altitude(now: Situation, grant: CompiledGrant, altitude_m: float)
     """Return True if the drone may climb or sink to an altitude at its position.
 
     A drone that is too close below or above a zone may move away from it, even next to another zone: a vertical motion
-    does not bring it closer to the other zone.
+    does not bring it closer to the other zone. A drone that breaks the altitude limit of a zone may move to any altitude.
+    No other drone may enter a zone from above or below, or move in it, where its altitude limit forbids that.
     """
     position = grant.locate(now)
     if position is None:
         return False
-    column = vertical_leg(position, min(now.altitude_m, altitude_m), max(now.altitude_m, altitude_m))
+    low_m = min(now.altitude_m, altitude_m)
+    high_m = max(now.altitude_m, altitude_m)
+    if _limits_forbid(AirVolume(shapely.points(position), now.margin_m, low_m, high_m), now, grant):
+        return False
+    column = vertical_leg(position, low_m, high_m)
     present = vertical_leg(position, now.altitude_m, now.altitude_m)
 
     def broken(leg: Leg, room_m: float) -> set[str]:
@@ -119,6 +136,20 @@ def may_change_altitude(now: Situation, grant: CompiledGrant, altitude_m: float)
 
     on_the_way = broken(column, now.height_margin_m)
     return not on_the_way or on_the_way <= broken(present, 0.0) < broken(present, now.height_margin_m)
+
+
+def _limits_forbid(column: AirVolume, now: Situation, grant: CompiledGrant) -> bool:
+    """Return True if a vertical motion breaks the altitude limit of a zone that the drone does not break at present."""
+    flat = grant.flat_terrain
+    zones = limiting_zones(grant.altitude_limits, grant, now, column, now.height_margin_m)
+    return any(
+        limit_forbids_altitudes(zone, column.lower_m, column.upper_m, now, flat)
+        and not (
+            limit_forbids_altitudes(zone, now.altitude_m, now.altitude_m, now, flat)
+            and band_may_overlap(zone.band, *altitude_range_to_stop_m(now), now.home, flat)
+        )
+        for zone in zones
+    )
 
 
 def descent_enters_fence(now: Situation, grant: CompiledGrant) -> bool:

@@ -6,7 +6,8 @@ reports drones in forbidden places. It also reports a corrected target if the en
 it lies inside a margin. Vehicles differ in acceleration and return altitude, and ground stations change both parameters
 in flight. After the requests, some drones return under the system like in the mobility service, and some under their
 autopilot (tests/component/return_flights.py). The motion monitor checks some of the flights and must not stop them. The position
-of some drones fails on a leg: GPS wrong, second GPS wrong, or a jump of the estimate (tests/component/position_fault_flights.py).
+of some drones fails on a leg: GPS, second GPS or barometer wrong, a jump of the estimate, or a drift of GPS or barometer, which
+no sign shows (tests/component/position_fault_flights.py).
 
 A case is one request of one drone under one set of policies. Each drone makes three requests, two of them in flight. In
 addition, vehicles with missing, absent and unusual parameters are armed (tests/component/parameter_faults.py).

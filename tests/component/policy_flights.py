@@ -580,8 +580,7 @@ def trespasses(
     inside = walls.around(points)
     up = heights[:, None]
     within = (bands[..., 0] <= up) & (up <= bands[..., 1])
-    slack = HEIGHT_ERROR_M + TRACKING_M + JUST_M
-    allowed = (limits[..., 0] - slack <= up) & (up <= limits[..., 1] + slack)
+    allowed = (limits[..., 0] - LIMIT_SLACK_M <= up) & (up <= limits[..., 1] + LIMIT_SLACK_M)
     broken = inside & within & ((kinds == EXCLUSION) | (~allowed & (kinds == LIMIT)))
     inclusion = kinds == INCLUSION
     outside = inclusion.any(axis=1) & ~(inside & within & inclusion).any(axis=1)
@@ -590,6 +589,9 @@ def trespasses(
 
 JUST_M = 0.3
 """Permitted violation of an altitude limit in addition to the declared errors, for overshoot of the controller."""
+
+LIMIT_SLACK_M = HEIGHT_ERROR_M + TRACKING_M + JUST_M
+"""Permitted violation of an altitude limit."""
 
 
 def _root(error: Floats, gain: Floats, limit: Floats) -> Floats:
@@ -875,12 +877,12 @@ def strays(verdict: Verdict, now: Situation, place: Scene) -> bool:
     if not beside.any():
         return False
     arrived: Flags = np.logical_or.reduce(inside & (floors <= low) & (high <= ceilings), axis=1)
-    away = np.where(inside, 0.0, _distances(points, place.rings))[:, beside].min(axis=1)
+    away = np.where(inside, 0.0, distances(points, place.rings))[:, beside].min(axis=1)
     until = int(np.argmax(arrived)) if arrived.any() else len(points)
     return bool((away[1:until] > np.minimum.accumulate(away)[: until - 1] + 0.05).any()) if until > 1 else False
 
 
-def _distances(points: Floats, rings: Floats) -> Floats:
+def distances(points: Floats, rings: Floats) -> Floats:
     """Return the distance of each point to the edges of each ring, shape (points, rings)."""
     edges = np.roll(rings, -1, axis=1) - rings
     off = points[:, None, None] - rings

@@ -1,6 +1,7 @@
 """Faults of the position during permitted legs, in the oracle of the policy engine.
 
-The service does not judge such a fault but stops the drone. The oracle simulates the time until the stop, and checks the true path.
+The service stops the drone after a fault with a sign. The oracle simulates the time until the stop, and checks the true path.
+A drift has no sign. The drone follows it, and may enter a zone by as much as the position is wrong.
 """
 
 from __future__ import annotations
@@ -9,10 +10,32 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from policy_flights import SLOWEST_STOP_S, STANDING_MPS, STEP_S, Flags, Fleet, Floats, Tally, excused
+from policy_flights import (
+    INCLUSION,
+    LIMIT,
+    LIMIT_SLACK_M,
+    SLOWEST_STOP_S,
+    STANDING_MPS,
+    STEP_S,
+    Flags,
+    Fleet,
+    Floats,
+    Tally,
+    distances,
+    excused,
+)
 
 DISAGREEMENT_S = 1.2
 """Longest time until two fixes of a wrong GPS have disagreed with the estimate (2 Hz)."""
+
+VARIANCE_S = 1.0
+"""Longest time until EKF_STATUS_REPORT reports the variance of a wrong barometer."""
+
+DRIFT_MPS = 0.5
+"""Speed at which a position drifts: no sign shows it."""
+
+DRIFT_S = 40.0
+"""Duration of a drift. Most legs end before, and the drone then hovers at a position that drifts."""
 
 SAMPLE_S = 0.1
 """Longest time until the position after a jump is received and judged (20 Hz)."""
@@ -26,10 +49,24 @@ SWERVE_M = 5.0
 SWERVE_MPS = 20.0
 """Documented distance by which a drone may leave its course after a jump: without delay, and in addition per second of round trip."""
 
+SLOW_TURN_S = 0.7
+SLOW_TURN_MPS = 10.0
+"""Documented increase of this distance for a drone that needs longer than `SLOW_TURN_S` to undo its acceleration.
 
-def swerve_m(round_trip_s: Floats) -> Floats:
-    """Return how far a drone may leave its course between a jump of its estimate and the end of its stop, in metres."""
-    return SWERVE_M + SWERVE_MPS * np.maximum(round_trip_s, 0.0)
+Its speed changes for this time in the direction in which the jump led it, although it already brakes. ArduCopter needs
+WPNAV_ACCEL / PSC_JERK_XY: 0.5 s with its default parameters.
+"""
+
+
+def swerve_m(round_trip_s: Floats, turn_s: Floats) -> Floats:
+    """Return how far a drone may leave its course between a jump of its estimate and the end of its stop, in metres.
+
+    Args:
+        round_trip_s: Delay of the link.
+        turn_s: Time in which the drone undoes its acceleration.
+    """
+    slow_m = SLOW_TURN_MPS * np.maximum(turn_s - SLOW_TURN_S, 0.0)
+    return SWERVE_M + SWERVE_MPS * np.maximum(round_trip_s, 0.0) + slow_m
 
 
 @dataclass(frozen=True)
@@ -47,8 +84,9 @@ class PositionFaultFlights:
     def fly(self, fleet: Fleet, exempt: Flags, tally: Tally) -> None:
         """Let the position of some drones on a leg fail, and report violations. The fleet is not changed.
 
-        While a GPS (also a second one) is wrong, the estimate stays correct until the drone has stopped. A drone whose estimate
-        jumps turns towards a wrong point until it stops. It may leave its course by the distance that the documentation states.
+        While a GPS (also a second one) or the barometer is wrong, the estimate stays correct until the drone has stopped. A drone
+        whose estimate jumps turns towards a wrong point until it stops. It may leave its course by the distance that the
+        documentation states. A drone whose GPS or barometer drifts continues.
         """
         rows = np.arange(self.seed % self.every, len(fleet.scenes), self.every)
         expected = {i for _, i, _ in fleet.mail}
@@ -72,12 +110,22 @@ class PositionFaultFlights:
         jumped.goal[:, :2] -= jump
         paths = [_fly(each, jump_s, allowed, rows, tally, "") for each in (course, jumped)]
         away = np.linalg.norm(paths[0] - paths[1], axis=2).max(axis=0)
-        bound = swerve_m(straight.latency - REACTION_S)
+        bound = swerve_m(straight.latency - REACTION_S, straight.accels / straight.jerks)
         for i in np.flatnonzero(away > bound):
             tally.wrong.append(
                 f"seed {self.seed}, drone {rows[i]} left its course by {away[i]:.1f} m after a jump, more than {bound[i]:.1f} m"
             )
-        tally.position_faults += 2 * len(rows)
+        barometer_s = straight.latency + rng.uniform(0, VARIANCE_S, len(rows))
+        _fly(fleet.part(rows), barometer_s, allowed, rows, tally, f"seed {self.seed}, barometer wrong")
+        sideways = jump / size[:, None] * rng.uniform(0, DRIFT_MPS, (len(rows), 1))
+        upwards = rng.uniform(-DRIFT_MPS, DRIFT_MPS, len(rows))
+        still = np.zeros(len(rows))
+        for fault, rate in (
+            ("GPS drifts", np.column_stack((sideways, still))),
+            ("barometer drifts", np.column_stack((still, still, upwards))),
+        ):
+            _drift(fleet.part(rows), rate, allowed, rows, tally, f"seed {self.seed}, {fault}")
+        tally.position_faults += 5 * len(rows)
 
 
 def _fly(
@@ -116,3 +164,57 @@ def _fly(
             ]
             reported |= broken
     return np.array(path)
+
+
+def _drift(
+    fleet: Fleet,
+    rate_mps: Floats,
+    allowed: Flags,
+    rows: np.ndarray[tuple[int], np.dtype[np.int64]],
+    tally: Tally,
+    fault: str,
+) -> None:
+    """Fly on with an estimate that drifts. Report each drone that is deeper in a forbidden place than its estimate is wrong.
+
+    Args:
+        fleet: Drones with the fault.
+        rate_mps: Speed of the drift of each drone, either horizontal or vertical, shape (drones, 3).
+        allowed, rows, tally, fault: See `_fly`.
+    """
+    correct = fleet.error.copy()
+    inside_m = heights_inside if rate_mps[:, 2].any() else depths
+    reported = np.zeros(len(rows), dtype=bool)
+    for _ in range(int(DRIFT_S / STEP_S)):
+        fleet.step()
+        fleet.error = fleet.error + rate_mps * STEP_S
+        broken = fleet.trespassing() & ~allowed
+        if broken.any():
+            wrong_m = np.linalg.norm(fleet.error - correct, axis=1)
+            deep = (broken & (inside_m(fleet) > wrong_m[:, None])).any(axis=1) & ~reported
+            tally.wrong += [
+                f"{fault}, drone {rows[i]}: breach at {fleet.true[i].round(1)}, the position is wrong by {wrong_m[i]:.1f} m"
+                for i in np.flatnonzero(deep)
+            ]
+            reported |= deep
+
+
+def depths(fleet: Fleet) -> Floats:
+    """Return the horizontal distance that leads each drone out of each zone; in the last column, into an inclusion zone."""
+    rings = np.stack([place.rings for place in fleet.scenes])
+    edges = np.array([distances(point[None, :2], ring)[0] for point, ring in zip(fleet.true, rings, strict=True)])
+    up = fleet.true[:, 2:]
+    permits = (fleet.kinds == INCLUSION) & (fleet.bands[..., 0] <= up) & (up <= fleet.bands[..., 1])
+    return np.column_stack((edges, np.where(permits, edges, np.inf).min(axis=1)))
+
+
+def heights_inside(fleet: Fleet) -> Floats:
+    """Return the climb or descent that leads each drone out of each violated zone; in the last column, into an inclusion zone."""
+    up = fleet.true[:, 2:]
+    floors = fleet.bands[..., 0]
+    ceilings = fleet.bands[..., 1]
+    leave = np.minimum(up - floors, ceilings - up)
+    comply = np.maximum(fleet.limits[..., 0] - LIMIT_SLACK_M - up, up - fleet.limits[..., 1] - LIMIT_SLACK_M)
+    leave = np.where(fleet.kinds == LIMIT, np.minimum(leave, comply), leave)
+    permits = (fleet.kinds == INCLUSION) & fleet.walls.around(fleet.true[:, :2])
+    enter = np.where(permits, np.maximum(np.maximum(floors - up, up - ceilings), 0.0), np.inf)
+    return np.column_stack((leave, enter.min(axis=1)))

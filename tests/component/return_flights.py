@@ -163,11 +163,9 @@ class _ReturningDrones:
             elif i in expected:
                 continue
             elif leg is not None:
-                east = (leg.lon - HOME.lon) * EAST_M
-                north = (leg.lat - HOME.lat) * NORTH_M
-                x, y, z = fleet.estimated[i]
+                z = fleet.estimated[i, 2]
                 if (
-                    math.hypot(x - east, y - north) <= self._reached[i]
+                    self._distance_m(i, leg) <= self._reached[i]
                     and abs(z - (leg.alt or z)) <= SETTINGS.height_reached_m
                 ):
                     self._legs[i] = None
@@ -177,6 +175,10 @@ class _ReturningDrones:
                         fleet.send(i, BRAKE)
             elif speeds[i] < AT_REST_MPS:
                 self._begin_leg(i)
+
+    def _distance_m(self, i: int, leg: GotoArgs) -> float:
+        x, y, _ = self.fleet.estimated[i]
+        return math.hypot(x - (leg.lon - HOME.lon) * EAST_M, y - (leg.lat - HOME.lat) * NORTH_M)
 
     def _begin_leg(self, i: int) -> None:
         try:
@@ -190,7 +192,7 @@ class _ReturningDrones:
             return
         self._legs[i] = leg.args
         self._last[i] = leg.last
-        self._reached[i] = leg.reached_m
+        self._reached[i] = leg.acceptance_m(self._distance_m(i, leg.args))
         self._begun[i] = True
         self._tops[i] = leg.args.speed_mps
         self.fleet.send(i, Verdict("allow", leg.args))

@@ -26,6 +26,7 @@ from parameter_faults import parameter_faults
 from policy_flights import (
     CORNERS,
     EAST_M,
+    EXCLUSION,
     INCLUSION,
     LIMIT,
     NORTH_M,
@@ -39,7 +40,7 @@ from policy_flights import (
     strays,
 )
 from policy_world import HOME, Corners, altitude, ask, at, compiled, exclusion, goto, inclusion, ring, target
-from position_fault_flights import PositionFaultFlights
+from position_fault_flights import PositionFaultFlights, depths, heights_inside
 from return_flights import ReturnFlights
 
 STEP_S = 0.05
@@ -394,6 +395,29 @@ def test_position_fault_on_permitted_leg_breaches_no_fence() -> None:
     tally = flights(3, 64, requests=2, faults=PositionFaultFlights(3, 1))
     assert tally.position_faults > 10
     assert tally.wrong == []
+
+
+def test_oracle_detects_drone_that_enters_zone_deeper_than_its_position_drifted(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(Fleet, "true", property(lambda fleet: fleet.estimated + 4 * fleet.error))
+    wrong = flights(12, 128, requests=2, faults=PositionFaultFlights(12, 1)).wrong
+    assert any("GPS drifts" in text for text in wrong)
+    assert any("barometer drifts" in text for text in wrong)
+
+
+def test_oracle_finds_distance_that_leads_out_of_forbidden_place() -> None:
+    bands = np.tile([-np.inf, np.inf], (ZONES, 1))
+    bands[0] = 10.0, 30.0
+    scene = two_zones(EXCLUSION, bands, bands.copy())
+    fleet = Fleet(np.random.default_rng(1), [scene, two_zones(INCLUSION, bands, bands.copy())])
+    fleet.place[:] = (15, 0, 27), (25, 0, 27)
+    fleet.gust[:] = fleet.error[:] = fleet.settled[:] = 0.0
+    fleet._estimated = None
+    assert depths(fleet)[0, 0] == pytest.approx(5.0)
+    assert heights_inside(fleet)[0, 0] == pytest.approx(3.0)
+    assert depths(fleet)[1, -1] == pytest.approx(5.0)
+    assert heights_inside(fleet)[1, -1] == np.inf
 
 
 def test_oracle_detects_drone_that_does_not_stop_after_jump_of_position(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -117,6 +117,15 @@ class NextLeg:
     reached_m: float = SETTINGS.reached_m
     settles: bool = False
 
+    def acceptance_m(self, length_m: float) -> float:
+        """Return the distance to the target within which a leg of this length is complete.
+
+        The distance is smaller than `reached_m` for a short leg, for example out of a zone's margin, so that the drone flies it.
+        """
+        if self.last or not SETTINGS.at_waypoint_m < length_m < 2 * self.reached_m:
+            return self.reached_m
+        return min(self.reached_m, max(length_m / 3, SETTINGS.at_waypoint_m))
+
 
 async def first_leg(
     goal: tuple[float, float], heights_m: Iterable[float], now: Situation, flight: SystemFlight
@@ -243,10 +252,7 @@ class RouteFollower:
             leg = await search()
             if leg is None:
                 return
-            distance_m = autopilot.vehicle.distance_m(leg.args.lat, leg.args.lon)
-            # Reduce the acceptance radius of a short leg, for example out of a zone's margin, so that the drone flies it.
-            short = SETTINGS.at_waypoint_m < distance_m < 2 * leg.reached_m and not leg.last
-            reached_m = min(leg.reached_m, max(distance_m / 3, SETTINGS.at_waypoint_m)) if short else leg.reached_m
+            reached_m = leg.acceptance_m(autopilot.vehicle.distance_m(leg.args.lat, leg.args.lon))
             flying = fly_to(autopilot, motion, leg.args, reached_m, permit, settles=leg.settles)
             async with aclosing(flying) as steps:
                 async for step in steps:

@@ -70,16 +70,15 @@ class Flight:
 
         async def store() -> None:
             file = ExpectedPositionFile(directory / EXPECTED_POSITION_FILE)
-            file.keep(self.vehicle.position_checks.expected)
+            if not self.vehicle.position_checks.blind:
+                file.keep(self.vehicle.position_checks.expected)
             if file._storing is not None:
                 await file._storing
 
         asyncio.run(store())
         armed = self.vehicle.armed
         self.vehicle = Vehicle(stack=ARDUCOPTER, armed=armed, landed_state=2, landed_at=self.now)
-        stored = ExpectedPositionFile(directory / EXPECTED_POSITION_FILE).stored
-        if stored is not None:
-            self.vehicle.position_checks.restore(stored)
+        ExpectedPositionFile(directory / EXPECTED_POSITION_FILE).apply_to(self.vehicle.position_checks)
 
     def send(self, duration_s: float, *, lost: bool = False) -> None:
         """Fly on for a duration. If the messages are lost, none of them arrives."""
@@ -253,14 +252,71 @@ def test_restart_of_vehicle_after_restart_of_service_makes_position_known(tmp_pa
     assert flight.known
 
 
-@pytest.mark.parametrize("content", ["", "[]", "{}", '{"position": {"boot_s": NaN}}', '{"position": {"lat": "here"}}'])
-def test_unreadable_expected_position_is_reported(
-    tmp_path: Path, content: str, caplog: pytest.LogCaptureFixture
+def make_unreadable(path: Path, content: str) -> None:
+    if content == "directory":
+        path.mkdir()
+    else:
+        path.write_text(content)
+
+
+@pytest.mark.parametrize(
+    "content", ["", "[]", "{}", '{"position": {"boot_s": NaN}}', '{"position": {"lat": "here"}}', "directory"]
+)
+@pytest.mark.parametrize("armed", [True, False])
+def test_position_stays_unknown_after_unreadable_record_until_vehicle_restarts(
+    tmp_path: Path, content: str, armed: bool, caplog: pytest.LogCaptureFixture
 ) -> None:
     path = tmp_path / EXPECTED_POSITION_FILE
-    path.write_text(content)
-    assert ExpectedPositionFile(path).stored is None
-    assert "cannot read the expected position" in caplog.text
+    make_unreadable(path, content)
+    flight = Flight(armed=armed)
+    ExpectedPositionFile(path).apply_to(flight.vehicle.position_checks)
+    assert "no position is trusted until the autopilot restarts" in caplog.text
+    flight.send(1.0)
+    flight.flags = GLITCHING
+    flight.send(2.0)
+    flight.flags = READY
+    flight.send(60.0)
+    assert not flight.known
+    assert str(path) in flight.vehicle.position_problem
+    assert path.exists()
+    flight.vehicle.armed = False
+    flight.boot_s = -flight.now
+    flight.send(QUIET_S + 0.5)
+    assert flight.known
+
+
+def test_unreadable_record_is_removed_after_restart_of_vehicle(tmp_path: Path) -> None:
+    path = tmp_path / EXPECTED_POSITION_FILE
+    path.write_text("{")
+    flight = Flight(armed=False)
+    flight.restart_service(tmp_path)
+    assert not flight.vehicle.position_checks.blind
+    path.write_text("{")
+    ExpectedPositionFile(path).apply_to(flight.vehicle.position_checks)
+    flight.send(1.0)
+    flight.boot_s = -flight.now
+    flight.send(QUIET_S + 0.5)
+    flight.restart_service(tmp_path)
+    assert not path.exists()
+
+
+@pytest.mark.parametrize(("silent_s", "known"), [(30.0, False), (200.0, True)])
+def test_restart_of_vehicle_during_interruption_is_noticed_although_its_clock_reads_more(
+    silent_s: float, known: bool
+) -> None:
+    flight = Flight()
+    flight.boot_s = 10.0
+    flight.send(0.1)
+    flight.north_m += 33.0
+    flight.send(1.0)
+    flight.vehicle.armed = False
+    flight.send(1.0)
+    boot_s = flight.boot_s + flight.now
+    flight.send(silent_s, lost=True)
+    if known:
+        flight.boot_s = boot_s + 20.0 - flight.now
+    flight.send(QUIET_S + 1.5)
+    assert flight.known is known
 
 
 def test_expected_position_is_stored_once_while_vehicle_hovers(tmp_path: Path) -> None:
@@ -533,8 +589,26 @@ def test_position_is_unknown_while_second_gps_disagrees_with_estimate() -> None:
     assert "GPS2_RAW and GLOBAL_POSITION_INT are 12 m apart" in flight.vehicle.position_problem
     flight.send(30.0)
     assert not flight.known, "the disagreement remains although the second receiver is silent"
+    for _ in range(6):
+        flight.gps("GPS2_RAW")
+        flight.send(1.0)
+    assert flight.known
+
+
+def test_position_is_unknown_if_second_gps_is_silent_until_vehicle_restarts_without_it() -> None:
+    flight = Flight()
     flight.gps("GPS2_RAW")
-    flight.send(QUIET_S + 0.2)
+    flight.send(9.0)
+    assert flight.known
+    flight.send(3.0)
+    assert not flight.known
+    flight.gps("GPS2_RAW")
+    flight.send(1.0)
+    assert flight.known
+    flight.send(12.0)
+    assert not flight.known
+    flight.boot_s = -flight.now
+    flight.send(1.0)
     assert flight.known
 
 

@@ -12,7 +12,7 @@ from typing import Any
 
 from fractus_runtime.files import read_json, remove_file, write_file
 
-from fractus_services.mobility.mavlink.position_checks import ExpectedPosition, ReportedPosition
+from fractus_services.mobility.mavlink.position_checks import ExpectedPosition, PositionChecks, ReportedPosition
 
 log = logging.getLogger(__name__)
 
@@ -30,18 +30,37 @@ class ExpectedPositionFile:
         path: Path of the file.
 
     Attributes:
-        stored: Position in the file; None if there is no file.
+        stored: Position in the file; None if there is no file, or if it cannot be read.
+        problem: Why the file cannot be read; empty if it can. The position is then not trusted, because the file shows that it was
+            not trusted before.
     """
 
     def __init__(self, path: Path) -> None:
         self._path = path
         self._storing: asyncio.Future[None] | None = None
         self._failed = False
-        self.stored = _read(path)
+        self.stored: ExpectedPosition | None = None
+        self.problem = ""
+        try:
+            self.stored = _read(path)
+        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+            self.problem = f"the position expected by an earlier process cannot be read ({path})"
+            log.critical(
+                "position: cannot read the expected position; no position is trusted until the autopilot restarts where it has"
+                " a clear view of the sky (path=%s error=%s)",
+                path, error,
+            )  # fmt: skip
+
+    def apply_to(self, checks: PositionChecks) -> None:
+        """Let the checks of this process continue from the file."""
+        if self.problem:
+            checks.distrust(self.problem)
+        elif self.stored is not None:
+            checks.restore(self.stored)
 
     def keep(self, expected: ExpectedPosition | None) -> None:
         """Store a position in the background, or remove the file. If a write is in progress or fails, the next call tries again."""
-        if (self._storing is None or self._storing.done()) and _differs(self.stored, expected):
+        if (self._storing is None or self._storing.done()) and (self.problem or _differs(self.stored, expected)):
             self._storing = asyncio.ensure_future(self._store(expected))
 
     async def _store(self, expected: ExpectedPosition | None) -> None:
@@ -57,6 +76,7 @@ class ExpectedPositionFile:
         else:
             self._failed = False
             self.stored = expected
+            self.problem = ""
 
 
 def _differs(stored: ExpectedPosition | None, expected: ExpectedPosition | None) -> bool:
@@ -70,15 +90,12 @@ def _differs(stored: ExpectedPosition | None, expected: ExpectedPosition | None)
 def _read(path: Path) -> ExpectedPosition | None:
     try:
         content = read_json(path)
-        position = ReportedPosition(**{name: _finite(value) for name, value in content["position"].items()})
-        return ExpectedPosition(
-            position, _finite(content["unseen_m"]), moves=bool(content["moves"]), reason=str(content["reason"])
-        )
     except FileNotFoundError:
         return None
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        log.critical("position: cannot read the expected position (path=%s error=%s)", path, error)
-        return None
+    position = ReportedPosition(**{name: _finite(value) for name, value in content["position"].items()})
+    return ExpectedPosition(
+        position, _finite(content["unseen_m"]), moves=bool(content["moves"]), reason=str(content["reason"])
+    )
 
 
 def _finite(value: Any) -> float:

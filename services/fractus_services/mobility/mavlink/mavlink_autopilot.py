@@ -282,8 +282,8 @@ class MavlinkAutopilot(AutopilotLink):
         )
         self.starting = asyncio.Lock()
         self._expected_position = expected_position
-        if expected_position is not None and expected_position.stored is not None:
-            self.vehicle.position_checks.restore(expected_position.stored)
+        if expected_position is not None:
+            expected_position.apply_to(self.vehicle.position_checks)
         self.vehicle_parameters = Parameters(self, on_parameter)
         self._locks: dict[int, asyncio.Lock] = {}
         self._acknowledgements = Acknowledgements(sysid, self.timing)
@@ -345,8 +345,9 @@ class MavlinkAutopilot(AutopilotLink):
             self.vehicle_parameters.request(self.stack.gimbal_type)
         super().take(incoming)
         self._home_monitor.take(incoming.name)
-        if self._expected_position is not None and incoming.name == "GLOBAL_POSITION_INT":
-            self._expected_position.keep(self.vehicle.position_checks.expected)
+        checks = self.vehicle.position_checks
+        if self._expected_position is not None and incoming.name == "GLOBAL_POSITION_INT" and not checks.blind:
+            self._expected_position.keep(checks.expected)
 
     async def command(
         self,

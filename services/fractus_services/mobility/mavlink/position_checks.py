@@ -70,6 +70,12 @@ It bounds the distance that the velocities before and after a longer interruptio
 position is not trusted, so a larger mean acceleration is not expected.
 """
 
+LOST_CLOCK_S = 10.0
+"""Seconds by which the vehicle's clock must be behind, compared with the last position, to show that the vehicle has restarted.
+
+Less may be a delayed message, or a simulator that stalled.
+"""
+
 PATH_S = 1.0
 """Seconds of the vehicle's clock for which positions are kept. The position of the GPS is older than the estimate."""
 
@@ -165,11 +171,13 @@ class PositionChecks:
     Attributes:
         variance_limit: FS_EKF_THRESH of the vehicle: a variance of this size or larger is a sign.
         pace: Seconds of the vehicle's clock per second of real time.
+        blind: True while nothing is known of the expected position, because the record of an earlier process cannot be read.
     """
 
     def __init__(self) -> None:
         self.variance_limit = DEFAULT_VARIANCE_LIMIT
         self.pace = 1.0
+        self.blind = False
         self._path: deque[ReportedPosition] = deque()
         self._path_at = -math.inf
         self._estimator_problem = ""
@@ -216,6 +224,11 @@ class PositionChecks:
         self._moved = expected.moves
         self._displacement = expected.reason
 
+    def distrust(self, reason: str) -> None:
+        """Trust no position until the vehicle has restarted, because the record of the expected position cannot be read."""
+        self.blind = True
+        self._displacement = reason
+
     def set_variance_limit(self, limit: float) -> None:
         """Use the vehicle's FS_EKF_THRESH. Values that switch the failsafe off, or on late, do not apply."""
         self.variance_limit = limit if 0.0 < limit <= 1.0 else DEFAULT_VARIANCE_LIMIT
@@ -247,8 +260,8 @@ class PositionChecks:
         """Process a status text that reports another estimator in use. Its position may differ from that of the former one."""
         self._see("the autopilot has switched to another estimator (EKF lane)", now)
 
-    def take_position(self, reported: ReportedPosition, error_m: float, now: float, *, moves: bool) -> None:
-        """Compare a position with the previous one.
+    def take_position(self, reported: ReportedPosition, error_m: float, now: float, *, moves: bool) -> bool:
+        """Compare a position with the previous one. Return True if the vehicle has restarted between the two.
 
         Args:
             reported: The position.
@@ -257,25 +270,43 @@ class PositionChecks:
             moves: True if the motors run. On the ground, the estimator corrects its position and altitude by resets.
         """
         error_m = min(error_m, MAX_TOLERATED_ERROR_M)
+        restarted = False
         if self._path:
             last = self._path[-1]
             elapsed_s = reported.boot_s - last.boot_s
             if elapsed_s == 0.0:
-                return  # The same position again.
-            if elapsed_s < 0.0:
-                # The vehicle has restarted. Overtaken positions are dropped before.
+                return False  # The same position again.
+            restarted = self._has_restarted(reported, elapsed_s, now, moves=moves)
+            if restarted:
                 self._path.clear()
+                self._receivers.clear()
                 self._trusted = None
                 self._displacement = ""
+                self.blind = False
             else:
                 if moves:
                     self._look_for_jump(last, reported, elapsed_s, error_m, now)
-                self._follow(last, reported, elapsed_s, error_m, now, moves=moves)
+                if not self.blind:
+                    self._follow(last, reported, elapsed_s, error_m, now, moves=moves)
         self._moved = moves
         self._path.append(reported)
         while self._path[0].boot_s < reported.boot_s - PATH_S:
             self._path.popleft()
         self._path_at = now
+        return restarted
+
+    def _has_restarted(self, reported: ReportedPosition, elapsed_s: float, now: float, *, moves: bool) -> bool:
+        """Return True if the vehicle has restarted since the last position. Overtaken positions are dropped before.
+
+        After a long interruption, the clock of a restarted vehicle may read more than before. It is then behind, and reads at
+        most the duration of the interruption. A restarted vehicle has stopped its motors.
+        """
+        if elapsed_s < 0.0:
+            return True
+        silent_s = (now - self._path_at) * self.pace
+        if moves or not math.isfinite(silent_s):
+            return False
+        return elapsed_s < silent_s - LOST_CLOCK_S and reported.boot_s < silent_s
 
     def _follow(
         self,

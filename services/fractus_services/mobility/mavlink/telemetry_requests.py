@@ -130,8 +130,10 @@ class TelemetryRates:
         never_received: set[str] = set()
         if self._received_before and self._never_received_requests < MAX_NEVER_RECEIVED:
             never_received = self._accepted - self._received_before
+        # The position is unknown without the message of a second receiver that sent one before.
+        optional = _OPTIONAL - (self._received_before & {"GPS2_RAW"})
         expected = {
-            name: RATES_HZ[name][flying] * counted_s for name in (self._received_before | never_received) - _OPTIONAL
+            name: RATES_HZ[name][flying] * counted_s for name in (self._received_before | never_received) - optional
         }
         missing = [
             name for name, count in expected.items() if count >= CHECK_PERIOD_S and counted[name] < MIN_SHARE * count

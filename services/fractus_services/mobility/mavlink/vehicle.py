@@ -87,6 +87,7 @@ class Vehicle(VehicleState):
         gimbal_limits: Smallest and largest pitch and yaw of the gimbal, degrees; None until they are reported.
         position_checks: Signs of a wrong position.
         second_error_m: Position error of the second GPS receiver; 0 without one or if it has no fix.
+        second_gps_at: Time of the last message of a second receiver with a fix; infinite without one or if it has no fix.
         reported_at: Time of the last position message, trusted or not.
         resumed_at: Time of the first position message after an interruption.
     """
@@ -102,6 +103,7 @@ class Vehicle(VehicleState):
     stopping_at: float = math.inf
     position_checks: PositionChecks = field(default_factory=PositionChecks)
     second_error_m: float = 0.0
+    second_gps_at: float = math.inf
     reported_at: float = -math.inf
     resumed_at: float = -math.inf
 
@@ -193,12 +195,15 @@ def _position(vehicle: Vehicle, message: Message, now: float) -> None:
     if now - vehicle.reported_at > MAX_POSITION_AGE_S:
         vehicle.resumed_at = now
     vehicle.reported_at = now
-    vehicle.position_checks.take_position(reported, vehicle.position_error_m, now, moves=vehicle.armed)
+    if vehicle.position_checks.take_position(reported, vehicle.position_error_m, now, moves=vehicle.armed):
+        log.info("position: the autopilot has restarted")
+        vehicle.second_error_m = 0.0
+        vehicle.second_gps_at = math.inf
     plausible = _check_position(vehicle, now)
     expected = vehicle.position_checks.expected
     vehicle.expected_place = (expected.position.lat, expected.position.lon) if expected is not None else None
     vehicle.expected_error_m = expected.unseen_m if expected is not None else 0.0
-    located = vehicle.located and now - vehicle.gps_at <= STATUS_MAX_AGE_S / vehicle.pace
+    located = vehicle.located and now - min(vehicle.gps_at, vehicle.second_gps_at) <= STATUS_MAX_AGE_S / vehicle.pace
     if not plausible or not located or not vehicle.estimator_positioned(now):
         return
     if vehicle.position_problem:
@@ -328,8 +333,10 @@ def _second_gps(vehicle: Vehicle, message: Message, now: float) -> None:
     """Process GPS2_RAW, which a vehicle with two receivers sends. Its position must agree with the estimate as well."""
     if message.integer("fix_type") < mavlink.GPS_FIX_TYPE_3D_FIX:
         vehicle.second_error_m = 0.0
+        vehicle.second_gps_at = math.inf
         vehicle.position_checks.forget_gps(message.name, now)
         return
+    vehicle.second_gps_at = now
     vehicle.second_error_m = _gps_error_m(message)
     _compare_gps(vehicle, message, now)
 

@@ -120,3 +120,23 @@ def test_invalid_experiment_is_rejected_with_the_field_name(case: str) -> None:
 def test_missing_experiment_file_is_rejected_with_its_name(tmp_path: Path) -> None:
     with pytest.raises(InvalidObject, match="cannot read"):
         load(tmp_path / "none.yaml")
+
+
+@pytest.mark.parametrize(
+    ("mode", "vehicle", "problem"),
+    [
+        ("vehicles", {"home": {"lat": 1, "lon": 2}}, "cannot be set for a running autopilot in mode vehicles"),
+        ("standalone", {}, "is required in mode standalone"),
+        ("cluster", {}, "is not supported in mode cluster"),
+    ],
+)
+def test_running_autopilot_needs_a_home_only_for_the_services(
+    mode: str, vehicle: dict[str, object], problem: str
+) -> None:
+    parts = {"cluster": {"cluster": {"file": "c.yaml", "apply": ["a.yaml"]}}, "standalone": {"manifests": ["a.yaml"]}}
+    vehicles = [{"name": "d", "connection": "tcp:127.0.0.1:5760", **vehicle}]
+    with pytest.raises(InvalidObject, match=problem):
+        parse({"name": "x", "mode": mode, "vehicles": vehicles, **parts.get(mode, {})})
+    home = {"home": {"lat": 1, "lon": 2}} if mode == "standalone" else {}
+    if mode != "cluster":
+        parse({"name": "x", "mode": mode, "vehicles": [{**vehicles[0], "home": None, **home}], **parts.get(mode, {})})

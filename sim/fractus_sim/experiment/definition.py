@@ -64,7 +64,8 @@ class VehicleEntry(Model):
     connection: str | None = Field(
         default=None,
         pattern=r"^tcp:[^:\s]+:\d{1,5}$",
-        description="tcp:HOST:PORT of a running autopilot, such as ArduPilot SITL (mode vehicles).",
+        description="tcp:HOST:PORT of a running autopilot, such as ArduPilot SITL (modes vehicles and standalone). The autopilot"
+        " must accept several connections.",
     )
     camera: bool = Field(default=False, description="Add a camera and the camera service (mode standalone).")
     task: tuple[Step, ...] = Field(
@@ -73,10 +74,8 @@ class VehicleEntry(Model):
 
     @model_validator(mode="after")
     def _check_running_autopilot(self) -> Self:
-        if self.connection is not None and (self.count > 1 or self.home is not None or self.parameters):
-            raise InvalidObject(
-                "connection", "count, home and parameters cannot be set for a running autopilot; remove them"
-            )
+        if self.connection is not None and (self.count > 1 or self.parameters):
+            raise InvalidObject("connection", "count and parameters cannot be set for a running autopilot; remove them")
         return self
 
     def names(self) -> tuple[str, ...]:
@@ -266,12 +265,20 @@ def _check_vehicles(experiment: Experiment) -> None:
     if len(names) > MAX_VEHICLES:
         raise InvalidObject("vehicles", f"{len(names)} vehicles; the maximum is {MAX_VEHICLES}")
     for index, entry in enumerate(experiment.vehicles):
-        if entry.home is None and entry.connection is None and experiment.mode != "cluster":
+        starts_elsewhere = entry.connection is not None and experiment.mode == "vehicles"
+        if entry.home is None and not starts_elsewhere and experiment.mode != "cluster":
             raise InvalidObject(
                 f"vehicles[{index}].home", f"is required in mode {experiment.mode}: the start position of {entry.name}"
             )
-        if entry.connection is not None and experiment.mode != "vehicles":
-            raise InvalidObject(f"vehicles[{index}].connection", "is only supported in mode vehicles")
+        if entry.home is not None and starts_elsewhere:
+            raise InvalidObject(
+                f"vehicles[{index}].home", "cannot be set for a running autopilot in mode vehicles; remove it"
+            )
+        if entry.connection is not None and experiment.mode == "cluster":
+            raise InvalidObject(
+                f"vehicles[{index}].connection",
+                "is not supported in mode cluster; the cluster starts the vehicle of each drone",
+            )
         if entry.task and experiment.mode != "vehicles":
             raise InvalidObject(
                 f"vehicles[{index}].task",

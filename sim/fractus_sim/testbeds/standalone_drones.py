@@ -332,8 +332,8 @@ class RunningDrone:
         self._mobility_port = free_port()
         self._camera_port = free_port() if setup.camera is not None else None
         self._world_port = free_port() if setup.camera is not None and setup.camera.world is not None else None
-        self.station_link = f"tcp:{LOOPBACK}:{station}"
-        self.guest_link = f"tcp:{LOOPBACK}:{guest}"
+        self.station_link = setup.autopilot or f"tcp:{LOOPBACK}:{station}"
+        self.guest_link = setup.autopilot or f"tcp:{LOOPBACK}:{guest}"
         self.mobility_address = f"{LOOPBACK}:{self._mobility_port}"
         self.camera_address = f"{LOOPBACK}:{self._camera_port}" if self._camera_port else None
         self.world_url = f"http://{LOOPBACK}:{self._world_port}" if self._world_port else None

@@ -56,7 +56,7 @@ class StandaloneTestbed(Testbed):
         drone_manifests = self._manifests.of(Drone)
         for setup in self.experiment.setups():
             drone = self._drones.add_drone(self._setup(setup, drone_manifests.get(setup.name)))
-            host, port = drone.station_link.split(":")[1:]
+            host, port = drone.station_link.removeprefix("tcp:").rsplit(":", 1)
             self.observe(setup, TcpLink.connect(host, int(port), CONNECT_S))
             self.endpoints[setup.name] = drone.guest_link
             if drone.world_url is not None:
@@ -147,6 +147,7 @@ class StandaloneTestbed(Testbed):
             description=manifest.spec.to_dict(),
             camera=camera,
             vehicle_arguments=("--wind", wind_argument(self.experiment)),
+            autopilot=entry.connection,
         )
 
     def _start_program(self, program: Program, addresses: Mapping[str, str]) -> None:

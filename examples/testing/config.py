@@ -11,7 +11,7 @@ WAYPOINTS = {
     "WP1": (39.36030, 22.94500, 15.0),
     "WP2": (39.36030, 22.94575, 15.0),
     "WP3": (39.36030, 22.94650, 15.0),
-    "WP4": (39.36000, 22.94500, 15.0),
+    "WP4": (39.36000, 22.94575, 15.0),
 }
 EXTRA_WAYPOINTS = {
     "WP-E1": (39.36080, 22.94610, 15.0),
@@ -30,7 +30,7 @@ flight_plan = FlightPlan(
     region=CITY,
     restrictions=(
         stay_inside("flight-path", PERMITTED, action="adjust"),
-        no_fly("city-hall", CITY_HALL, action="revoke"),
+        no_fly("city-hall", CITY_HALL, action="abort", land_at=WAYPOINTS["WP4"][:2]),
         no_photo("square", SQUARE),
     ),
 )

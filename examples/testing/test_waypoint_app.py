@@ -67,7 +67,9 @@ def test_deviations_are_corrected_and_the_no_fly_zone_ends_the_mission(fractus: 
     results.check_violations("vDrone-1", type="no_fly", count=1)
     results.check_app_status("vDrone-1", ABORTED)
     results.check("outsideZone", zone="city-hall", margin=2)
-    results.check_landed("vDrone-1", near_home=3)
+    lat, lon, _ = config.WAYPOINTS["WP4"]
+    results.check("reached", lat=lat, lon=lon, alt=0)
+    results.check_landed("vDrone-1")
 
 
 @pytest.mark.fractus(speedup=4)

@@ -11,7 +11,7 @@ from fractus_core.api import API_VERSION
 Waypoint = tuple[float, float, float]
 """Latitude and longitude in degrees, altitude in metres above home."""
 
-Action = Literal["ignore", "adjust", "hover", "land", "returnToLaunch", "revoke"]
+Action = Literal["ignore", "adjust", "hover", "land", "returnToLaunch", "abort", "revoke"]
 Manifest = dict[str, Any]
 
 _MOBILITY_METHODS = (
@@ -59,18 +59,27 @@ class Restriction:
         ]
 
 
-def no_fly(name: str, area: Mapping[str, Any], action: Action = "ignore", priority: int = 100) -> Restriction:
+def no_fly(
+    name: str,
+    area: Mapping[str, Any],
+    action: Action = "ignore",
+    *,
+    land_at: tuple[float, float] | None = None,
+    priority: int = 100,
+) -> Restriction:
     """Forbid flights above an area.
 
     Args:
         name: Name of the policy and of its zone.
         area: Area, as `polygon` or `circle` returns it.
         action: Repair action on a violation. `ignore` refuses the request, and the flight continues.
+        land_at: Latitude and longitude where the drone lands after an `abort`. None: at home.
         priority: Precedence among equally restrictive policies.
     """
-    return Restriction(
-        name, {"type": "GeofenceControl", "kind": "exclusion", "action": action, "priority": priority}, area
-    )
+    policy: Manifest = {"type": "GeofenceControl", "kind": "exclusion", "action": action, "priority": priority}
+    if land_at is not None:
+        policy["landAt"] = {"lat": land_at[0], "lon": land_at[1]}
+    return Restriction(name, policy, area)
 
 
 def stay_inside(name: str, area: Mapping[str, Any], action: Action = "adjust") -> Restriction:

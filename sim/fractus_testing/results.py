@@ -56,7 +56,7 @@ _SHORTENED = frozenset({"LegShortened", "VelocityScaled"})
 _LEAVING_WORDS = (" outside ", " leaves ", " border of ", "none of ")
 """Words in the reasons of fences that a drone must not leave."""
 
-_ENDING_TAKEOVERS = frozenset({"revoke", "returnToLaunch", "land"})
+_ENDING_TAKEOVERS = frozenset({"revoke", "returnToLaunch", "land", "abort"})
 _PENDING_PHASES = frozenset({"", "Running", "Waiting", "Flying", "Returning", "Landed"})
 _SAME_CAUSE_S = 2.0
 """A takeover within this time after a violation of the same reason is its effect, and not another violation."""

@@ -71,6 +71,9 @@ STEP_S = 0.25
 PROGRAM_END_S = 5.0
 """Real time for which a program may continue to run after the landing of its drone, seconds."""
 
+RECORDING_S = 0.5
+"""Time for which a landed vehicle is recorded, seconds of the vehicle."""
+
 EMERGENCY_RADIUS_M = 5000.0
 _LOG_LINES = 15
 _MAX_VERDICTS = 10
@@ -84,10 +87,11 @@ class VirtualDrone:
         node: Name of the node: the name in lower case.
     """
 
-    def __init__(self, scene: Scene, name: str, setup: Resources) -> None:
+    def __init__(self, scene: Scene, name: str, setup: Resources, connection: str | None) -> None:
         self.name = name
         self.node = name.lower()
         self.resources = setup
+        self.connection = connection
         self.home: tuple[float, float, float] | None = None
         self.plan: FlightPlan | None = None
         self.manifests: tuple[Path, ...] = ()
@@ -204,6 +208,8 @@ class VirtualDrone:
 
         if not self._scene.advance_until(lambda: landed() or cannot_fly(), timeout) or not landed():
             raise AssertionError(f"{self.name} has not landed within {timeout:g} s: {self._scene.describe(self)}")
+        # The recording contains the state of the motors with the next position.
+        self._scene.advance(RECORDING_S)
         self._scene.wait_programs_end(self)
 
     def wait(self, trigger: Trigger, timeout: float = TRIGGER_TIMEOUT_S) -> None:
@@ -387,6 +393,7 @@ class Scene:
         autopilot: str = Ardupilot,
         fdm: str = Builtin,
         setup: Resources = MIN_RESOURCES,
+        connection: str | None = None,
     ) -> VirtualDrone:
         """Add a virtual drone.
 
@@ -396,6 +403,8 @@ class Scene:
             autopilot: Ardupilot: an ArduCopter-compatible simulated vehicle.
             fdm: Flight dynamics. Builtin: part of the simulated vehicle.
             setup: Resources that the application of the drone declares.
+            connection: `tcp:HOST:PORT` of a running autopilot at the start position, such as ArduPilot SITL. Its clock
+                must run `speedup` times real time. None: a simulated vehicle is started.
 
         Raises:
             ExperimentError: The name is used twice, or a mode is not supported.
@@ -404,7 +413,7 @@ class Scene:
         for value, only, field in ((mode, SITL, "mode"), (autopilot, Ardupilot, "autopilot"), (fdm, Builtin, "fdm")):
             if value != only:
                 raise ExperimentError(f"vDrone {name}: {field} {value} is not supported; use {only}")
-        drone = VirtualDrone(self, name, setup)
+        drone = VirtualDrone(self, name, setup, connection)
         if drone.node in self.nodes:
             raise ExperimentError(f"the drone name {name} is used twice; names must be unique in lower case")
         self._drones.append(drone)
@@ -618,7 +627,16 @@ class Scene:
         entry: dict[str, Any] = {
             "name": drone.node, "home": {"lat": lat, "lon": lon, "alt": alt}, "readyAfter": 1 if drone.task else 3,
         }  # fmt: skip
-        optional = {"parameters": drone.parameters, "task": drone.task, "camera": drone.world is not None}
+        if drone.connection is not None and drone.task:
+            raise ExperimentError(
+                f"{drone.name}: a running autopilot needs a program; use set_app() instead of set_task()"
+            )
+        optional = {
+            "connection": drone.connection,
+            "parameters": drone.parameters,
+            "task": drone.task,
+            "camera": drone.world is not None,
+        }
         return entry | {name: value for name, value in optional.items() if value}
 
     def _manifests(self) -> list[str]:

@@ -90,7 +90,7 @@ def test_manifests_of_a_flight_plan_can_be_planned(tmp_path: Path) -> None:
     plan = FlightPlan(
         path=PATH,
         restrictions=(
-            no_fly("hospital", circle(50.8650, 4.6785, 20), action="land"),
+            no_fly("hospital", circle(50.8650, 4.6785, 20), action="abort", land_at=(50.8640, 4.6785)),
             stay_inside("town", circle(50.8640, 4.6785, 500)),
             no_photo("school", circle(50.8640, 4.6791, 20)),
             max_altitude(40),
@@ -134,6 +134,14 @@ def test_wrong_use_is_refused_with_a_remedy(scene: Scene) -> None:
         drone.start_app()
     other.set_task(*TASK)
     with pytest.raises(ExperimentError, match="flies vehicles alone, so all drones need it; missing: vDrone-1"):
+        drone.start_app()
+
+
+def test_running_autopilot_needs_a_program(scene: Scene) -> None:
+    drone = scene.vDrone("vDrone-1", connection="tcp:127.0.0.1:1")
+    drone.set_pos(HOME)
+    drone.set_task(*TASK)
+    with pytest.raises(ExperimentError, match=r"needs a program; use set_app\(\) instead of set_task\(\)"):
         drone.start_app()
 
 

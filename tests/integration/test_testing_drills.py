@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from fractus_cluster.ports import free_port
 from fractus_testing import (
     ABORTED,
     SUCCESS,
@@ -24,6 +25,7 @@ from fractus_testing import (
     no_fly,
     until,
 )
+from vehicle_process import running_vehicle
 
 pytestmark = [pytest.mark.slow, pytest.mark.fractus(speedup=2)]
 
@@ -46,9 +48,11 @@ fractus.run(fly)
 """
 
 
-def start(scene: Scene, app: App | str, *, camera: bool = False) -> tuple[VirtualController, VirtualDrone]:
+def start(
+    scene: Scene, app: App | str, *, camera: bool = False, connection: str | None = None
+) -> tuple[VirtualController, VirtualDrone]:
     controller = scene.vController()
-    drone = scene.vDrone("vDrone-1")
+    drone = scene.vDrone("vDrone-1", connection=connection)
     drone.set_pos(HOME)
     drone.set_plan(FlightPlan(path=PATH))
     drone.set_app(app)
@@ -101,6 +105,17 @@ def test_drone_returns_if_its_program_stalls_or_crashes(fractus: Scene, attack: 
     results = fractus.results()
     results.check_landed("vDrone-1", near_home=3)
     assert results.get_app_status("vDrone-1") != SUCCESS
+
+
+def test_running_autopilot_is_flown_by_the_services(fractus: Scene, tmp_path: Path) -> None:
+    link = f"tcp:127.0.0.1:{free_port()}"
+    with running_vehicle("--speedup", "2", "--home", "50.8637,4.6785,25", links=(link,)):
+        _, drone = start(fractus, pilot(tmp_path), connection=link)
+        drone.wait_landed(240)
+        results = fractus.results()
+        results.check_app_status("vDrone-1", SUCCESS)
+        results.check_landed("vDrone-1", near_home=3)
+        fractus.close()
 
 
 def test_emergency_landing_lands_the_drone_where_it_is(fractus: Scene, tmp_path: Path) -> None:

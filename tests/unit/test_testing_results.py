@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import demo_flight
 import pytest
 from fractus_sim.report.track import Place, Sample
 from fractus_sim.runner.telemetry_recording import Flight
@@ -169,6 +171,22 @@ def test_checks_of_experiment_files_are_available() -> None:
 def test_unknown_drone_is_named_with_the_known_ones() -> None:
     with pytest.raises(ExperimentError, match="unknown drone vDrone-2; known: vdrone-1"):
         results().track("vDrone-2")
+
+
+def test_folder_of_the_demo_is_read(tmp_path: Path) -> None:
+    (tmp_path / "objects.json").write_text(json.dumps(demo_flight.content()))
+    (tmp_path / "audit").mkdir()
+    lines = [json.dumps(line) for line in demo_flight.audit()]
+    (tmp_path / "audit" / "mobility.jsonl").write_text("\n".join(lines) + "\n")
+    demo = Results.read(tmp_path)
+    (drone,) = demo.drones
+    takeoff_s = demo.track(drone).takeoff_s
+    assert takeoff_s == pytest.approx(demo_flight.TAKEOFF_S - demo_flight.APPLIED_S)
+    assert demo.requests(drone)
+    violations = demo.get_violations(drone)
+    assert {violation.type for violation in violations} >= {"no_fly"}
+    assert all(violation.time_s > 0 for violation in violations)
+    demo.check("landed", drone)
 
 
 def test_folder_without_a_run_is_refused(tmp_path: Path) -> None:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 from axe_playwright_python.sync_playwright import Axe
 from browser import CHROMIUM, SOFTWARE_GL, TIMEOUT_MS, launched, opened
+from fractus_view.base_map import open_map
 from fractus_view.events import Areas, Contact, Event, Feature, Fix, Policies, Policy, Records, State, Verdict
 from page_server import PageSource
 from PIL import Image
@@ -184,3 +186,16 @@ def test_view_of_a_cluster_shows_verdicts_and_states_why_some_may_be_missing(
         # A page that is opened later receives the same problem.
         page.reload()
         expect(page.locator("#verdicts-problem")).to_contain_text("no route to host", timeout=TIMEOUT_MS)
+
+
+def test_view_map_shows_offline_base_map_with_attribution(browser: Browser, source: PageSource, tmp_path: Path) -> None:
+    tile = tmp_path / "map" / "0" / "0" / "0.png"
+    tile.parent.mkdir(parents=True)
+    Image.new("RGB", (256, 256), (0, 200, 0)).save(tile)
+    (tmp_path / "map" / "attribution.txt").write_text("Land registry")
+    source.publish(Areas("zones", T_MS, [zone("school", square(0, 0), "exclusion")]))
+    with source.serving(base_map=open_map(tmp_path / "map")) as address, opened(browser, address) as page:
+        page.wait_for_selector("#map[data-map=ready]")
+        expect(page.locator("#attribution")).to_have_text("Land registry")
+        # Tile at 70 % above the plain background.
+        wait_for_pixels(page, (70, 211, 73), 10_000)

@@ -19,6 +19,7 @@ from fractus_runtime.metrics import serve_metrics
 from fractus_runtime.open_files import TooFewOpenFiles, raise_open_files
 from prometheus_client import Metric
 
+from fractus_view.base_map import BaseMap, UnsuitableMap, open_map
 from fractus_view.cluster import ClusterSource
 from fractus_view.connections import ConnectionLimit
 from fractus_view.mcap_tail import MAGIC
@@ -48,6 +49,7 @@ class ServerOptions:
         hostnames: Additional host names by which browsers may address the server.
         token_file: File that contains the token. None creates a token at each start.
         metrics: HOST:PORT for Prometheus metrics. An empty string serves no metrics.
+        base_map: Base map of the page. None: plain background.
     """
 
     host: str
@@ -55,6 +57,7 @@ class ServerOptions:
     hostnames: tuple[str, ...]
     token_file: Path | None
     metrics: str = ""
+    base_map: BaseMap | None = None
 
 
 def _parse_address(_context: click.Context, _option: click.Parameter, text: str) -> tuple[str, int]:
@@ -110,6 +113,13 @@ def _parse_address(_context: click.Context, _option: click.Parameter, text: str)
     help="File with the access token. The file is read again when it changes. Default: a new token at each start.",
 )
 @click.option(
+    "--map",
+    "map_path",
+    type=click.Path(path_type=Path, exists=True),
+    metavar="PATH",
+    help="Base map: a PMTiles archive with raster tiles, or a directory with files Z/X/Y.png. Default: plain background.",
+)
+@click.option(
     "--metrics",
     default="",
     metavar="[HOST]:PORT",
@@ -126,6 +136,7 @@ def view(
     listen: tuple[str, int],
     hostnames: tuple[str, ...],
     token_file: Path | None,
+    map_path: Path | None,
     metrics: str,
 ) -> None:
     """Show flights on a web page.
@@ -138,13 +149,24 @@ def view(
     uses_cluster = bool(namespace or context or config)
     if bool(recordings) + (directory is not None) + uses_cluster > 1:
         raise click.UsageError("specify only one source: recordings to replay, --recordings, or options of a cluster")
-    options = ServerOptions(*listen, hostnames, token_file, metrics)
+    options = ServerOptions(*listen, hostnames, token_file, metrics, _open_map(map_path))
     if directory is not None:
         asyncio.run(_serve(GrowingRecordings(directory), options))
     elif recordings:
         asyncio.run(_serve(_replay(recordings), options))
     else:
         asyncio.run(_serve_cluster(config, context, namespace, system_namespace, options))
+
+
+def _open_map(path: Path | None) -> BaseMap | None:
+    if path is None:
+        return None
+    try:
+        return open_map(path)
+    except UnsuitableMap as error:
+        raise click.ClickException(f"--map: {error}") from error
+    except OSError as error:
+        raise click.ClickException(f"--map: cannot read {path_text(path)}: {error.strerror or error}") from error
 
 
 def _read_token(path: Path) -> str:
@@ -229,7 +251,8 @@ async def _serve(source: Source, options: ServerOptions, metrics: Callable[[], I
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, stopped.set)
-    server = ViewServer(source, frozenset(name.lower() for name in (options.host, *options.hostnames)))
+    names = frozenset(name.lower() for name in (options.host, *options.hostnames))
+    server = ViewServer(source, names, base_map=options.base_map)
     token_file = options.token_file
     if token_file is not None:
         server.token = _read_token(token_file)

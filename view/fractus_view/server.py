@@ -7,8 +7,9 @@ import hmac
 import logging
 import mimetypes
 import secrets
+from base64 import b64decode
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from ipaddress import ip_address
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from aiohttp import hdrs, web
 from fractus_runtime.metrics import gauge
 from prometheus_client import Counter, Metric
 
+from fractus_view.base_map import MAX_ZOOM, BaseMap, image_type
 from fractus_view.connections import mark_authorized
 from fractus_view.sources import Source
 
@@ -44,6 +46,11 @@ KEEPALIVE_S = 15.0
 
 MAX_STREAMS = 64
 
+TRANSPARENT_PNG = b64decode(
+    "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAYAAAAfFcSJAAAADUlEQVR42mNkYPhfDwAChwGA60e6kgAAAABJRU5ErkJggg=="
+)
+"""Image for a missing tile. Browsers would report every other response as an error."""
+
 HEALTH_PATH = "/healthz"
 """The only path that needs no token."""
 
@@ -59,12 +66,14 @@ class ViewServer:
         names: Host names by which browsers may address the server, besides IP addresses and localhost.
         token: Token that clients need. After a change, open pages with the old token are disconnected within `KEEPALIVE_S`.
         page: Directory of the built page.
+        base_map: Base map of the page, or None for a plain background.
     """
 
     source: Source
     names: frozenset[str]
     token: str = field(default_factory=lambda: secrets.token_urlsafe(32))
     page: Path = PAGE
+    base_map: BaseMap | None = None
     _streams: set[object] = field(default_factory=set)
     _responses: Counter = field(
         default_factory=lambda: Counter(
@@ -90,6 +99,8 @@ class ViewServer:
         application.router.add_get(HEALTH_PATH, self._health)
         application.router.add_get("/stream", self._stream)
         application.router.add_get("/pictures/{id}", self._picture)
+        application.router.add_get("/map.json", self._map)
+        application.router.add_get(r"/tiles/{zoom:[0-9]{1,2}}/{x:[0-9]{1,8}}/{y:[0-9]{1,8}}", self._tile)
         application.cleanup_ctx.append(self._run)
         return application
 
@@ -164,6 +175,22 @@ class ViewServer:
                 status=404, text="picture not found; its recording may have been removed to free space\n"
             )
         return web.Response(body=jpeg, content_type="image/jpeg", headers={hdrs.CACHE_CONTROL: "private, max-age=3600"})
+
+    async def _map(self, _request: web.Request) -> web.Response:
+        """Return the description of the base map as JSON, or null without a base map."""
+        return web.json_response(None if self.base_map is None else asdict(self.base_map.info))
+
+    async def _tile(self, request: web.Request) -> web.Response:
+        """Return a tile of the base map. A missing tile is transparent."""
+        zoom, x, y = (int(request.match_info[name]) for name in ("zoom", "x", "y"))
+        if self.base_map is None or zoom > MAX_ZOOM or max(x, y) >= 1 << zoom:
+            return web.Response(status=404, text="the base map has no such tile\n")
+        data = await asyncio.to_thread(self.base_map.tile, zoom, x, y)
+        type_ = image_type(data) if data is not None else None
+        if type_ is None:
+            data = TRANSPARENT_PNG
+            type_ = "image/png"
+        return web.Response(body=data, content_type=type_, headers={hdrs.CACHE_CONTROL: "private, max-age=3600"})
 
     async def _stream(self, request: web.Request) -> web.StreamResponse:
         head = {hdrs.CONTENT_TYPE: "text/event-stream", hdrs.CACHE_CONTROL: "no-store", "X-Accel-Buffering": "no"}

@@ -2,6 +2,7 @@
 
 import "./style.css";
 
+import { loadBaseMap } from "./base_map";
 import type { Event, Marker } from "./events";
 import { Lists, byId } from "./lists";
 import type { Colours, FlightMap } from "./map";
@@ -57,9 +58,9 @@ const firstEvents = new Promise<void>((resolve) => (resolveFirstEvents = resolve
 
 async function openMap(): Promise<void> {
   try {
-    const [module] = await Promise.all([import("./map"), firstEvents]);
+    const [module, baseMap] = await Promise.all([import("./map"), loadBaseMap(), firstEvents]);
     const time = complete ? model.begin : playback.time;
-    map = new module.FlightMap(byId("map"), model, colours(), reducedMotion, select, time);
+    map = new module.FlightMap(byId("map"), model, colours(), reducedMotion, select, baseMap, time);
     window.matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => map?.paint(colours()));
     if (complete) map?.showWhole();
     byId("map-tools").hidden = false;

@@ -5,6 +5,7 @@ import { type GeoJSONSource, LngLatBounds, Map as MapLibre, NavigationControl, P
 import "maplibre-gl/dist/maplibre-gl.css";
 import workerUrl from "maplibre-gl/dist/maplibre-gl-worker.mjs?url";
 
+import type { BaseMap } from "./base_map";
 import type { Feature, Link } from "./events";
 import { type Drone, MAX_GAP_MS, type Model } from "./model";
 import { policiesAt } from "./places";
@@ -26,6 +27,8 @@ const PATH_WIDTH_PX = 3;
 const FIT = { padding: 40, maxZoom: 18 };
 /** Minimum width and height of a zone that is labelled. Smaller zones are named only in the list. */
 const MIN_LABELLED_PX = 40;
+/** The base map is paler than zones and paths. */
+const BASE_MAP_OPACITY = 0.7;
 const STALE_OPACITY = 0.45;
 const NOT_READY_OPACITY = 0.55;
 
@@ -69,6 +72,7 @@ export class FlightMap {
     private colours: Colours,
     private readonly reducedMotion: boolean,
     private readonly select: (drone: string) => void,
+    baseMap: BaseMap | null,
     private time: number,
   ) {
     this.features = model.features(time);
@@ -76,7 +80,7 @@ export class FlightMap {
     const world = { center: [0, 20] as [number, number], zoom: 1 };
     this.map = new MapLibre({
       container: element,
-      style: this.style(),
+      style: this.style(baseMap),
       validateStyle: false,
       ...(bounds.isEmpty() ? world : { bounds, fitBoundsOptions: FIT }),
       attributionControl: false,
@@ -102,12 +106,18 @@ export class FlightMap {
   }
 
   /** Returns a style that already contains the known areas, so that the first frame shows them. */
-  private style(): StyleSpecification {
+  private style(baseMap: BaseMap | null): StyleSpecification {
     const source = (features: GeoJSON.Feature[]) =>
       ({ type: "geojson", data: { type: "FeatureCollection", features }, buffer: 32, tolerance: 0.2 }) as const;
     const filter = (name: string) => ["==", ["get", "class"], name] as ["==", ["get", string], string];
     const colours = this.colours;
     const layers: StyleSpecification["layers"] = [{ id: "background", type: "background", paint: { "background-color": colours("map") } }];
+    const base: StyleSpecification["sources"] = {};
+    if (baseMap !== null) {
+      const tiles = [`${window.location.origin}/tiles/{z}/{x}/{y}`];
+      base["base"] = { type: "raster", tiles, tileSize: 256, minzoom: baseMap.min_zoom, maxzoom: baseMap.max_zoom };
+      layers.push({ id: "base", type: "raster", source: "base", paint: { "raster-opacity": BASE_MAP_OPACITY, "raster-fade-duration": 0 } });
+    }
     for (const name of AREAS) {
       // Line layers draw the outlines.
       const paint = { "fill-antialias": false, "fill-color": colours(name), "fill-opacity": FILL_OPACITY[name] ?? DEFAULT_FILL_OPACITY };
@@ -123,7 +133,7 @@ export class FlightMap {
       const paint = { "line-color": colours("flown"), "line-width": width, "line-opacity": opacity };
       layers.push({ id: `${id}-line`, type: "line", source: id, layout: { "line-join": "round", "line-cap": "round" }, paint });
     }
-    return { version: 8, sources: { areas: source(this.shapes()), whole: source([]), earlier: source([]), flown: source([]) }, layers };
+    return { version: 8, sources: { ...base, areas: source(this.shapes()), whole: source([]), earlier: source([]), flown: source([]) }, layers };
   }
 
   /** Makes the map visible after the first frame that contains all areas. */

@@ -527,6 +527,7 @@ class ControlStore:
             self.effects.run_task(self._state.task, work)
 
     def _constrain(self, grant: ActiveGrant) -> FlightConstraints:
+        grant = self.latest(grant)  # The caller may have waited since it read the grant.
         self._constraints = FlightConstraints(grant, self.for_transit(grant))
         return self._constraints
 

@@ -104,7 +104,7 @@ class ReturnFlight:
         place = control.landing_place if kind is TaskKind.LAND_AT and attempts < SETTINGS.max_route_attempts else None
         if place is not None and await self._fly_to_landing(grant, is_current, place):
             return stack.land
-        return await self._return_home(grant, is_current, attempts)
+        return await self._return_home(control.last_grant or grant, is_current, attempts)
 
     async def _return_home(self, grant: ActiveGrant, is_current: Callable[[], bool], attempts: int) -> FlightMode:
         """Fly home, and return the mode for the rest of the return, as `approach` does."""

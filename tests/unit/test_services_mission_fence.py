@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -45,6 +46,10 @@ def spec(*areas: dict[str, Any], **more: Any) -> GrantSpec:
 
 def outline(items: tuple[MissionItem, ...]) -> Any:
     return shapely.Polygon([FRAME.xy(i.lat_e7 / 1e7, i.lon_e7 / 1e7) for i in items])
+
+
+class Killed(Exception):
+    """The service ends."""
 
 
 class Vehicle(ParameterVehicle):
@@ -345,6 +350,50 @@ async def test_owner_fence_that_cannot_be_restored_is_kept_for_later(
     with pytest.raises(AutopilotError, match="stopped responding"):
         await fence.raise_around(spec(area(-50, -50, 50, 50)), retraces=False)
     assert fence.raised, "the fence stays marked as raised, so that the supervisor restores the owner's fence later"
+
+
+@pytest.mark.parametrize(("types", "disabled"), [(7.0, 0), (3.0, 1)])
+async def test_restore_that_is_cut_off_leaves_a_fence_enabled_and_is_continued(
+    vehicle: Vehicle, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, types: float, disabled: int
+) -> None:
+    owner = {"FENCE_ENABLE": 1.0, "FENCE_TYPE": types, "FENCE_ALT_MAX": 40.0}
+    items = (MissionItem(5003, 30.0, 1, 2),)
+    send = vehicle.send
+    upload = module.upload
+    left = 0
+
+    def cut() -> None:
+        nonlocal left
+        left -= 1
+        if left < 0:
+            raise Killed
+
+    def dying(outgoing: Message) -> None:
+        if outgoing.name == "PARAM_SET":
+            cut()
+        send(outgoing)
+
+    async def dying_upload(*call: Any) -> None:
+        cut()
+        await upload(*call)
+
+    found_disabled = 0
+    for step in range(8):
+        vehicle.values |= owner
+        vehicle.items = items
+        await MissionFence(vehicle, tmp_path).raise_around(spec(area(-50, -50, 50, 50), **LIMITS), retraces=False)
+        with monkeypatch.context() as patch:
+            patch.setattr(vehicle, "send", dying)
+            patch.setattr(module, "upload", dying_upload)
+            left = step
+            with contextlib.suppress(Killed):
+                await MissionFence(vehicle, tmp_path).lower(lambda: True)
+        found_disabled += vehicle.values["FENCE_ENABLE"] == 0.0
+        await MissionFence(vehicle, tmp_path).lower(lambda: True)
+        assert {name: vehicle.values[name] for name in owner} == owner
+        assert vehicle.items == items
+    assert left > 0, "the last restore was complete"
+    assert found_disabled == disabled, "only the moment in which the fence reads its types"
 
 
 async def test_fence_parameter_changed_by_another_station_in_flight_is_reset(vehicle: Vehicle, tmp_path: Path) -> None:

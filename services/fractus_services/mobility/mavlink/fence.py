@@ -318,9 +318,21 @@ class MissionFence:
             log.warning("fence: owner's fence not restored yet (error=%s)", str(error) or "timeout")
 
     async def _restore(self, owned: OwnerFence) -> None:
+        """Restore the owner's fence. The owner's enabled fence is not disabled before everything else is restored.
+
+        If the service ends meanwhile, the vehicle therefore keeps an enabled fence: that of the mission, or that of the owner.
+        The next start of the service continues, because the owner's fence stays on disk until the end.
+        """
         self._raised_bounds = None
-        await self._set({self._stack.fence_switch: 0.0})
+        if self._autopilot.vehicle.armed:
+            raise AutopilotError("the motors are running; the fence cannot be changed")
+        switch = self._stack.fence_switch
+        if not owned.parameters.get(switch, 0.0):
+            await self._set({switch: 0.0})
         await self._write(owned.items)
+        others = {name: value for name, value in owned.parameters.items() if name != switch}
+        if await self._set(others) and owned.parameters.get(switch, 0.0):
+            await self._set({switch: 0.0})  # ArduPilot reads the fence types only when the fence is enabled.
         await self._set(owned.parameters)
         await asyncio.to_thread(self._path.unlink, True)
         log.info("fence: owner's fence restored")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 from fractus_core.control.state import FlightMode, ModeKind
 from fractus_core.policy.decision_types import Airframe
@@ -93,6 +93,8 @@ _SPEED: Names = (("WPNAV_SPEED", 0.01), ("WP_SPD", 1.0))
 _MOVEMENT = (_ACCEL, _GAIN, _CLIMB, _JERK, _OWN_LEAN, _LEAN, _RETURN_ALTITUDE, _SPEED)
 _RETURN_SPEED: Names = (("RTL_SPEED", 0.01), ("RTL_SPEED_MS", 1.0))
 _RETURN_CLIMB: Names = (("RTL_CLIMB_MIN", 0.01), ("RTL_CLIMB_MIN_M", 1.0))
+_FINAL_ALTITUDE: Names = (("RTL_ALT_FINAL", 0.01), ("RTL_ALT_FINAL_M", 1.0))
+_RESTORED = (_RETURN_ALTITUDE, _RETURN_SPEED, _SPEED, _RETURN_CLIMB, _FINAL_ALTITUDE)
 _MIN_SPEED_MPS = 0.2
 _MIN_ACCEL_MPS2 = 0.1
 _NO_RALLY_KM = 2.0**-10
@@ -239,6 +241,16 @@ class ArduCopter:
                     limit = maximum if scale == 1.0 or math.isinf(maximum) else math.floor(round(maximum / scale, 3))
                     limited[name] = min(owned[name], float(limit))
         return limited
+
+    def under_names_of(self, present: Collection[str], values: Mapping[str, float]) -> dict[str, float]:
+        """Return parameters under the names that the vehicle has. Release 4.7 renamed some and changed their unit."""
+        renamed = {}
+        for names in _RESTORED:
+            for stored, stored_scale in names:
+                for name, scale in names:
+                    if stored in values and stored not in present and name in present:
+                        renamed[name] = round(values[stored] * stored_scale / scale, 6)
+        return renamed | {name: value for name, value in values.items() if name in present}
 
     def airframe(self, reader: ParameterReader, known: Airframe, speed_mps: float) -> tuple[Airframe, float]:
         """Return the dynamics of the vehicle, and the speed of its legs.

@@ -6,7 +6,7 @@ to a firmware is behind `FlightStack`. `ardupilot` implements it for ArduCopter.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -142,6 +142,14 @@ class FlightStack(Protocol):
         Args:
             owned: Values of the owner, for the parameters that the vehicle has.
             bounds: Limits of altitude and speed.
+        """
+
+    def under_names_of(self, present: Collection[str], values: Mapping[str, float]) -> dict[str, float]:
+        """Return parameters under the names, and in the units, that the vehicle's release of the firmware has.
+
+        Args:
+            present: Names of the vehicle's parameters.
+            values: Values under names of this or another release. Unknown names are dropped.
         """
 
     def airframe(self, reader: ParameterReader, known: Airframe, speed_mps: float) -> tuple[Airframe, float]:

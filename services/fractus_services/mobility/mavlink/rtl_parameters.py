@@ -51,8 +51,8 @@ class RtlParameters:
         """
         async with self._lock:
             current = await self._parameters.read(self._names)
-            # Ignore stored names that this release of the firmware does not have.
-            owned = current | {name: value for name, value in self._owned.items() if name in current}
+            # The firmware may have been replaced by another release since the values were stored.
+            owned = current | self._stack.under_names_of(current, self._owned)
             values = self._stack.return_values(owned, bounds) | self._mission_values(owned)
             changed = {name: value for name, value in values.items() if not same(current[name], value)}
             if changed:
@@ -75,7 +75,7 @@ class RtlParameters:
             if not idle() or not self._owned:
                 return
             current = await self._parameters.read(self._names)
-            await self._set({name: value for name, value in self._owned.items() if name in current})
+            await self._set(self._stack.under_names_of(current, self._owned))
             await asyncio.to_thread(self._path.unlink, True)
             self._owned = {}
             self._update_leg_speed()

@@ -101,7 +101,12 @@ def kube_errors_explained() -> Iterator[None]:
             first = first.exceptions[0]  # Report only the first failure, because it cancelled the other tasks.
         if not isinstance(first, KubeError):
             raise
-        remedy = "check your permissions" if first.status else "check the cluster and --kubeconfig"
+        if first.status == HTTPStatus.UNAUTHORIZED:
+            remedy = "the credentials are invalid or expired: log in again, or use another --kubeconfig"
+        elif first.status:
+            remedy = "check your permissions"
+        else:
+            remedy = "check the cluster and --kubeconfig"
         raise click.ClickException(f"{first}; {remedy}") from first
 
 

@@ -12,11 +12,11 @@ from typing import Literal, TypeVar
 
 import click
 from cryptography import x509
-from fractus_core.api import KINDS, Application, Depot, InvalidObject, Policy, Resource, Zone
+from fractus_core.api import KINDS, Application, Depot, EdgeNode, InvalidObject, Policy, Resource, Zone
 from fractus_core.api.crd import crd
 from fractus_core.api.names import CLASS_LABEL as CLASS
 from fractus_core.api.names import CLOUD_LABEL
-from fractus_core.plausibility import policy_notes, zone_notes
+from fractus_core.plausibility import edge_node_notes, policy_notes, zone_notes
 
 from fractus_cli.cluster_reader import (
     EXIT_PROBLEM,
@@ -419,6 +419,8 @@ def _notes(cluster: ClusterReader) -> Iterator[str]:
     applications = list(_valid(cluster, Application))
     for zone in _valid(cluster, Zone):
         yield from zone_notes(zone, depots)
+    for edge_node in _valid(cluster, EdgeNode):
+        yield from edge_node_notes(edge_node, depots)
     for policy in _valid(cluster, Policy):
         yield from policy_notes(policy, applications)
 

@@ -31,7 +31,7 @@ from fractus_core.api.nodes import DroneStatus
 from fractus_core.documents import MAX_BYTES, BadDocument, Documents, parse_documents
 from fractus_core.planning import Host, Inventory
 from fractus_core.planning.inventory import amount_of
-from fractus_core.plausibility import policy_notes, zone_notes
+from fractus_core.plausibility import edge_node_notes, policy_notes, zone_notes
 from fractus_core.validation import check_policy, check_zone
 from fractus_runtime import files
 
@@ -114,6 +114,8 @@ class Manifests:
         applications = self.applications()
         for zone in self.of(Zone).values():
             yield from zone_notes(zone, depots)
+        for edge_node in self.of(EdgeNode).values():
+            yield from edge_node_notes(edge_node, depots)
         for policy in self.of(Policy).values():
             yield from policy_notes(policy, applications)
 
@@ -221,7 +223,9 @@ def read_documents(file: pathlib.Path, *, strict: bool = True) -> Iterator[Manif
     for body in parsed.values:
         if not isinstance(body, dict) or not isinstance(body.get("kind"), str):
             if strict:
-                raise BadManifest(f"{parsed.where(body)}: the document has no kind, so it is not a Kubernetes object")
+                raise BadManifest(
+                    f"{parsed.where(body)}: the document has no kind, so it is not a Kubernetes object; add apiVersion and kind"
+                )
             continue
         items = body.get("items")
         if body["kind"].endswith("List") and isinstance(items, list):
@@ -254,10 +258,14 @@ def _resource(manifest: Manifest, kinds: Mapping[str, type[Resource]]) -> Resour
             return None
         metadata = body.get("metadata")
         if not isinstance(metadata, dict) or not isinstance(metadata.get("name"), str):
-            raise InvalidObject("metadata.name", "must be a string; specify the name of the object")
+            raise InvalidObject(
+                "metadata.name", "must be a string; specify the name of the object, in quotes if it is a number"
+            )
         unknown = sorted(metadata.keys() - _METADATA)
         if unknown:
-            raise InvalidObject(f"metadata.{unknown[0]}", "there is no such field; remove it, or correct its name")
+            similar = difflib.get_close_matches(unknown[0], _METADATA, n=1)
+            remedy = f"did you mean {similar[0]}?" if similar else "remove it, or correct its name"
+            raise InvalidObject(f"metadata.{unknown[0]}", f"there is no such field; {remedy}")
         return _host(body) if kind == "Node" else kinds[str(kind)].from_body(body)
     except InvalidObject as error:
         raise manifest.bad(error) from None

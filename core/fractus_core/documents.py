@@ -109,6 +109,23 @@ class Documents:
         return line
 
 
+def _with_remedy(problem: str) -> str:
+    """Return a problem that the YAML parser reports, with what the writer of the file should do."""
+    return f"{problem}; {next((remedy for part, remedy in _REMEDIES.items() if part in problem), _REMEDY)}"
+
+
+_REMEDIES = {
+    "tab character": "indent with spaces",
+    "cannot start any token": "indent with spaces, and put a text that begins with a special character in quotes",
+    "mapping values are not allowed": "put a text that contains a colon and a space in quotes, or correct the indentation",
+    "control characters": "save the file as plain UTF-8 text",
+    "quoted scalar": "close the quotes",
+    "document indicator": "close the quotes and brackets before this line",
+}
+"""Remedies by a part of the parser's problem."""
+_REMEDY = "check the indentation, brackets, commas and quotes on this line and the lines before"
+
+
 def parse_documents(content: bytes, name: str, *, is_json: bool = False) -> Documents:
     """Parse a YAML stream, or a JSON file with `is_json`.
 
@@ -132,10 +149,12 @@ def parse_documents(content: bytes, name: str, *, is_json: bool = False) -> Docu
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         line = mark.line + 1 if mark is not None else 0
-        raise BadDocument(name, line, f"invalid YAML: {error.problem or error.context}") from None
+        raise BadDocument(name, line, f"invalid YAML: {_with_remedy(error.problem or error.context or '')}") from None
     except yaml.YAMLError as error:
         line = text[: getattr(error, "position", 0)].count("\n") + 1
-        raise BadDocument(name, line, f"invalid YAML: {getattr(error, 'reason', None) or error}") from None
+        raise BadDocument(
+            name, line, f"invalid YAML: {_with_remedy(getattr(error, 'reason', None) or str(error))}"
+        ) from None
     return Documents(name, tuple(reader.values), reader.lines)
 
 
@@ -162,7 +181,9 @@ def _check_json(text: str, name: str) -> None:
     try:
         json.loads(text, parse_int=len, parse_constant=refuse_constant)
     except json.JSONDecodeError as error:
-        raise BadDocument(name, error.lineno, f"invalid JSON: {error.msg.lower()}") from None
+        raise BadDocument(
+            name, error.lineno, f"invalid JSON: {error.msg.lower()}; correct or export the file again"
+        ) from None
     except RecursionError:
         raise BadDocument(
             name, 0, f"lists or objects are nested deeper than {MAX_DEPTH} levels; flatten them"
@@ -227,7 +248,7 @@ class _Reader:
         if len(self._stack) >= MAX_DEPTH:
             raise self._bad(line, f"lists or objects are nested deeper than {MAX_DEPTH} levels; flatten them")
         if self._stack and self._expects_key():
-            raise self._bad(line, "a list or object cannot be a key; use a string")
+            raise self._bad(line, "a list or object cannot be a key; put a text in braces in quotes")
         self._count(line)
         if event.anchor is not None:
             self._anchors[event.anchor] = None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator
 
-from fractus_core.api import Application, Depot, Policy, Zone
+from fractus_core.api import Application, Depot, EdgeNode, Policy, Zone
 from fractus_core.api.geometry import Point
 from fractus_core.geo import area_center
 from fractus_core.geo.distances import geodesic_m
@@ -24,7 +24,7 @@ def exchanged_coordinates(point: Point, depots: Iterable[Depot]) -> str:
         return ""
     return (
         f"{point.lat:g}, {point.lon:g} is {distance_m / 1000:,.0f} km from the nearest depot; "
-        "latitude and longitude are probably exchanged"
+        "latitude and longitude are probably exchanged, here or in the Depot"
     )
 
 
@@ -32,6 +32,12 @@ def zone_notes(zone: Zone, depots: Collection[Depot]) -> Iterator[str]:
     """Yield the notes about a zone."""
     if note := exchanged_coordinates(area_center(zone.spec.area), depots):
         yield f"Zone {zone.name}: spec.area: {note}"
+
+
+def edge_node_notes(edge_node: EdgeNode, depots: Collection[Depot]) -> Iterator[str]:
+    """Yield the notes about an edge node."""
+    if note := exchanged_coordinates(edge_node.spec.location, depots):
+        yield f"EdgeNode {edge_node.name}: spec.location: {note}"
 
 
 def policy_notes(policy: Policy, applications: Collection[Application]) -> Iterator[str]:

@@ -355,12 +355,9 @@ def parse_spec(content: object, *, source: str, documents: Documents | None = No
     try:
         return ClusterSpec.model_validate(content)
     except ValidationError as error:
-        wrong = [(".".join(str(part) for part in fault["loc"]), fault["msg"]) for fault in error.errors()]
-        # For an invalid list entry, pydantic also reports that the list is too short. Omit that second error.
-        real = [(place, text) for place, text in wrong if not any(other.startswith(f"{place}.") for other, _ in wrong)]
-        faults = "; ".join(f"{place or 'file'}: {text.removeprefix('Value error, ')}" for place, text in real)
-        where = documents.where(content, real[0][0]) if documents is not None else source
-        raise ClusterError(f"{where}: {faults}") from error
+        problem = InvalidObject.from_pydantic(error, ClusterSpec)
+        where = documents.where(content, problem.field) if documents is not None else source
+        raise ClusterError(f"{where}: {problem}") from error
 
 
 def load_spec(path: Path) -> ClusterSpec:

@@ -86,6 +86,8 @@ def report(
     folder = out or Path("out") / application
     if audit and not manifests:
         raise click.UsageError("--audit also needs the manifest of the Application (--filename)")
+    if (manifests or recordings) and not audit:
+        raise click.UsageError("--filename and --recordings also need the audit log of the mobility service (--audit)")
     with command_errors():
         _check_folder(folder, audit)
         folder.mkdir(parents=True, exist_ok=True)

@@ -249,7 +249,7 @@ BOW_TIE = [{"lat": 0, "lon": 0}, {"lat": 1e-3, "lon": 1e-3}, {"lat": 0, "lon": 1
         ),
         (
             [manifest("Drone", "d", {"depo": "base"})],
-            "Drone d: spec.depo: there is no such field; remove it, or correct its name",
+            "Drone d: spec.depo: there is no such field; did you mean depot?",
         ),
         ([TRAFFIC | {"spec": {"components": []}}], "Application traffic: spec.components: "),
         ([TRAFFIC], "Application traffic: spec.components[0].controlPoints[0].point.depot: there is no Depot base"),

@@ -37,7 +37,7 @@ def _known(field: ReferenceField) -> Any:
     return _each(
         field,
         "self.components.exists(d, d.name == n)",
-        "names a component that is not in the application",
+        "names a component that is not in the application; correct the name or add the component",
         lambda spec, _, name: spec.find(name) is not None,
     )
 

@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal, Self, assert_never
 
 from pydantic import Field, WithJsonSchema, model_validator
 
+from fractus_core.api.formats import IMAGE, MOUNT_PATH, VARIABLE
 from fractus_core.api.geometry import Area, Circle, Position
 from fractus_core.api.methods import METHODS_OF, Method, Service
 from fractus_core.api.model import InvalidObject, Model, Quantity, keyed, quantity
@@ -26,10 +27,6 @@ TLS_DIR = "/var/run/fractus/tls"
 TMP_DIR = "/tmp"  # nosec B108  # noqa: S108  (private to the pod)
 """Directory that a component may write to."""
 _OWN_VOLUMES = {"tls": TLS_DIR, "tmp": TMP_DIR}
-_IMAGE = (
-    r"^([a-zA-Z0-9]([-a-zA-Z0-9.]*[a-zA-Z0-9])?(:[0-9]+)?/)?[a-z0-9]+(([._]|__|-+)[a-z0-9]+)*"
-    r"(/[a-z0-9]+(([._]|__|-+)[a-z0-9]+)*)*(:[A-Za-z0-9_][-A-Za-z0-9_.]{0,127})?(@[a-z0-9]+:[0-9a-f]{32,128})?$"
-)
 
 
 class ContainerPort(Model):
@@ -55,7 +52,7 @@ class ContainerPort(Model):
 class EnvVar(Model):
     """An environment variable."""
 
-    name: str = Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$", max_length=128, description="Name of the variable.")
+    name: str = Field(pattern=VARIABLE, max_length=128, description="Name of the variable.")
     value: str = Field(default="", max_length=32768, description="Value as a string; put numbers in quotes.")
 
     @rule("!self.name.startsWith('FRACTUS_')", "names that begin with FRACTUS_ are reserved; choose another name")
@@ -149,7 +146,7 @@ class Volume(Model):
 
     name: Name = Field(description="Name of the volume, unique in the component.")
     mount_path: str = Field(
-        pattern=r"^(/[^/:]+)+$", max_length=512, description="Absolute path of the volume in the container."
+        pattern=MOUNT_PATH, max_length=512, description="Absolute path of the volume in the container."
     )
     read_only: bool = Field(
         default=False, description="Mount without write access. ConfigMaps and Secrets are always read-only."
@@ -213,7 +210,7 @@ class Container(Model):
     """The container of a component."""
 
     image: str = Field(
-        min_length=1, max_length=512, pattern=_IMAGE, description="Image reference such as registry.example/app:1.2."
+        min_length=1, max_length=512, pattern=IMAGE, description="Image reference such as registry.example/app:1.2."
     )
     command: tuple[str, ...] = Field(
         default=(), max_length=64, description="Command of the container; default: the entry point of the image."

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import difflib
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from datetime import datetime
-from typing import Annotated, Any, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self, get_args
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, WithJsonSchema
 from pydantic.alias_generators import to_camel
 from pydantic_core import ErrorDetails
 
+from fractus_core.api.formats import FORMATS
 from fractus_core.api.names import DNS_SUBDOMAIN, SHAPES, LabelKey, LabelValue, Name
 
 GROUP = "fractus.dev"
@@ -230,7 +232,7 @@ class Resource(Model):
             if whole != text:
                 _refuse_unknown(cls, whole)
         except ValidationError as error:
-            raise InvalidObject.from_pydantic(error) from None
+            raise InvalidObject.from_pydantic(error, cls) from None
         if len(text) > MAX_OBJECT_BYTES and not cls.WRITTEN_BY_OPERATOR:
             raise InvalidObject(
                 "", f"has {len(text)} bytes as JSON, more than the {MAX_OBJECT_BYTES} that etcd keeps; split it"
@@ -269,7 +271,7 @@ def _refuse_unknown(model: type[Resource], text: str) -> None:
     except ValidationError as error:
         for finding in error.errors(include_url=False):
             if finding["type"] == "extra_forbidden":
-                raise InvalidObject(_path(finding).lstrip("."), _problem(finding)) from None
+                raise InvalidObject(_path(finding).lstrip("."), _unknown_field(finding, model)) from None
 
 
 def _path(finding: ErrorDetails) -> str:
@@ -285,10 +287,18 @@ class InvalidObject(ValueError):
         super().__init__(f"{field}: {problem}" if field else problem)
 
     @classmethod
-    def from_pydantic(cls, error: ValidationError) -> InvalidObject:
-        """Convert the first pydantic error to a field path and a sentence."""
-        finding = error.errors(include_url=False)[0]
+    def from_pydantic(cls, error: ValidationError, model: type[BaseModel] | None = None) -> InvalidObject:
+        """Convert the first pydantic error to a field path and a sentence.
+
+        Args:
+            error: The error.
+            model: The parsed model. With it, the sentence about an unknown field suggests a similar name.
+        """
+        findings = error.errors(include_url=False)
+        finding = _misspelt(findings) or findings[0]
         path = _path(finding)
+        if finding["type"] == "extra_forbidden":
+            return cls(path.lstrip("."), _unknown_field(finding, model))
         context = finding.get("ctx", {}).get("error")
         if isinstance(context, InvalidObject):
             inner = context.field
@@ -296,9 +306,11 @@ class InvalidObject(ValueError):
             return cls((path + joint + inner).lstrip("."), context.problem)
         problem = str(context) if context is not None else _problem(finding)
         value = finding.get("input")
-        if context is None and finding["type"] != "extra_forbidden" and isinstance(value, (str, int, float, bool)):
+        if context is None and isinstance(value, (str, int, float, bool)):
             text = repr(value)
             problem += f", not {text if len(text) <= 80 else text[:77] + '...'}"
+        if context is None:
+            problem += _hint(finding)
         return cls(path.lstrip("."), problem[:1].lower() + problem[1:])
 
 
@@ -314,17 +326,79 @@ _SENTENCES = {
     "bool_type": "must be true or false",
     "string_type": "must be a string; put it in quotes",
     "missing": "is missing; specify it",
-    "extra_forbidden": "there is no such field; remove it, or correct its name",
 }
 """Messages for pydantic errors, by error type. The messages of pydantic use Python terms that users do not know."""
 
 
 def _problem(finding: ErrorDetails) -> str:
-    kind = finding["type"]
+    kind = str(finding["type"])
     limits = finding.get("ctx", {})
     if kind == "string_pattern_mismatch":
-        return f"must be {SHAPES.get(limits['pattern'], 'of the form ' + limits['pattern'])}"
+        pattern = limits["pattern"]
+        return f"must be {SHAPES.get(pattern) or FORMATS.get(pattern) or 'of the form ' + pattern}"
     if kind in {"too_long", "too_short"} and limits.get("field_type") == "Tuple":
         bound = f"most {limits['max_length']}" if kind == "too_long" else f"least {limits['min_length']}"
         return f"must have at {bound} entries, not {limits['actual_length']}"
     return _SENTENCES.get(kind) or finding["msg"].replace("Input should", "must").replace("String should", "must")
+
+
+def _misspelt(findings: Sequence[ErrorDetails]) -> ErrorDetails | None:
+    """Return the unknown field whose name resembles the first problem, a missing field beside it."""
+    first = findings[0]
+    if first["type"] != "missing":
+        return None
+    for finding in findings:
+        beside = finding["type"] == "extra_forbidden" and finding["loc"][:-1] == first["loc"][:-1]
+        if beside and _similar(str(finding["loc"][-1]), [str(first["loc"][-1])]):
+            return finding
+    return None
+
+
+def _unknown_field(finding: ErrorDetails, model: type[BaseModel] | None) -> str:
+    name = str(finding["loc"][-1])
+    if name.isdigit():
+        return "there is no such field; write decimals with a point, or remove the number"
+    similar = _similar(name, _field_names(model, finding["loc"][:-1]) if model is not None else ())
+    return f"there is no such field; {f'did you mean {similar}?' if similar else 'remove it, or correct its name'}"
+
+
+def _field_names(model: type[BaseModel], place: Sequence[int | str]) -> list[str]:
+    """Return the names of the fields at a place of a model."""
+    models = {model}
+    for part in place:
+        if isinstance(part, str):
+            models = {inner for each in models for inner in _models_in(_fields(each).get(part))}
+    return [name for each in models for name in _fields(each)]
+
+
+def _fields(model: type[BaseModel]) -> dict[str, Any]:
+    """Return the types of a model's fields by their names in manifests."""
+    return {field.alias or name: field.annotation for name, field in model.model_fields.items()}
+
+
+def _models_in(annotation: Any) -> set[type[BaseModel]]:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return {annotation}
+    return {model for argument in get_args(annotation) for model in _models_in(argument)}
+
+
+def _similar(word: str, names: Iterable[str], cutoff: float = 0.7) -> str | None:
+    by_lower_case = {name.lower(): name for name in names}
+    found = difflib.get_close_matches(word.lower(), by_lower_case, n=1, cutoff=cutoff)
+    return by_lower_case[found[0]] if found else None
+
+
+def _hint(finding: ErrorDetails) -> str:
+    """Return the end of the sentence about a wrong value: what its writer probably meant."""
+    kind = finding["type"]
+    value = finding.get("input")
+    if not isinstance(value, str):
+        return "; begin each entry with a hyphen" if kind in {"tuple_type", "list_type"} else ""
+    if kind in {"tuple_type", "list_type"}:
+        return f"; write [{value:.40}]"
+    if kind in {"float_type", "int_type"}:
+        return "; remove the quotes" if re.fullmatch(r"-?[0-9.]+", value) else "; write only the number"
+    if kind == "literal_error":
+        similar = _similar(value, re.findall(r"'([^']*)'", finding["ctx"]["expected"]), cutoff=0.6)
+        return f"; did you mean {similar}?" if similar else ""
+    return ""

@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 from pydantic import Field, JsonValue
 
+from fractus_core.api.formats import AUTOPILOT_CONNECTION, CAMERA_CONNECTION, DEVICE, RESOLUTION, SSID
 from fractus_core.api.geometry import Point, Position
 from fractus_core.api.methods import CameraMethod, MobilityMethod
 from fractus_core.api.model import AGE, GROUP, READY, Conditions, InvalidObject, Model, OpenModel, Resource
@@ -65,7 +66,7 @@ class Pairing(Model):
         default="adhoc", description="adhoc (directly), or infrastructure (through an access point)."
     )
     network_id: str = Field(
-        min_length=1, max_length=32, pattern=r"^[ -~]+$", description="Network name (SSID for WiFi), ASCII."
+        min_length=1, max_length=32, pattern=SSID, description="Network name (SSID for WiFi), ASCII."
     )
 
 
@@ -76,7 +77,7 @@ class Interface(Model):
     device: str | None = Field(
         default=None,
         max_length=15,
-        pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.-]*$",
+        pattern=DEVICE,
         description="Name of the network device on the node, such as wlan0.",
     )
     range: float | None = Field(
@@ -125,9 +126,9 @@ class MobilityFeatures(Model):
     autopilot: Literal["ardupilot"] = Field(default="ardupilot", description="Autopilot firmware family.")
     connection: str = Field(
         default="tcp:127.0.0.1:5760",
-        pattern=r"^(tcp|udpin|udpout|serial):.+$",
+        pattern=AUTOPILOT_CONNECTION,
         max_length=128,
-        description="Connection from the node to the autopilot: tcp:, udpin:, udpout: or serial:DEVICE:BAUD.",
+        description="Connection from the node to the autopilot: tcp:HOST:PORT, udpin:HOST:PORT, udpout:HOST:PORT or serial:DEVICE:BAUD.",
     )
     max_altitude: float = Field(gt=0, le=20000, description="Maximum altitude in metres above home.")
     max_flight_time: float = Field(gt=0, le=1440, description="Flight time with a full battery, in minutes.")
@@ -194,15 +195,13 @@ class CameraFeatures(Model):
 
     connection: str = Field(
         default="test:",
-        pattern=r"^(https?://[^/].*|v4l2:/dev/.+|picamera2:[0-9]|directory:/.+|test:)$",
+        pattern=CAMERA_CONNECTION,
         max_length=512,
         description="Image source: http://HOST/snapshot.jpg, v4l2:/dev/video0, picamera2:0, directory:/PATH with geotagged"
         " images, or test: for generated images.",
     )
     model: str = Field(default="", max_length=128, description="Manufacturer and model.")
-    resolution: str = Field(
-        default="1920x1080", pattern=r"^[1-9][0-9]{1,4}x[1-9][0-9]{1,4}$", description="WIDTHxHEIGHT in pixels."
-    )
+    resolution: str = Field(default="1920x1080", pattern=RESOLUTION, description="WIDTHxHEIGHT in pixels.")
     sensor_type: Literal["RGB", "IR"] = Field(default="RGB", description="Spectral range: RGB or IR (infrared).")
     horizontal_field_of_view: float | None = Field(
         default=None,

@@ -9,11 +9,12 @@ from typing import Annotated, Literal, get_args
 
 from pydantic import Field
 
+from fractus_core.api.formats import CLOCK_TIME
 from fractus_core.api.model import Model, Timestamp
 from fractus_core.api.rules import Violation, rule
 
 Day = Literal["Mon", "Tue", "Wed", "Thu", "Fri", "Sat", "Sun"]
-ClockTime = Annotated[str, Field(pattern=r"^([01][0-9]|2[0-3]):[0-5][0-9]$", max_length=5)]
+ClockTime = Annotated[str, Field(pattern=CLOCK_TIME, max_length=5)]
 
 _DAYS: tuple[Day, ...] = get_args(Day)
 _DAY_S = 86_400.0

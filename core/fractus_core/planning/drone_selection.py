@@ -216,7 +216,9 @@ def _parked_in_range(builder: PlanBuilder, area: OperationArea, leader: Componen
             message = f"it {relation} {distance:.0f} m from the start, {requirement}"
             builder.reject(leader, name, Check(reason, message), far=True)
     for name in sorted(located.homeless - kept - set(flying))[: settings.near_misses]:
-        message = "it has neither a depot that exists nor a home; set spec.depot or spec.home"
+        depot = builder.inventory.drones[name].spec.depot
+        missing = f"its Depot {depot} does not exist" if depot else "it has no depot"
+        message = f"{missing}, and it has no home; set spec.depot to an existing Depot, or set spec.home"
         builder.reject(leader, name, Check("NoHome", message))
     return sorted(in_range)
 

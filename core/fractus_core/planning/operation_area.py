@@ -145,8 +145,10 @@ def start_of(point: ControlPoint, depots: Mapping[str, Depot]) -> Position | Non
         return point.point.position
     name = point.point.depot or ""
     if name not in depots:
-        known = ", ".join(sorted(depots)) or "no Depot exists yet; apply one"
-        raise InvalidObject("point.depot", f"there is no Depot {name} ({known})")
+        known = ", ".join(sorted(depots)[:10]) or "none"
+        raise InvalidObject(
+            "point.depot", f"there is no Depot {name} (existing: {known}); apply it or correct the name"
+        )
     location = depots[name].spec.location
     return Position(lat=location.lat, lon=location.lon)
 

@@ -56,7 +56,9 @@ async def kubeconfig(path: str | Path, context: str | None = None) -> Access:
             await load_kube_config(str(path), context=context, client_configuration=configuration, persist_config=False)
         # The loader does not check types, so an invalid kubeconfig raises arbitrary errors.
         except (ConfigException, OSError, yaml.YAMLError, AttributeError, TypeError, ValueError) as error:
-            raise Unconfigured(f"the kubeconfig {path} cannot be used: {error}") from error
+            cause = "it is not a kubeconfig" if isinstance(error, AttributeError | TypeError) else str(error)
+            check = f"check it with `kubectl config view --kubeconfig {path}`"
+            raise Unconfigured(f"the kubeconfig {path} cannot be used: {cause}; {check}") from error
 
     await load()
     return Access(configuration, load)
@@ -98,7 +100,9 @@ async def from_environment(context: str | None = None) -> Access:
     try:
         return await kubeconfig(os.environ.get("KUBECONFIG") or _KUBECONFIG, context)
     except Unconfigured as error:
-        raise Unconfigured(f"no cluster: set KUBECONFIG, or run in a pod ({error})") from error
+        raise Unconfigured(
+            f"no cluster: set KUBECONFIG to the kubeconfig of a cluster, or run in a pod ({error})"
+        ) from error
 
 
 def with_certificate(

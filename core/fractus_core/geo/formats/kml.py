@@ -66,7 +66,7 @@ def read_kml(text: str, without: Collection[str] = (), drop: Collection[str] = (
     try:
         root = ElementTree.fromstring(re.sub(r"^\ufeff?\s*<\?xml[^>]*\?>", "", text))  # nosec B314  # noqa: S314  (no entities, see above)
     except ElementTree.ParseError as error:
-        raise InvalidObject("", f"this is not XML ({error})") from None
+        raise InvalidObject("", f"this is not XML ({error}); correct or export the file again") from None
     if _tag(root) != "kml":
         raise InvalidObject("", f"the root element is {_tag(root)}, not kml")
     builder = ZoneBuilder(without, drop)

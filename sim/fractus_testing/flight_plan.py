@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from fractus_core.api import API_VERSION
+from fractus_sim.errors import ExperimentError
 
 Waypoint = tuple[float, float, float]
 """Latitude and longitude in degrees, altitude in metres above home."""
@@ -190,6 +191,21 @@ def drone_manifests(
         _manifest("Application", name, {"components": [program]}),
         *(manifest for restriction in plan.restrictions for manifest in restriction.manifests()),
     ]
+
+
+def merged(manifests: Iterable[Manifest]) -> list[Manifest]:
+    """Return manifests without repetitions. Drones may share the restrictions of their flight plans.
+
+    Raises:
+        ExperimentError: Two manifests have the same kind and name, and different content.
+    """
+    merged_manifests: dict[tuple[str, str], Manifest] = {}
+    for body in manifests:
+        kind = body["kind"]
+        name = body["metadata"]["name"]
+        if merged_manifests.setdefault((kind, name), body) != body:
+            raise ExperimentError(f"two restrictions are named {name}, but their {kind} differs; use different names")
+    return list(merged_manifests.values())
 
 
 def _manifest(kind: str, name: str, spec: Mapping[str, Any]) -> Manifest:

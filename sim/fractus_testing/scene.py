@@ -47,6 +47,7 @@ from fractus_testing.flight_plan import (
     Waypoint,
     circle,
     drone_manifests,
+    merged,
     no_fly,
 )
 from fractus_testing.records import record_of_run
@@ -62,6 +63,7 @@ runtime = "runtime"
 autopilot = "autopilot"
 _LOGS = (app, runtime, autopilot)
 
+DEFINITION = "experiment.yaml"
 TRIGGER_TIMEOUT_S = 300.0
 MAX_DURATION_S = 7200.0
 SETTLE_S = 600.0
@@ -251,6 +253,7 @@ class VirtualController:
         self._restrictions: tuple[Restriction, ...] = ()
         self._silent_until_s: dict[str, float] = {}
         self._pending: set[str] = set()
+        self._aborted: set[str] = set()
 
     def set_logs(self, *logs: str) -> None:
         """Select logs for failed tests. The controller has the log `runtime` only: the events of the test."""
@@ -268,7 +271,7 @@ class VirtualController:
 
         Raises:
             AssertionError: The moment did not come.
-            ExperimentError: The applications cannot be planned with the restrictions.
+            ExperimentError: A restriction is invalid.
         """
         __tracebackhide__ = True
         if at is not None:
@@ -301,6 +304,8 @@ class VirtualController:
     def abort(self, drone: VirtualDrone, at: Trigger | None = None) -> None:
         """End the mission of a drone: its Grants are revoked, and the system brings the drone home.
 
+        A drone without contact gets the revocation when the contact returns.
+
         Args:
             drone: Drone to bring home.
             at: Moment of a flight to wait for.
@@ -309,7 +314,8 @@ class VirtualController:
         if at is not None:
             self._scene.wait(at, TRIGGER_TIMEOUT_S)
         self._scene.run.report(drone.node, "mission aborted by the controller")
-        self._scene.run.testbed.revoke(drone.node)
+        self._aborted.add(drone.node)
+        self._issue([drone.node])
 
     def lose_contact(self, drone: VirtualDrone, duration: float, at: Trigger | None = None) -> None:
         """Interrupt the contact of this controller to a drone. The drone keeps its Grants and continues its flight.
@@ -338,7 +344,9 @@ class VirtualController:
     def _issue(self, nodes: Iterable[str]) -> None:
         reachable = {node for node in nodes if not self._silent(node)}
         self._pending |= set(nodes) - reachable
-        self._scene.reissue(self._restrictions, reachable)
+        for node in reachable & self._aborted:
+            self._scene.run.testbed.revoke(node)
+        self._scene.reissue(self._restrictions, reachable - self._aborted)
 
 
 class Scene:
@@ -357,6 +365,9 @@ class Scene:
             base: Base directory of relative paths. Default: the working directory.
             speedup: Factor of real time. Default: 4, and as fast as possible for vehicles alone.
             seed: Seed of noise and wind.
+
+        Raises:
+            ExperimentError: The folder contains files that are not of an earlier test.
         """
         self.folder = folder.absolute()
         self.base = base or Path.cwd()
@@ -369,9 +380,12 @@ class Scene:
         self._outcome: Outcome | None = None
         self._began = False
         self._wind: dict[str, float] = {}
+        self._issued: list[Restriction] = []
         self._changes = itertools.count(1)
+        _require_replaceable(self.folder)
         shutil.rmtree(self.folder, ignore_errors=True)
         self.folder.mkdir(parents=True)
+        (self.folder / DEFINITION).touch()
 
     def __enter__(self) -> Self:
         return self
@@ -380,7 +394,13 @@ class Scene:
         self.close()
 
     def vController(self) -> VirtualController:  # noqa: N802 - term of the field
-        """Return a new virtual controller."""
+        """Return the virtual controller of the test.
+
+        Raises:
+            ExperimentError: The test has a controller already.
+        """
+        if self._controllers:
+            raise ExperimentError("a test has one controller; vController() was called before")
         controller = VirtualController(self)
         self._controllers.append(controller)
         return controller
@@ -501,7 +521,7 @@ class Scene:
             return
         try:
             content = self._experiment()
-            (self.folder / "experiment.yaml").write_text(yaml.safe_dump(content, sort_keys=False))
+            (self.folder / DEFINITION).write_text(yaml.safe_dump(content, sort_keys=False))
             experiment = parse({**content, "settle": SETTLE_S})
         except InvalidObject as error:
             raise ExperimentError(str(error)) from None
@@ -577,19 +597,21 @@ class Scene:
         return text
 
     def reissue(self, restrictions: Sequence[Restriction], nodes: Iterable[str]) -> None:
-        """Plan the applications with additional restrictions, and replace the Grants of drones.
+        """Replace the Grants of drones by Grants with additional restrictions. The plans stay.
 
         Raises:
-            ExperimentError: An application cannot be planned.
+            ExperimentError: A restriction is invalid.
         """
         chosen = set(nodes)
         if not chosen:
             return
         paths = [self.folder / path for path in self.run.experiment.manifests]
+        planned = read_all_manifests(paths)
+        self._issued += restrictions
         manifests = [manifest for restriction in restrictions for manifest in restriction.manifests()]
         if manifests:
             paths.append(self._write(f"restrictions-{next(self._changes)}.yaml", manifests))
-        grants = [spec for spec in planned_grants(read_all_manifests(paths)) if spec.node in chosen]
+        grants = [spec for spec in planned_grants(planned, read_all_manifests(paths)) if spec.node in chosen]
         self.run.testbed.reissue(grants)
 
     def manifest_waypoints(self) -> tuple[Waypoint, ...]:
@@ -642,16 +664,18 @@ class Scene:
     def _manifests(self) -> list[str]:
         """Write the manifests of flight plans, and return the paths of all manifests."""
         paths = []
+        manifests: list[Manifest] = []
         for drone in self._drones:
             if (drone.plan is None) == (not drone.manifests):
                 raise ExperimentError(f"{drone.name} needs a flight plan: call either set_plan() or set_manifests()")
             paths += [str(path.absolute()) for path in drone.manifests]
             if drone.plan is not None and drone.home is not None:
-                manifests = drone_manifests(
+                manifests += drone_manifests(
                     drone.node, _component(drone), drone.home, drone.plan,
                     resources=drone.resources, camera=drone.world is not None,
                 )  # fmt: skip
-                paths.append(self._write(f"{drone.node}.yaml", manifests).name)
+        if manifests:
+            paths.append(self._write("manifests.yaml", manifests).name)
         return list(dict.fromkeys(paths))
 
     def _program_entries(self, drone: VirtualDrone) -> list[dict[str, Any]]:
@@ -674,12 +698,12 @@ class Scene:
 
     def _write(self, name: str, manifests: Sequence[Manifest]) -> Path:
         path = self.folder / name
-        unique = {(body["kind"], body["metadata"]["name"]): body for body in manifests}
-        path.write_text(yaml.safe_dump_all(unique.values(), sort_keys=False))
+        path.write_text(yaml.safe_dump_all(merged(manifests), sort_keys=False))
         return path
 
     def _zones(self) -> dict[str, NamedZone]:
         restrictions = [r for drone in self._drones if drone.plan is not None for r in drone.plan.restrictions]
+        restrictions += self._issued
         return {
             r.name: NamedZone.model_validate({"name": r.name, "area": r.area})
             for r in restrictions
@@ -701,6 +725,16 @@ class Scene:
             texts = self._run.flights[drone.node].texts[-_LOG_LINES:]
             lines += [f"--- autopilot of {drone.name}", *(f"{text.time_s:7.1f} s  {text.text}" for text in texts)]
         return lines
+
+
+def _require_replaceable(folder: Path) -> None:
+    """Check that a folder is empty, or that it is the folder of an earlier test.
+
+    Raises:
+        ExperimentError: The folder contains other files.
+    """
+    if folder.exists() and any(folder.iterdir()) and not (folder / DEFINITION).exists():
+        raise ExperimentError(f"{folder} contains files and no earlier test; specify a new folder")
 
 
 def _component(drone: VirtualDrone) -> str:

@@ -25,7 +25,7 @@ from fractus_testing import (
     stay_inside,
     until,
 )
-from fractus_testing.flight_plan import drone_manifests
+from fractus_testing.flight_plan import drone_manifests, merged
 
 HOME = (50.8637, 4.6785, 25.0)
 TASK = ({"do": "takeoff", "alt": 5}, {"do": "goto", "north": 10, "east": 0, "alt": 5}, {"do": "returnToLaunch"})
@@ -106,11 +106,42 @@ def test_manifests_of_a_flight_plan_can_be_planned(tmp_path: Path) -> None:
     assert {service.service for service in grant.services} == {"mobility", "camera"}
 
 
+def test_drones_share_the_restrictions_of_their_plans(tmp_path: Path) -> None:
+    import yaml
+
+    plan = FlightPlan(path=PATH, restrictions=(no_fly("hospital", circle(50.8650, 4.6785, 20)),))
+    homes = {"one": HOME, "two": (HOME[0], HOME[1] + 0.0006, HOME[2])}
+    manifests = [
+        manifest
+        for name, home in homes.items()
+        for manifest in drone_manifests(name, f"App-{name}", home, plan, resources=Resources(), camera=False)
+    ]
+    (tmp_path / "plan.yaml").write_text(yaml.safe_dump_all(merged(manifests)))
+    specs = planned_grants(read_all_manifests([tmp_path / "plan.yaml"]))
+    assert {(spec.node, spec.component) for spec in specs} == {("one", "App-one"), ("two", "App-two")}
+    other = no_fly("hospital", circle(50.8650, 4.6785, 30)).manifests()
+    with pytest.raises(ExperimentError, match="two restrictions are named hospital, but their Zone differs"):
+        merged([*manifests, *other])
+
+
+def test_folder_with_other_files_is_not_replaced(tmp_path: Path) -> None:
+    (tmp_path / "thesis.txt").write_text("important")
+    with pytest.raises(ExperimentError, match="contains files and no earlier test; specify a new folder"):
+        Scene(tmp_path)
+    assert (tmp_path / "thesis.txt").exists()
+    (tmp_path / "experiment.yaml").touch()
+    Scene(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["experiment.yaml"]
+
+
 def test_wrong_use_is_refused_with_a_remedy(scene: Scene) -> None:
     with pytest.raises(ExperimentError, match="mode hitl is not supported; use sitl"):
         scene.vDrone("vDrone-1", "hitl")
     with pytest.raises(ExperimentError, match="fdm gazebo is not supported; use builtin"):
         scene.vDrone("vDrone-1", fdm="gazebo")
+    scene.vController()
+    with pytest.raises(ExperimentError, match="a test has one controller"):
+        scene.vController()
     drone = scene.vDrone("vDrone-1")
     with pytest.raises(ExperimentError, match="names must be unique in lower case"):
         scene.vDrone("VDRONE-1")

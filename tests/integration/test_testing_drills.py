@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -179,6 +180,17 @@ def test_examples_pass(tmp_path: Path) -> None:
         str(EXAMPLES),
     ]
     result = subprocess.run(command, cwd=EXAMPLES, env=dict(os.environ), capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stdout + result.stderr
+
+
+def test_first_test_of_the_page_passes(tmp_path: Path) -> None:
+    page = (EXAMPLES.parents[1] / "docs" / "testing.md").read_text()
+    program, test = re.findall(r"```python\n(.*?)```", page, flags=re.DOTALL)[:2]
+    (tmp_path / "pilot.py").write_text(program)
+    (tmp_path / "test_pilot.py").write_text(test)
+    result = subprocess.run(
+        [sys.executable, "-m", "pytest", "-q"], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
     assert result.returncode == 0, result.stdout + result.stderr
 
 

@@ -184,8 +184,12 @@ def read_all_manifests(paths: Sequence[Path]) -> Manifests:
         raise ExperimentError(str(error)) from None
 
 
-def planned_grants(manifests: Manifests) -> Iterable[GrantSpec]:
+def planned_grants(manifests: Manifests, changed: Manifests | None = None) -> Iterable[GrantSpec]:
     """Yield the Grants that the operator would create.
+
+    Args:
+        manifests: Manifests from which the applications are planned.
+        changed: Manifests of a later time with other policies. The plan stays, as for a drone in flight. None: `manifests`.
 
     Raises:
         ExperimentError: An application cannot be planned.
@@ -199,7 +203,7 @@ def planned_grants(manifests: Manifests) -> Iterable[GrantSpec]:
         name = decision.application.name
         if decision.plan is None:
             raise ExperimentError(f"Application {name} cannot be planned: {decision.refusal}")
-        yield from compile_grants(decision.application, decision.plan, manifests.inventory(), settings)
+        yield from compile_grants(decision.application, decision.plan, (changed or manifests).inventory(), settings)
 
 
 def grant_manifest(spec: GrantSpec) -> dict[str, Any]:

@@ -32,6 +32,12 @@ pytestmark = [pytest.mark.slow, pytest.mark.fractus(speedup=2)]
 
 HOME = (50.8637, 4.6785, 25.0)
 PATH = ((50.8640, 4.6785, 10.0), (50.8640, 4.6791, 10.0), (50.8637, 4.6791, 10.0))
+SAFETY_RADIUS_M = 7.0
+"""Half the width of the corridor along the path."""
+
+KEPT_M = 1.0
+"""Distance that a drone keeps from the border of the corridor at least: the margin, less a deviation of the vehicle."""
+
 EXAMPLES = Path(__file__).parents[2] / "examples" / "testing"
 PILOT = """
 import fractus
@@ -89,8 +95,8 @@ def test_attack_is_prevented_and_the_drone_returns(fractus: Scene, attack: App, 
     results.check_audit()
     if violation is not None:
         results.check_violations("vDrone-1", type=violation)  # type: ignore[arg-type]
-    corridor_end = PATH[0][0] + 12 / 111_320
-    assert max(sample.place.lat for sample in results.track("vDrone-1").samples) < corridor_end
+    border = PATH[0][0] + SAFETY_RADIUS_M / 111_320
+    assert max(sample.place.lat for sample in results.track("vDrone-1").samples) < border - KEPT_M / 111_320
 
 
 def test_pictures_of_others_cannot_be_read_or_deleted(fractus: Scene) -> None:

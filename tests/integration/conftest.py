@@ -50,9 +50,27 @@ def control_plane(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ControlP
         plane.stop()
 
 
+@pytest.fixture(scope="session")
+def kept_operator(control_plane: ControlPlane, tmp_path_factory: pytest.TempPathFactory) -> Iterator[OperatorProcess]:
+    """The operator of consecutive tests that use the fixture `operator`. A start takes about 3 s of CPU time."""
+    process = OperatorProcess(control_plane.kubeconfig, tmp_path_factory.mktemp("operator") / "operator.log")
+    yield process
+    _stop(process)
+
+
+def _stop(process: OperatorProcess) -> None:
+    code = process.stop() if process.running else None
+    # SIGTERM kills a process that has not set its signal handlers yet.
+    assert code in (0, -signal.SIGTERM, None), f"the operator exited with code {code}"
+
+
 @pytest.fixture
-def world(control_plane: ControlPlane) -> Iterator[World]:
+def world(
+    control_plane: ControlPlane, kept_operator: OperatorProcess, request: pytest.FixtureRequest
+) -> Iterator[World]:
     """Objects of one drone, three edge nodes and a cloud node at the API server."""
+    if "operator" not in request.fixturenames:
+        _stop(kept_operator)
     world = World(control_plane)
     world.furnish()
     yield world
@@ -69,15 +87,13 @@ def chart(control_plane: ControlPlane) -> Iterator[None]:
 
 
 @pytest.fixture
-def operator(control_plane: ControlPlane, world: World, tmp_path: Path) -> Iterator[OperatorProcess]:
+def operator(kept_operator: OperatorProcess, world: World) -> Iterator[OperatorProcess]:
     """A running operator. A failed test prints its log."""
-    process = OperatorProcess(control_plane.kubeconfig, tmp_path / "operator.log")
-    process.start()
-    yield process
-    code = process.stop() if process.running else None
-    print(process.log())
-    # SIGTERM kills a process that has not set its signal handlers yet.
-    assert code in (0, -signal.SIGTERM, None), f"the operator exited with code {code}"
+    kept_operator.begin_log()
+    if not kept_operator.running:
+        kept_operator.start()
+    yield kept_operator
+    print(kept_operator.log())
 
 
 @pytest.fixture

@@ -292,6 +292,7 @@ class OperatorProcess:
         # The process keeps its identity when it is restarted, like a pod.
         self._settings = {"FRACTUS_IDENTITY": identity, **settings}
         self._log = log
+        self._log_begin = 0
         self.health = f"http://127.0.0.1:{free_port()}/healthz"
         self._process: subprocess.Popen[bytes] | None = None
 
@@ -327,8 +328,12 @@ class OperatorProcess:
         assert self._process is not None
         self._process.send_signal(number)
 
+    def begin_log(self) -> None:
+        """Let `log` return only what the operator writes from now on."""
+        self._log_begin = self._log.stat().st_size if self._log.exists() else 0
+
     def log(self) -> str:
-        return self._log.read_text()
+        return self._log.read_bytes()[self._log_begin :].decode()
 
 
 @contextmanager

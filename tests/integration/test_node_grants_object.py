@@ -17,7 +17,9 @@ NODE_GRANTS = f"{FRACTUS}/namespaces/{NODES}/nodegrants"
 
 
 @pytest.fixture
-def operator(control_plane: ControlPlane, world: World, chart: None, tmp_path: Path) -> Iterator[OperatorProcess]:
+def operator_of_chart(
+    control_plane: ControlPlane, world: World, chart: None, tmp_path: Path
+) -> Iterator[OperatorProcess]:
     """The operator with the token of its account. The chart's roles and admission policies apply to this account."""
     cluster = {"server": control_plane.server, "certificate-authority": str(control_plane.ca)}
     config = {
@@ -49,7 +51,7 @@ def carried(world: World, node: str) -> dict[str, Body] | None:
 
 
 def test_node_grants_object_follows_grants_and_returns_reports(
-    world: World, operator: OperatorProcess, namespace: str
+    world: World, operator_of_chart: OperatorProcess, namespace: str
 ) -> None:
     wait_for(lambda: carried(world, "drone-1") == {}, "the NodeGrants object of drone-1, without Grants")
     for path in NODE_OBJECTS:
@@ -77,10 +79,10 @@ def test_node_grants_object_follows_grants_and_returns_reports(
     wait_for(lambda: status() == {"phase": "Active", "message": "", "observedGeneration": 1}, "the status of the Grant")
 
     # The restarted operator processes reports that arrived while it did not run.
-    operator.stop()
+    operator_of_chart.stop()
     report("edge-1", "Failed", "not its own")
     report("drone-1", "Complete", "flown")
-    operator.start()
+    operator_of_chart.start()
     wait_for(lambda: status().get("phase") == "Complete", "the new status of the Grant after a restart")
     report("drone-1", "Active")
     wait_for(lambda: world.status(namespace).get("phase") in {"Returning", "Completed"}, "the end of the mission")

@@ -329,7 +329,7 @@ class Responder:
                 await context.abort(grpc.StatusCode.UNAVAILABLE, str(error))
             except Exception as error:
                 log.exception("%s: the handler failed", name)
-                await context.abort(grpc.StatusCode.UNKNOWN, f"{name}: {type(error).__name__}")
+                await context.abort(grpc.StatusCode.UNKNOWN, f"the handler failed ({type(error).__name__})")
             raise AssertionError("abort does not return")
 
         return grpc.unary_unary_rpc_method_handler(handle)

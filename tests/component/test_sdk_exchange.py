@@ -158,6 +158,14 @@ async def test_refused_request_is_not_retried() -> None:
     assert asking.repeated == 0
 
 
+async def test_error_of_failed_handler_names_method_once() -> None:
+    worker = Worker()
+    worker.failures = [KeyError("content of the request")]
+    async with worker.serving() as responder, Requester(f"127.0.0.1:{responder.port}") as asking:
+        with pytest.raises(InvalidRequest, match=r"^work on 127\.0\.0\.1:\d+: the handler failed \(KeyError\)$"):
+            await asking.request("work", b"x")
+
+
 async def test_requester_finds_restarted_server() -> None:
     worker = Worker()
     async with worker.serving() as responder:

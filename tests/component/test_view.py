@@ -18,6 +18,7 @@ import pytest
 from aiohttp import ClientSession, hdrs, web
 from click.testing import CliRunner
 from fractus_cluster.ports import free_port
+from fractus_runtime.mcap_tail import DamagedFile, Tail
 from fractus_runtime.metrics import metrics_text
 from fractus_services.recording import messages
 from fractus_services.recording.messages import Record
@@ -27,7 +28,6 @@ from fractus_view.command import ServerOptions, view
 from fractus_view.connections import ConnectionLimit
 from fractus_view.events import Event, Fix, Problem, State, Verdict
 from fractus_view.hub import RECENT, TRAIL, Hub, Trail
-from fractus_view.mcap_tail import DamagedFile, Tail
 from fractus_view.server import PAGE, ViewServer
 from fractus_view.sources import GrowingRecordings, Replay
 from fractus_view.typescript import typescript_types
@@ -369,7 +369,16 @@ async def test_connection_without_authorized_request_is_closed(
 async def test_requests_without_token_are_refused(served: tuple[str, ViewServer]) -> None:
     address, live_view = served
     async with ClientSession() as session:
-        for path in ("/", "/stream", "/pictures/0-0-0", "/?token=wrong", "/?token=%FF", "/sources.sha256", "/nothing"):
+        for path in (
+            "/",
+            "/stream",
+            "/pictures/0-0-0",
+            "/thumbnails/0-0-0",
+            "/?token=wrong",
+            "/?token=%FF",
+            "/sources.sha256",
+            "/nothing",
+        ):
             for headers in ({}, {hdrs.AUTHORIZATION: "Bearer wrong"}, {hdrs.COOKIE: f"fractus-view-{address[-5:]}=x"}):
                 async with session.get(address + path, headers=headers) as response:
                     assert response.status == 401

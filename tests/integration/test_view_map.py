@@ -10,7 +10,20 @@ import pytest
 from axe_playwright_python.sync_playwright import Axe
 from browser import CHROMIUM, SOFTWARE_GL, TIMEOUT_MS, launched, opened
 from fractus_view.base_map import open_map
-from fractus_view.events import Areas, Contact, Event, Feature, Fix, Policies, Policy, Records, State, Verdict
+from fractus_view.events import (
+    Areas,
+    Contact,
+    Event,
+    Feature,
+    Fix,
+    Picture,
+    PictureSource,
+    Policies,
+    Policy,
+    Records,
+    State,
+    Verdict,
+)
 from page_server import PageSource
 from PIL import Image
 from playwright.sync_api import Browser, Page, expect, sync_playwright
@@ -199,3 +212,21 @@ def test_view_map_shows_offline_base_map_with_attribution(browser: Browser, sour
         expect(page.locator("#attribution")).to_have_text("Land registry")
         # Tile at 70 % above the plain background.
         wait_for_pixels(page, (70, 211, 73), 10_000)
+
+
+def test_view_of_a_cluster_shows_thumbnails_and_states_why_some_may_be_missing(
+    browser: Browser, source: PageSource
+) -> None:
+    buffer = io.BytesIO()
+    Image.new("RGB", (2_000, 1_500), (10, 120, 200)).save(buffer, "JPEG")
+    source.pictures["cluster-0"] = buffer.getvalue()
+    source.publish(Contact(T_MS, None, ""), *drone(T_MS, 0.0))
+    with source.serving() as address, opened(browser, address) as page:
+        expect(page.locator("#drones")).to_contain_text("in the air", timeout=TIMEOUT_MS)
+        expect(page.locator("#pictures-section")).to_be_hidden()
+        source.publish(PictureSource(T_MS, ""), Picture("drone-1", T_MS, "cluster-0"))
+        image = page.get_by_role("img", name="Picture that drone-1 took at 20:26:40")
+        expect(image).to_be_visible(timeout=TIMEOUT_MS)
+        page.wait_for_function("document.querySelector('#pictures img').naturalWidth === 320")
+        source.publish(PictureSource(T_MS, "drone-1: pods is forbidden"))
+        expect(page.locator("#pictures-problem")).to_have_text("Pictures may be missing: drone-1: pods is forbidden")

@@ -20,6 +20,7 @@ from fractus_cli.zones import zones
 from fractus_core.api.grants import Grant
 from fractus_core.api.nodes import Drone
 from fractus_runtime.files import MAX_JSON_DEPTH, UnsuitableFile, parse_json, path_text, read_file, read_set
+from fractus_runtime.mcap_tail import Tail
 from fractus_services.auth import TlsFiles
 from fractus_services.camera.drivers.geotagged_directory import read_position
 from fractus_services.mobility.authority.journal import Journal
@@ -28,7 +29,6 @@ from fractus_services.node_description import NodeDescription
 from fractus_services.options import CannotServe
 from fractus_view.command import view
 from fractus_view.events import Problem
-from fractus_view.mcap_tail import Tail
 from fractus_view.sources import GrowingRecordings
 from odd_files import ODD, odd_files
 from policy_world import spec

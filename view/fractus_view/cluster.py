@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 from operator import attrgetter
 from typing import Any, TypeVar
 
@@ -14,6 +14,7 @@ from fractus_runtime.metrics import gauge
 from prometheus_client import Metric
 
 from fractus_view import objects
+from fractus_view.cluster_pictures import ClusterPictures
 from fractus_view.events import Applications, Areas, Contact, Event, Gone, Links, Policies, Problem
 from fractus_view.flight_times import FlightTimes
 from fractus_view.hub import Hub
@@ -47,6 +48,7 @@ class ClusterSource:
         namespace: Namespace of the shown applications. An empty string shows all namespaces.
         now_ms: Returns the current time in Unix milliseconds.
         system_namespace: Namespace of the mobility and camera services.
+        kubectl: Command of kubectl with the options that select the cluster, to show pictures. Empty: no pictures.
     """
 
     def __init__(
@@ -55,6 +57,7 @@ class ClusterSource:
         namespace: str = "",
         now_ms: Callable[[], int] = lambda: round(time.time() * 1000),
         system_namespace: str = "fractus-system",
+        kubectl: Sequence[str] = (),
     ) -> None:
         self._client = client
         self._namespace = namespace
@@ -69,18 +72,27 @@ class ClusterSource:
             client,
             system_namespace,
             namespace=namespace,
-            drones=self._drones_with_verdicts,
+            drones=self._followed_drones,
             publish=self._hub.publish,
             now_ms=now_ms,
         )
+        self._pictures: ClusterPictures | None = None
+        if kubectl:
+            self._pictures = ClusterPictures(
+                client,
+                kubectl,
+                system_namespace,
+                drones=self._followed_drones,
+                publish=self._hub.publish,
+                now_ms=now_ms,
+            )
         self._informers: dict[type[api.Resource], Informer[Any]] = {
             model: self._informer(model, namespace if model.NAMESPACED else "") for model in KINDS
         }
 
     def picture(self, id_: str) -> bytes | None:
-        """Return None, because a cluster stores no pictures."""
-        del id_
-        return None
+        """Return a thumbnail by its id, or None if there is none."""
+        return self._pictures.picture(id_) if self._pictures is not None else None
 
     def stream(self, last_id: str) -> AsyncIterator[bytes]:
         """Yield the current state, then changes."""
@@ -103,6 +115,8 @@ class ClusterSource:
             group.create_task(self._report_contact())
             group.create_task(self._publish_changes())
             group.create_task(self._verdicts.run())
+            if self._pictures is not None:
+                group.create_task(self._pictures.run())
 
     def metrics(self) -> Iterator[Metric]:
         """Yield the metrics of the watches."""
@@ -188,7 +202,7 @@ class ClusterSource:
         if fix is not None:
             yield fix
 
-    def _drones_with_verdicts(self) -> frozenset[str]:
+    def _followed_drones(self) -> frozenset[str]:
         """Return the drones with a running application, and without a selected namespace also all drones in the air."""
         drones = set(objects.assigned_drones(self._all(api.Application)))
         if not self._namespace:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import secrets
+import shutil
 import signal
 from collections.abc import Callable, Iterable
 from contextlib import aclosing, suppress
@@ -15,6 +16,7 @@ import click
 from aiohttp import web
 from fractus_runtime.files import open_file, path_text, read_file
 from fractus_runtime.kubernetes import Client, KubeError, Unconfigured, from_environment, kubeconfig
+from fractus_runtime.mcap_tail import MAGIC
 from fractus_runtime.metrics import serve_metrics
 from fractus_runtime.open_files import TooFewOpenFiles, raise_open_files
 from prometheus_client import Metric
@@ -22,7 +24,6 @@ from prometheus_client import Metric
 from fractus_view.base_map import BaseMap, UnsuitableMap, open_map
 from fractus_view.cluster import ClusterSource
 from fractus_view.connections import ConnectionLimit
-from fractus_view.mcap_tail import MAGIC
 from fractus_view.server import ViewServer
 from fractus_view.sources import GrowingRecordings, Replay, Source
 
@@ -93,6 +94,11 @@ def _parse_address(_context: click.Context, _option: click.Parameter, text: str)
     help="Kubeconfig of the cluster. Default: KUBECONFIG, or ~/.kube/config.",
 )
 @click.option(
+    "--pictures",
+    is_flag=True,
+    help="Show thumbnails of pictures from a cluster, after privacy filters. Needs kubectl and the permission pods/exec.",
+)
+@click.option(
     "--listen",
     callback=_parse_address,
     default=DEFAULT_LISTEN,
@@ -133,6 +139,7 @@ def view(
     system_namespace: str,
     context: str | None,
     config: Path | None,
+    pictures: bool,
     listen: tuple[str, int],
     hostnames: tuple[str, ...],
     token_file: Path | None,
@@ -146,7 +153,7 @@ def view(
     The command prints the address of the page, which contains an access token, and serves the page until interrupted. The page
     is read-only.
     """
-    uses_cluster = bool(namespace or context or config)
+    uses_cluster = bool(namespace or context or config or pictures)
     if bool(recordings) + (directory is not None) + uses_cluster > 1:
         raise click.UsageError("specify only one source: recordings to replay, --recordings, or options of a cluster")
     options = ServerOptions(*listen, hostnames, token_file, metrics, _open_map(map_path))
@@ -155,7 +162,16 @@ def view(
     elif recordings:
         asyncio.run(_serve(_replay(recordings), options))
     else:
-        asyncio.run(_serve_cluster(config, context, namespace, system_namespace, options))
+        asyncio.run(
+            _serve_cluster(
+                config,
+                context,
+                options,
+                namespace=namespace,
+                system_namespace=system_namespace,
+                pictures=pictures,
+            )
+        )
 
 
 def _open_map(path: Path | None) -> BaseMap | None:
@@ -224,16 +240,40 @@ def _replay(recordings: tuple[Path, ...]) -> Source:
     return Replay(recordings)
 
 
+def _kubectl(config: Path | None, context: str | None) -> tuple[str, ...]:
+    """Return the command of kubectl for the selected cluster.
+
+    Raises:
+        click.ClickException: kubectl is not installed.
+    """
+    path = shutil.which("kubectl")
+    if path is None:
+        raise click.ClickException("--pictures needs kubectl, which is not installed; install it, or omit --pictures")
+    command = [path]
+    if config is not None:
+        command.append(f"--kubeconfig={config}")
+    if context is not None:
+        command.append(f"--context={context}")
+    return tuple(command)
+
+
 async def _serve_cluster(
-    config: Path | None, context: str | None, namespace: str, system_namespace: str, options: ServerOptions
+    config: Path | None,
+    context: str | None,
+    options: ServerOptions,
+    *,
+    namespace: str,
+    system_namespace: str,
+    pictures: bool,
 ) -> None:
+    kubectl = _kubectl(config, context) if pictures else ()
     try:
         access = await (kubeconfig(config, context) if config is not None else from_environment(context))
         client = Client(access, "fractus-view")
     except Unconfigured as error:
         raise click.ClickException(f"{error}; or specify recordings to replay") from error
     async with aclosing(client):
-        cluster = ClusterSource(client, namespace, system_namespace=system_namespace)
+        cluster = ClusterSource(client, namespace, system_namespace=system_namespace, kubectl=kubectl)
         try:
             await cluster.check()
         except KubeError as error:

@@ -249,6 +249,18 @@ class Records:
 
 
 @dataclass(frozen=True, slots=True)
+class PictureSource:
+    """Completeness of the pictures of a cluster. Without this event, a cluster provides no pictures.
+
+    Attributes:
+        problem: Reason why pictures may be missing, or an empty string.
+    """
+
+    time_ms: int
+    problem: str
+
+
+@dataclass(frozen=True, slots=True)
 class Picture:
     """Picture after privacy filters. The page requests it by `id`."""
 
@@ -277,6 +289,7 @@ Event = (
     | Policies
     | Contact
     | Records
+    | PictureSource
     | Picture
     | Problem
 )

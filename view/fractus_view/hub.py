@@ -19,6 +19,7 @@ from fractus_view.events import (
     Links,
     Note,
     Picture,
+    PictureSource,
     Policies,
     Problem,
     Records,
@@ -97,7 +98,7 @@ class Hub:
                 self._current[State, event.drone] = event
             case Areas():
                 self._current[Areas, event.origin] = event
-            case Applications() | Links() | Policies() | Contact() | Records():
+            case Applications() | Links() | Policies() | Contact() | Records() | PictureSource():
                 self._current[type(event), ""] = event
             case Gone():
                 self._trails.pop(event.drone, None)

@@ -15,6 +15,7 @@ from pathlib import Path
 
 from aiohttp import hdrs, web
 from fractus_runtime.metrics import gauge
+from fractus_runtime.thumbnails import thumbnail
 from prometheus_client import Counter, Metric
 
 from fractus_view.base_map import MAX_ZOOM, BaseMap, image_type
@@ -99,6 +100,7 @@ class ViewServer:
         application.router.add_get(HEALTH_PATH, self._health)
         application.router.add_get("/stream", self._stream)
         application.router.add_get("/pictures/{id}", self._picture)
+        application.router.add_get("/thumbnails/{id}", self._thumbnail)
         application.router.add_get("/map.json", self._map)
         application.router.add_get(r"/tiles/{zoom:[0-9]{1,2}}/{x:[0-9]{1,8}}/{y:[0-9]{1,8}}", self._tile)
         application.cleanup_ctx.append(self._run)
@@ -168,13 +170,12 @@ class ViewServer:
     def _is_token(self, token: str) -> bool:
         return hmac.compare_digest(token.encode(errors="replace"), self.token.encode())
 
-    async def _picture(self, request: web.Request) -> web.StreamResponse:
+    async def _thumbnail(self, request: web.Request) -> web.Response:
         jpeg = await asyncio.to_thread(self.source.picture, request.match_info["id"])
-        if jpeg is None:
-            return web.Response(
-                status=404, text="picture not found; its recording may have been removed to free space\n"
-            )
-        return web.Response(body=jpeg, content_type="image/jpeg", headers={hdrs.CACHE_CONTROL: "private, max-age=3600"})
+        return _jpeg(await asyncio.to_thread(thumbnail, jpeg) if jpeg is not None else None)
+
+    async def _picture(self, request: web.Request) -> web.Response:
+        return _jpeg(await asyncio.to_thread(self.source.picture, request.match_info["id"]))
 
     async def _map(self, _request: web.Request) -> web.Response:
         """Return the description of the base map as JSON, or null without a base map."""
@@ -227,6 +228,13 @@ class ViewServer:
                     await response.write(message)
         finally:
             pending.cancel()
+
+
+def _jpeg(data: bytes | None) -> web.Response:
+    """Return the response with a picture."""
+    if data is None:
+        return web.Response(status=404, text="picture not found; its recording may have been removed to free space\n")
+    return web.Response(body=data, content_type="image/jpeg", headers={hdrs.CACHE_CONTROL: "private, max-age=3600"})
 
 
 def _log_failure(task: asyncio.Task[None]) -> None:

@@ -14,10 +14,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Protocol
 
+from fractus_runtime.mcap_tail import DamagedFile, MessageLocation, Tail, message_at
+
 from fractus_view.events import END, RESET, Event, Problem, State, encode, stream_message
 from fractus_view.flight_times import FlightTimes
 from fractus_view.hub import Hub
-from fractus_view.mcap_tail import DamagedFile, MessageLocation, Tail, message_at
 from fractus_view.translation import ON_THE_GROUND, Translator
 
 log = logging.getLogger(__name__)

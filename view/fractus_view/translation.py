@@ -7,9 +7,9 @@ from collections.abc import Iterator, Mapping
 from typing import Any, cast
 
 from fractus_runtime.files import parse_json
+from fractus_runtime.mcap_tail import RecordedMessage
 
 from fractus_view.events import Areas, Event, Feature, Fix, Note, Picture, State, Verdict
-from fractus_view.mcap_tail import RecordedMessage
 
 FIX_INTERVAL_MS = 200
 """Interval between two published positions of a moving drone. Recordings contain 20 positions per second."""

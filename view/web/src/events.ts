@@ -224,6 +224,18 @@ export interface Records {
   verdicts_problem: string;
 }
 
+/**
+ * Completeness of the pictures of a cluster. Without this event, a cluster provides no pictures.
+ *
+ * Attributes:
+ *     problem: Reason why pictures may be missing, or an empty string.
+ */
+export interface PictureSource {
+  type: "picturesource";
+  time_ms: number;
+  problem: string;
+}
+
 /** Picture after privacy filters. The page requests it by `id`. */
 export interface Picture {
   type: "picture";
@@ -251,6 +263,7 @@ export type Event =
   | Policies
   | Contact
   | Records
+  | PictureSource
   | Picture
   | Problem;
 

@@ -102,7 +102,9 @@ export class Lists {
     const model = this.model;
     // Hide lists that a cluster does not report. An empty list would suggest that there were no pictures or log lines.
     const fromCluster = model.contact !== undefined;
-    byId("pictures-section").hidden = fromCluster;
+    byId("pictures-section").hidden = fromCluster && model.pictureSource === undefined;
+    const pictureProblem = model.pictureSource?.problem;
+    setText(byId("pictures-problem"), pictureProblem ? `Pictures may be missing: ${pictureProblem}` : "");
     byId("log-section").hidden = fromCluster;
     // A cluster reports only calls that policies changed or refused.
     byId("verdict-filter-label").hidden = fromCluster;
@@ -261,7 +263,7 @@ export class Lists {
       link.href = `/pictures/${picture.id}`;
       link.target = "_blank";
       const image = element("img");
-      image.src = link.href;
+      image.src = `/thumbnails/${picture.id}`;
       image.alt = `Picture that ${picture.drone} took at ${clock(picture.time_ms)}`;
       image.width = 160;
       image.height = 90;

@@ -1,6 +1,6 @@
 // Stores all received events in order of time, so that the page can show any past time.
 
-import type { Applications, Areas, Contact, Event, Feature, Fix, Link, Links, Note, Picture, Policies, Problem, Records, State, Verdict } from "./events";
+import type { Applications, Areas, Contact, Event, Feature, Fix, Link, Links, Note, Picture, PictureSource, Policies, Problem, Records, State, Verdict } from "./events";
 
 const MAX_FIXES = 20_000;
 const MAX_EVENTS = 5_000;
@@ -118,6 +118,7 @@ export class Model {
   private readonly links = new Series<Links>(MAX_LISTS);
   contact: Contact | undefined;
   records: Records | undefined;
+  pictureSource: PictureSource | undefined;
   private readonly areas = new Map<string, Series<Areas>>();
   /** Time of the first and of the last event. */
   begin = Infinity;
@@ -146,6 +147,9 @@ export class Model {
         return;
       case "records":
         this.records = event;
+        return;
+      case "picturesource":
+        this.pictureSource = event;
         return;
       case "picture":
         return this.drone(event.drone).pictures.add(event);

@@ -9,11 +9,12 @@ from io import BytesIO
 from pathlib import Path
 from typing import IO, Any
 
-from fractus_runtime.files import open_file, parse_json, path_text
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, Message, Schema
 from mcap.stream_reader import breakup_chunk
+
+from fractus_runtime.files import open_file, parse_json, path_text
 
 MAGIC = b"\x89MCAP0\r\n"
 MAX_RECORD_BYTES = 100_000_000

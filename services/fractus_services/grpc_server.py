@@ -12,6 +12,7 @@ from contextlib import AbstractContextManager, asynccontextmanager, nullcontext
 from typing import Any
 
 import grpc
+from fractus_core.api.methods import Interface, Service
 from fractus_core.api.names import component_name
 from fractus_core.policy.decision_types import Verdict
 from fractus_runtime import tracing
@@ -98,6 +99,8 @@ class CallAdmission(grpc.aio.ServerInterceptor):  # type: ignore[misc]  # grpc h
         translate: Converts an exception of the service to a refusal, or returns None for an unknown exception.
         failed: Callback invoked with a verdict when a call raises an unexpected exception.
         on_passenger: Callback invoked with the Grant of a caller that is not a driver, each time the Grant is read.
+        service: Service whose calls are admitted.
+        interface: Protocol of the calls. The Grant of the caller must list it.
     """
 
     def __init__(
@@ -107,8 +110,13 @@ class CallAdmission(grpc.aio.ServerInterceptor):  # type: ignore[misc]  # grpc h
         translate: Callable[[Exception], Refused | None] = lambda _error: None,
         failed: Callable[[Verdict], None] = lambda _verdict: None,
         on_passenger: Callable[[ActiveGrant], None] = lambda _grant: None,
+        *,
+        service: Service = "mobility",
+        interface: Interface = "grpc",
     ) -> None:
         self._grants = grants
+        self._service = service
+        self._interface = interface
         self._callers = Callers(clock)
         self._translate = translate
         self._failed = failed
@@ -244,7 +252,7 @@ class CallAdmission(grpc.aio.ServerInterceptor):  # type: ignore[misc]  # grpc h
         """Return the Grant of a caller.
 
         Raises:
-            PolicyDenied: The caller has no Grant on this node.
+            PolicyDenied: The caller has no Grant on this node, or its Grant does not list the interface.
         """
         grant = self._grants.active.get(caller.identity)
         if grant is None:
@@ -254,6 +262,12 @@ class CallAdmission(grpc.aio.ServerInterceptor):  # type: ignore[misc]  # grpc h
                 extra={"limit_by": caller.identity},
             )
             raise PolicyDenied("NoGrant", f"{component_name(caller.identity)} has no Grant on this node")
+        if self._interface not in grant.compiled.interfaces[self._service]:
+            raise PolicyDenied(
+                "InterfaceNotGranted",
+                f"the Grant does not permit calls of the {self._service} service over {self._interface}; "
+                f"add {self._interface} to the interfaces of the service in the component",
+            )
         if grant.spec.class_ != "driver":
             self._on_passenger(grant)
         return grant

@@ -11,6 +11,8 @@ from typing import Any, cast
 
 import grpc
 import pytest
+from fractus_core.api.grants import GrantSpec
+from fractus_core.policy.compiled_grant import compile_grant
 from fractus_proto.v1 import types_pb2
 from fractus_services import grpc_server
 from fractus_services.auth import Caller
@@ -157,3 +159,35 @@ def test_caller_without_grant_is_logged(caplog: pytest.LogCaptureFixture) -> Non
         == "policy: call refused because the caller has no Grant on this node (caller=spiffe://fractus.dev/a)"
     )
     assert record.limit_by == "spiffe://fractus.dev/a"  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize(
+    ("interfaces", "interface", "granted"),
+    [
+        (None, "grpc", True),
+        (None, "mavlink", False),
+        (["mavlink"], "grpc", False),
+        (["mavlink"], "mavlink", True),
+        (["grpc", "mavlink"], "mavlink", True),
+    ],
+)
+def test_call_needs_its_interface_in_the_grant(interfaces: list[str] | None, interface: Any, granted: bool) -> None:
+    request: dict[str, Any] = {"service": "mobility", "methods": ["Goto"]}
+    if interfaces is not None:
+        request["interfaces"] = interfaces
+    spec = GrantSpec.model_validate(
+        {
+            "node": "d",
+            "application": {"namespace": "n", "name": "a", "uid": "u"},
+            "component": "C",
+            "instance": "i",
+            "services": [request],
+        }
+    )
+    grants = SimpleNamespace(active={"a": SimpleNamespace(spec=spec, compiled=compile_grant(spec))})
+    calls = CallAdmission(cast("Any", grants), lambda: 0.0, interface=interface)
+    if granted:
+        assert calls.grant_of(Caller("a", math.inf)).spec is spec
+    else:
+        with pytest.raises(PolicyDenied, match=f"over {interface}; add {interface} to the interfaces"):
+            calls.grant_of(Caller("a", math.inf))

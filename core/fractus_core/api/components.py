@@ -10,7 +10,7 @@ from pydantic import Field, WithJsonSchema, model_validator
 
 from fractus_core.api.formats import IMAGE, MOUNT_PATH, VARIABLE
 from fractus_core.api.geometry import Area, Circle, Position
-from fractus_core.api.methods import METHODS_OF, Method, Service
+from fractus_core.api.methods import METHODS_OF, Interface, Method, Service
 from fractus_core.api.model import InvalidObject, Model, Quantity, keyed, quantity
 from fractus_core.api.names import ComponentName, HeuristicKind, Name, PortName, slug
 from fractus_core.api.rules import Violation, one_of, rule
@@ -303,9 +303,23 @@ class ServiceRequest(Model):
 
     service: Service = Field(description="System service of the node on which the component runs.")
     methods: tuple[Method, ...] = Field(min_length=1, max_length=32, description="Methods that the component calls.")
+    interfaces: tuple[Interface, ...] = Field(
+        default=("grpc",),
+        min_length=1,
+        max_length=2,
+        description="Protocols over which the component calls the service: grpc (the SDK), mavlink (an unmodified MAVLink"
+        " program, through the gateway of the node; mobility service only).",
+    )
 
     _mobility_methods = _belong("mobility")
     _camera_methods = _belong("camera")
+
+    @rule(
+        "self.service == 'mobility' || !has(self.interfaces) || !('mavlink' in self.interfaces)",
+        "only the mobility service can be called over mavlink; use grpc for other services",
+    )
+    def _mavlink_service(self) -> Violation:
+        return "interfaces" if self.service != "mobility" and "mavlink" in self.interfaces else None
 
 
 class Start(Model):

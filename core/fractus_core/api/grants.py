@@ -20,6 +20,7 @@ from fractus_core.api.components import (
     ServiceRequest,
 )
 from fractus_core.api.geometry import Area, Point, Position
+from fractus_core.api.methods import Interface, Service
 from fractus_core.api.model import AGE, Conditions, InvalidObject, Model, ObservedGeneration, OpenModel, Resource, keyed
 from fractus_core.api.names import component_identity, is_subdomain
 from fractus_core.api.policies import PolicySpec, ZoneShape
@@ -159,6 +160,13 @@ class GrantSpec(Model):
         """Reason why the mission must not begin yet; empty if it may."""
         names = ", ".join(self.awaits)
         return f"the mission begins when all components are ready; not ready: {names}" if names else ""
+
+    def interfaces(self, service: Service) -> frozenset[Interface]:
+        """Return the protocols over which the instance may call a service: gRPC unless the Grant lists others."""
+        listed: frozenset[Interface] = frozenset(
+            interface for s in self.services if s.service == service for interface in s.interfaces
+        )
+        return listed or frozenset(("grpc",))
 
     def methods(self, service: str) -> frozenset[str]:
         """Return the granted methods of a service. A driver may always get and return control."""

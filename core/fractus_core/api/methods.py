@@ -14,6 +14,9 @@ Method = Literal[MobilityMethod, CameraMethod, ControlMethod]
 
 Service = Literal["mobility", "camera"]
 
+Interface = Literal["grpc", "mavlink"]
+"""Protocol over which a component calls a service: gRPC with the SDK, or MAVLink through the gateway of the node."""
+
 MOBILITY_METHODS: tuple[MobilityMethod, ...] = get_args(MobilityMethod)
 CAMERA_METHODS: tuple[CameraMethod, ...] = get_args(CameraMethod)
 CONTROL_METHODS: tuple[ControlMethod, ...] = get_args(ControlMethod)

@@ -13,7 +13,7 @@ from shapely.geometry.base import BaseGeometry
 from fractus_core.api.components import ServiceRequest
 from fractus_core.api.geometry import AltitudeBand, Area, Point, Reference
 from fractus_core.api.grants import GrantedPolicy, GrantSpec
-from fractus_core.api.methods import METHODS_OF, MOBILITY_METHODS
+from fractus_core.api.methods import METHODS_OF, MOBILITY_METHODS, Interface, Service
 from fractus_core.api.policies import PolicySpec
 from fractus_core.api.schedules import ActiveTime, active_between, active_throughout
 from fractus_core.geo import LocalFrame, area_center, area_polygon, check_extent
@@ -163,6 +163,7 @@ class CompiledGrant:
 
     Attributes:
         methods: Granted methods of all services.
+        interfaces: Protocols over which the instance may call each service.
         denials: Per method, the policies that forbid it.
         allowances: Per method, the policies that grant it at certain places and times. A method without an entry is granted
             everywhere.
@@ -176,6 +177,7 @@ class CompiledGrant:
     identity: str
     frame: LocalFrame
     methods: frozenset[str]
+    interfaces: dict[Service, frozenset[Interface]]
     driver: bool
     max_altitude_m: float | None
     max_speed_mps: float | None
@@ -231,6 +233,7 @@ def compile_grant(spec: GrantSpec, origin: Point | None = None, flat_terrain: bo
         identity=spec.identity,
         frame=frame,
         methods=methods,
+        interfaces={service: spec.interfaces(service) for service in METHODS_OF},
         driver=spec.class_ == "driver",
         max_altitude_m=spec.limits.max_altitude if spec.limits else None,
         max_speed_mps=spec.limits.max_speed if spec.limits else None,

@@ -174,7 +174,7 @@ async def _serve(components: _Components, description: NodeDescription, stop: as
                 retry_s=settings.telemetry_retry_s,
             )
         )
-    admission = CallAdmission(components.grants, clock)
+    admission = CallAdmission(components.grants, clock, service="camera")
     filter_queue = FairQueue(settings.max_requests_per_instance, settings.max_filtering)
     detector = components.authorizer.detector
     capture = ImageCapture(

@@ -8,6 +8,7 @@ from collections.abc import AsyncGenerator, Callable
 from contextlib import aclosing
 from typing import Protocol
 
+from fractus_core.api.methods import Interface
 from fractus_core.api.names import node_identity
 from fractus_core.control import Authority
 from fractus_core.policy.decision_types import Call, PointGimbalArgs, SetSpeedArgs, TakeoffArgs, Verdict
@@ -19,6 +20,7 @@ from fractus_services.errors import AutopilotError, PreconditionFailed, Refused,
 from fractus_services.grant_files import ActiveGrant, GrantFiles
 from fractus_services.grpc_server import CallAdmission
 from fractus_services.mobility.authority.control_store import ControlStore
+from fractus_services.mobility.flight.authorization import CallAuthorizer
 from fractus_services.mobility.flight.service import MobilityService, Progress
 from fractus_services.mobility.rpc.control_streams import ControlStreams
 from fractus_services.mobility.rpc.proto_conversion import (
@@ -58,6 +60,7 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
         on_passenger: Called with the Grant of the caller for every call of a component that is no driver.
         fixed_camera: Returns True if the node description declares a camera that does not move.
         recording_problem: Returns why flights are not recorded; an empty string if there is no problem.
+        interface: Protocol of the calls.
     """
 
     def __init__(
@@ -72,6 +75,7 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
         on_passenger: Callable[[ActiveGrant], None] = lambda _grant: None,
         fixed_camera: Callable[[], bool] = bool,
         recording_problem: Callable[[], str] = str,
+        interface: Interface = "grpc",
     ) -> None:
         self._fixed_camera = fixed_camera
         self._recording_problem = recording_problem
@@ -80,7 +84,14 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
         self._streams = streams
         self._node = node_identity(node)
         self._clock = clock
-        self.admission = CallAdmission(grants, clock, _refusal_of, self._handle_internal_error, on_passenger)
+        self.admission = CallAdmission(
+            grants, clock, _refusal_of, self._handle_internal_error, on_passenger, interface=interface
+        )
+
+    @property
+    def calls(self) -> CallAuthorizer:
+        """Authorizes calls."""
+        return self._service.calls
 
     def _handle_internal_error(self, verdict: Verdict) -> None:
         """Brake if a driver is flying."""

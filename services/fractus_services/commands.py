@@ -1,4 +1,4 @@
-"""Commands `fractus mobility` and `fractus camera`: options, logging, signals and the process lock of the services."""
+"""Commands `fractus mobility`, `fractus camera` and `fractus gateway`: options, logging, signals and the process lock of the services."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from fractus_runtime import logs
 from fractus_runtime.open_files import TooFewOpenFiles, raise_open_files
 
 from fractus_services.camera.settings import CameraSettings
-from fractus_services.options import CannotServe, MobilityOptions, ServiceOptions
+from fractus_services.options import CannotServe, LockedOptions, MobilityOptions
 from fractus_services.service_lock import DEFAULT_LOCK_TIMEOUT_S, ServiceLock
 
 # gRPC reads this variable when it is imported later. At lower levels it logs each failed handshake, without a limit.
 os.environ.setdefault("GRPC_VERBOSITY", "ERROR")
 
-_Options = TypeVar("_Options", bound=ServiceOptions)
+_Options = TypeVar("_Options", bound=LockedOptions)
 
 _MAX_PORT = 65535
 _UNIX_SOCKETS = ("unix:", "unix-abstract:")
@@ -67,6 +67,22 @@ def until_signalled(
     Raises:
         click.ClickException: The service cannot run with its options.
     """
+
+    async def run_locked(stop: asyncio.Event) -> None:
+        lock = ServiceLock(service, options.state, options.audit)
+        if await lock.acquire(options.lock_timeout, stop):
+            with lock.watched():
+                await run(options, stop)
+
+    _run_process(run_locked, verbose)
+
+
+def _run_process(run: Callable[[asyncio.Event], Coroutine[Any, Any, None]], verbose: bool) -> None:
+    """Configure logging, and run until SIGTERM or SIGINT.
+
+    Raises:
+        click.ClickException: The process cannot run with its options.
+    """
     level = "DEBUG" if verbose else os.environ.get("FRACTUS_LOG_LEVEL") or "INFO"
     try:
         logs.configure(level.upper(), os.environ.get("FRACTUS_LOG_FORMAT") or "text")
@@ -82,10 +98,7 @@ def until_signalled(
         stop = asyncio.Event()
         for number in (signal.SIGTERM, signal.SIGINT):
             asyncio.get_running_loop().add_signal_handler(number, stop.set)
-        lock = ServiceLock(service, options.state, options.audit)
-        if await lock.acquire(options.lock_timeout, stop):
-            with lock.watched():
-                await run(options, stop)
+        await run(stop)
 
     try:
         asyncio.run(main())
@@ -201,6 +214,11 @@ def mobility() -> None:
     is_flag=True,
     help="Assume that the ground is level with home everywhere; otherwise limits above terrain deny calls.",
 )
+@click.option(
+    "--gateway-socket",
+    type=FILE,
+    help="Unix socket for `fractus gateway serve` (docs/mavlink-gateway.md). Without it there is no MAVLink interface.",
+)
 @click.option("--verbose", "-v", is_flag=True, help="Log more.")
 def serve_mobility(verbose: bool, **options: Any) -> None:
     """Serve until stopped. Waits for certificates and for the autopilot."""
@@ -260,3 +278,57 @@ def serve_camera(**options: Any) -> None:
     from fractus_services.camera.server import run  # noqa: PLC0415 - imports libraries that only this command needs
 
     until_signalled("camera", run, CameraSettings(**options))
+
+
+@click.group()
+def gateway() -> None:
+    """Run the gateway for MAVLink programs, or connect a program to the gateway of a node."""
+
+
+@gateway.command("serve")
+@_option("--tls", "/var/lib/fractus/tls", "Directory of tls.crt, tls.key and ca.crt of the node.", DIRECTORY)
+@_option("--mobility-socket", "/run/fractus/gateway.sock", "--gateway-socket of the mobility service.", FILE)
+@_option("--listen", "[::]:50053", "Address for connections of instances.", callback=address)
+@_option("--state", "/var/lib/fractus/gateway", "Directory of the lock of this process.", DIRECTORY)
+@_option("--audit", "/var/lib/fractus/audit/gateway.jsonl", "Audit log of refused messages.", FILE)
+@_option(
+    "--lock-timeout",
+    DEFAULT_LOCK_TIMEOUT_S,
+    "Seconds to wait for another process with the same --state or --audit to end.",
+    _SECONDS,
+)
+def serve_gateway(mobility_socket: Path, **options: Any) -> None:
+    """Serve until stopped. Waits for certificates and for the mobility service."""
+    from fractus_services.gateway.gateway_server import GatewayOptions, run  # noqa: PLC0415 - keeps the command line fast
+
+    until_signalled("gateway", run, GatewayOptions(mobility=mobility_socket, **options))
+
+
+@gateway.command("connect")
+@_option("--gateway", "127.0.0.1:50053", "Address of the gateway of the node.", callback=address)
+@click.option("--node", envvar="FRACTUS_NODE", required=True, help="Name of the node.")
+@click.option(
+    "--tls",
+    type=DIRECTORY,
+    envvar="FRACTUS_TLS_DIR",
+    required=True,
+    help="Directory of tls.crt, tls.key and ca.crt of the component instance.",
+)
+@_option("--tcp", 5760, "TCP port on the loopback interface for MAVLink programs.", click.IntRange(1, _MAX_PORT))
+@_option(
+    "--udp",
+    (14550, 14540),
+    "UDP port on the loopback interface to which heartbeats are sent; may be repeated.",
+    click.IntRange(1, _MAX_PORT),
+    multiple=True,
+)
+def connect_gateway(**options: Any) -> None:
+    """Carry MAVLink between programs on this machine and the gateway, until stopped."""
+    from fractus_services.gateway import sidecar  # noqa: PLC0415 - keeps the command line fast
+
+    settings = sidecar.SidecarOptions(**options)
+
+    async def run(stop: asyncio.Event) -> None:
+        await sidecar.run(settings, stop)
+
+    _run_process(run, verbose=False)

@@ -4,10 +4,27 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol
 
 
 class CannotServe(Exception):
     """A service cannot run with its options. The message contains the problem and the remedy."""
+
+
+class LockedOptions(Protocol):
+    """Options of a process that holds the lock of its state directory and audit log."""
+
+    @property
+    def state(self) -> Path:
+        """State directory."""
+
+    @property
+    def audit(self) -> Path:
+        """Audit log."""
+
+    @property
+    def lock_timeout(self) -> float:
+        """Seconds to wait for another process that holds the lock."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -46,3 +63,4 @@ class MobilityOptions(ServiceOptions):
     driver_grace: float
     boarding: float
     flat_terrain: bool
+    gateway_socket: Path | None = None

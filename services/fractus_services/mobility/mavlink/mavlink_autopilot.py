@@ -534,6 +534,16 @@ class MavlinkAutopilot(AutopilotLink):
                 )
             )
 
+    def request_gateway_messages(self) -> None:
+        """Request the messages that applications expect and the service itself does not need."""
+        self._rates.add_gateway_messages()
+
+    async def known_parameters(self) -> dict[str, float]:
+        """Return the vehicle's parameters. In the air, only the known ones, because the list would fill a slow link."""
+        if self.vehicle.in_air:
+            return dict(self.vehicle_parameters.values)
+        return await self.vehicle_parameters.read_all()
+
     async def set_rates(self, flying: bool) -> None:
         """Request the message rates, which are higher in the air. Request them again if messages are missing."""
         await self._rates.request(self, flying)

@@ -128,6 +128,12 @@ class Parameters:
         self._value_received.set()
         self._value_received = asyncio.Event()
 
+    async def read_all(self) -> dict[str, float]:
+        """Return the complete list of parameters, or the known part of the list if the vehicle does not send all of it."""
+        if not self._complete:
+            await self._fetch_list()
+        return {name: self.values[name] for name in self._list.values()} or dict(self.values)
+
     def request(self, name: str) -> None:
         """Request one parameter without waiting for the answer."""
         self._request(name.encode(), -1)

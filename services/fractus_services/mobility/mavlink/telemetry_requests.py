@@ -32,6 +32,19 @@ RATES_HZ = {
 }
 """Requested messages with their rates on the ground and in the air."""
 
+GATEWAY_RATES_HZ = {
+    "VFR_HUD": (2.0, 4.0),
+    "LOCAL_POSITION_NED": (2.0, 4.0),
+    "BATTERY_STATUS": (0.5, 0.5),
+    "GPS_GLOBAL_ORIGIN": (0.2, 0.2),
+    "SYSTEM_TIME": (0.5, 0.5),
+    "VIBRATION": (0.5, 0.5),
+}
+"""Messages that only applications behind the MAVLink gateway need, with their rates on the ground and in the air.
+
+They are requested last, and are not requested again if they are missing.
+"""
+
 CHECK_PERIOD_S = 5.0
 """Time for which received messages are counted before they are compared with the requested rates."""
 
@@ -77,6 +90,7 @@ class TelemetryRates:
 
     def __init__(self) -> None:
         self._received_before: set[str] = set()
+        self._for_gateway = False
         self.forget()
 
     def forget(self) -> None:
@@ -87,6 +101,12 @@ class TelemetryRates:
         self._never_received_requests = 0
         self._check_period_s = CHECK_PERIOD_S
         self._start_count(-math.inf)
+
+    def add_gateway_messages(self) -> None:
+        """Also request the messages for the MAVLink gateway from now on."""
+        if not self._for_gateway:
+            self._for_gateway = True
+            self._flying = None
 
     def take(self, name: str) -> None:
         """Count a received message."""
@@ -104,11 +124,13 @@ class TelemetryRates:
         if self._flying is not flying:
             self._check_period_s = CHECK_PERIOD_S
         self._flying = flying
-        for name, rates in RATES_HZ.items():
+        requested = RATES_HZ | GATEWAY_RATES_HZ if self._for_gateway else RATES_HZ
+        for name, rates in requested.items():
             try:
                 interval_us = 1e6 / rates[flying]
                 await autopilot.command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, message_id(name), interval_us, attempts=2)
-                self._accepted.add(name)
+                if name in RATES_HZ:
+                    self._accepted.add(name)
             except AutopilotError as error:
                 if error.link and self._flying is flying:
                     self._flying = None

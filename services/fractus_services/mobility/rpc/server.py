@@ -16,6 +16,7 @@ from fractus_runtime.metrics import BackgroundReader, serve_metrics
 from fractus_services.auth import TlsFiles
 from fractus_services.clock import Clock
 from fractus_services.decision_log import log_decision
+from fractus_services.gateway.decisions import DECISIONS
 from fractus_services.grant_files import GrantFiles
 from fractus_services.grant_verifier import GrantVerifier
 from fractus_services.grpc_server import run_until, serve_grpc
@@ -30,6 +31,7 @@ from fractus_services.mobility.mavlink.rtl_parameters import RtlParameters
 from fractus_services.mobility.mavlink.startup_heartbeat import VEHICLE_FILE, mark_served
 from fractus_services.mobility.mavlink.vehicle_identification import KnownVehicleFile
 from fractus_services.mobility.rpc.flight_metrics import flight_metrics
+from fractus_services.mobility.rpc.gateway_socket import GatewaySocket
 from fractus_services.mobility.rpc.handlers import MobilityHandlers
 from fractus_services.mobility.rpc.mobility_components import MobilityComponents
 from fractus_services.node_description import NodeDescription
@@ -162,7 +164,8 @@ async def run(options: MobilityOptions, stop: asyncio.Event) -> None:
     grants.listen(lambda old, new: _record_grant(audit, old, new))
     grants.listen(lambda _old, _new: recorder.take_grants([grant.spec for grant in grants.active.values()]))
     grants.scan()
-    handlers = MobilityHandlers(
+    create_handlers = partial(
+        MobilityHandlers,
         components.service,
         control,
         components.streams,
@@ -173,10 +176,16 @@ async def run(options: MobilityOptions, stop: asyncio.Event) -> None:
         fixed_camera=partial(_fixed_camera, description),
         recording_problem=lambda: recorder.problem,
     )
+    handlers = create_handlers()
 
     register = partial(mobility_pb2_grpc.add_MobilityServiceServicer_to_server, handlers)
     calls = serve_grpc("mobility", options.listen, tls, register, handlers.admission, node=node)
     running = [autopilot.run(), grants.run(), monitor.run(), monitor.record(), poi_missions.run(), calls]
+    if options.gateway_socket is not None:
+        gateway = GatewaySocket(
+            options.gateway_socket, create_handlers(interface="mavlink"), autopilot, DECISIONS.delivered
+        )
+        running.append(gateway.run())
     running.append(_watch_description(description, url, identified, fixed_link=bool(options.autopilot)))
     stopped = asyncio.Event()
     running.append(_stop(stop, components.supervisor, stopped))

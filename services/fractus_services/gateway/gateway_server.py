@@ -1,0 +1,232 @@
+"""Process of the gateway: TLS connections of applications, one session for each connection."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import ssl
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from fractus_runtime.audit import AuditLog
+
+from fractus_services.auth import FILES, Callers, TlsFiles
+from fractus_services.clock import Clock
+from fractus_services.errors import NotAuthenticated
+from fractus_services.gateway.instance import Instance
+from fractus_services.gateway.session import Session
+from fractus_services.options import CannotServe
+
+log = logging.getLogger(__name__)
+
+READ_BYTES = 4096
+MAX_UNSENT_BYTES = 64 * 1024
+"""Size of unsent data from which messages for an application are dropped, because it does not read."""
+
+TICK_S = 0.02
+"""Interval at which due messages are sent."""
+
+MAX_CONNECTIONS = 64
+MAX_CONNECTIONS_PER_INSTANCE = 4
+HANDSHAKE_TIMEOUT_S = 5.0
+RELOAD_S = 10.0
+"""Interval at which renewed certificates are loaded."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GatewayOptions:
+    """Options of `fractus gateway serve`."""
+
+    tls: Path
+    mobility: Path
+    listen: str
+    state: Path
+    audit: Path
+    lock_timeout: float
+
+
+class Gateway:
+    """Accepts connections of applications.
+
+    Args:
+        socket: Unix socket of the mobility service.
+        callers: Authenticates the instances by their certificates.
+        audit: Audit log of refused messages.
+    """
+
+    def __init__(self, socket: Path, callers: Callers, audit: AuditLog) -> None:
+        self._socket = socket
+        self._callers = callers
+        self._audit = audit
+        self._instances: dict[str, tuple[Instance, asyncio.Task[None]]] = {}
+        self._writers: set[asyncio.StreamWriter] = set()
+        self._ended = asyncio.Event()
+        self._ended.set()
+
+    async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """Serve one connection until it ends."""
+        try:
+            certificate = _certificate_of(writer)
+            identity = self._callers.of({"x509_pem_cert": (certificate,)}).identity
+        except NotAuthenticated as refusal:
+            log.warning("gateway: connection refused (reason=%s)", refusal)
+            writer.close()
+            return
+        await self.serve_instance(identity, certificate, reader, writer)
+
+    async def serve_instance(
+        self, identity: str, certificate: bytes, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
+    ) -> None:
+        """Serve one connection of an authenticated instance until it ends.
+
+        Args:
+            identity: SPIFFE ID.
+            certificate: PEM certificate of the instance.
+            reader: Bytes from the application.
+            writer: Bytes for the application.
+        """
+        instance = self._attach(identity, certificate)
+        if instance is None:
+            log.warning("gateway: connection refused, too many connections (instance=%s)", identity)
+            writer.close()
+            return
+        session = Session(instance.vehicle, instance.parameters)
+        instance.sessions.add(session)
+        self._writers.add(writer)
+        self._ended.clear()
+        log.info("gateway: application connected (instance=%s)", identity)
+        sending = asyncio.get_running_loop().create_task(self._send(instance, session, writer))
+        try:
+            await self._receive(instance, session, reader)
+        except (ConnectionError, ssl.SSLError, TimeoutError):
+            pass
+        finally:
+            sending.cancel()
+            instance.sessions.discard(session)
+            writer.close()
+            log.info("gateway: application disconnected (instance=%s)", identity)
+            if not instance.sessions:
+                await self._detach(identity)
+            self._writers.discard(writer)
+            if not self._writers:
+                self._ended.set()
+
+    def _attach(self, identity: str, certificate: bytes) -> Instance | None:
+        """Return the instance of a new connection; None if there are too many connections."""
+        entry = self._instances.get(identity)
+        if len(self._writers) >= MAX_CONNECTIONS:
+            return None
+        if entry is None:
+            instance = Instance(identity, self._socket)
+            instance.certificate = certificate
+            self._instances[identity] = instance, asyncio.get_running_loop().create_task(instance.run())
+            return instance
+        if len(entry[0].sessions) >= MAX_CONNECTIONS_PER_INSTANCE:
+            return None
+        entry[0].certificate = certificate
+        return entry[0]
+
+    async def _detach(self, identity: str) -> None:
+        _, task = self._instances.pop(identity)
+        task.cancel()
+        with suppress(asyncio.CancelledError):
+            await task
+
+    async def _receive(self, instance: Instance, session: Session, reader: asyncio.StreamReader) -> None:
+        loop = asyncio.get_running_loop()
+        while data := await reader.read(READ_BYTES):
+            for call in session.receive(data, loop.time()):
+                instance.start(session, call)
+            for refusal in session.take_refusals():
+                entry = {"identity": instance.identity, "message": refusal.name, "reason": refusal.reason}
+                self._audit.append("mavlink_refused", entry)
+            delay_s = session.delay_s(loop.time())
+            if delay_s > TICK_S:
+                await asyncio.sleep(delay_s)
+
+    async def _send(self, instance: Instance, session: Session, writer: asyncio.StreamWriter) -> None:
+        loop = asyncio.get_running_loop()
+        while not writer.is_closing():
+            session.step(loop.time())
+            data = session.take()
+            if data and writer.transport.get_write_buffer_size() < MAX_UNSENT_BYTES:
+                writer.write(data)
+            await asyncio.sleep(TICK_S)
+
+    async def close(self) -> None:
+        """Close all connections, and wait until their instances have ended."""
+        for writer in self._writers:
+            writer.close()
+        await self._ended.wait()
+
+
+async def run(options: GatewayOptions, stop: asyncio.Event) -> None:
+    """Serve until `stop` is set.
+
+    Raises:
+        CannotServe: An option is wrong.
+    """
+    await TlsFiles(options.tls).wait()
+    clock = Clock()
+    audit = AuditLog(options.audit, clock, tls=options.tls)
+    gateway = Gateway(options.mobility, Callers(clock), audit)
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.verify_mode = ssl.CERT_REQUIRED
+    host, _, port = options.listen.rpartition(":")
+    try:
+        _load(context, options.tls)
+        server = await asyncio.start_server(
+            gateway.serve,
+            host.strip("[]"),
+            int(port),
+            ssl=context,
+            ssl_handshake_timeout=HANDSHAKE_TIMEOUT_S,
+            limit=MAX_UNSENT_BYTES,
+        )
+    except OSError as error:
+        raise CannotServe(
+            f"--listen {options.listen}, --tls {options.tls}: cannot serve there ({error.strerror or error})"
+        ) from None
+    audit.append("started", {"listen": options.listen})
+    log.info("gateway: serving (address=%s)", options.listen)
+    reload = asyncio.get_running_loop().create_task(_reload(context, options.tls))
+    try:
+        await stop.wait()
+    finally:
+        reload.cancel()
+        server.close()
+        await gateway.close()
+        await audit.close()
+
+
+def _load(context: ssl.SSLContext, directory: Path) -> None:
+    context.load_cert_chain(directory / "tls.crt", directory / "tls.key")
+    context.load_verify_locations(directory / "ca.crt")
+
+
+async def _reload(context: ssl.SSLContext, directory: Path) -> None:
+    """Load renewed certificates. New connections use them."""
+    loaded = _stamps(directory)
+    while True:
+        await asyncio.sleep(RELOAD_S)
+        present = _stamps(directory)
+        if present == loaded:
+            continue
+        try:
+            _load(context, directory)
+            loaded = present
+        except OSError as error:
+            log.critical("gateway: cannot read the renewed certificate, keeping the current one (error=%s)", error)
+
+
+def _stamps(directory: Path) -> tuple[int, ...]:
+    with suppress(OSError):
+        return tuple((directory / name).stat().st_mtime_ns for name in FILES)
+    return ()
+
+
+def _certificate_of(writer: asyncio.StreamWriter) -> bytes:
+    connection = writer.get_extra_info("ssl_object")
+    certificate = connection.getpeercert(binary_form=True)
+    return ssl.DER_cert_to_PEM_cert(certificate).encode() if certificate else b""

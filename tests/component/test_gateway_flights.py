@@ -1,0 +1,197 @@
+"""MAVLink programs fly through the gateway under a Grant, and policies are enforced."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import sky_drone
+from closed_loop import Sky
+from fractus_core.control import OutcomeKind
+from gateway_world import ACCEPTED, DENIED, GUIDED, Flight, flying, mavlink_spec
+from mobility_world import zone
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+
+def fly(flight: Flight, directory: Path) -> None:
+    """Run a flight in virtual time."""
+
+    async def work(sky: Sky, path: Path) -> None:
+        async with flying(sky, path) as world:
+            await flight(world)
+
+    sky_drone.fly(work, directory)
+
+
+def test_program_takes_off_flies_a_target_and_a_velocity_and_returns(tmp_path: Path) -> None:
+    async def flight(world):
+        grant = world.drone.grants.put(mavlink_spec())
+        program = await world.program(grant.identity)
+        await program.up()
+        program.target(0, 30, 12)
+        await program.until(lambda: abs(program.place[1] - 30) < 1.0)
+        program.send(
+            "SET_POSITION_TARGET_LOCAL_NED",
+            coordinate_frame=mavlink.MAV_FRAME_LOCAL_NED,
+            type_mask=0b110111000111,
+            vy=3.0,
+        )
+        await program.until(lambda: program.latest["GLOBAL_POSITION_INT"].integer("vy") > 200)
+        assert await program.command(20) == ACCEPTED
+        await program.until(lambda: program.mode == mavlink.COPTER_MODE_RTL)
+        await program.until(lambda: not program.armed, 120.0)
+        await program.close()
+        await program.until(lambda: world.drone.control.mission(grant).outcome is not None)
+        assert world.drone.control.mission(grant).outcome.kind is OutcomeKind.COMPLETE
+
+    fly(flight, tmp_path)
+
+
+def test_mission_is_complete_when_the_program_leaves_while_another_connection_stays_open(tmp_path: Path) -> None:
+    async def flight(world):
+        grant = world.drone.grants.put(mavlink_spec())
+        program = await world.program(grant.identity)
+        idle = await world.program(grant.identity)
+        idle.beats = False
+        await program.up()
+        program.target(0, 20)
+        await program.until(lambda: abs(program.place[1] - 20) < 1.0)
+        await program.until(lambda: world.drone.control.mission(grant).legs == 1)
+        assert await program.command(21) == ACCEPTED
+        await program.until(lambda: not program.armed, 60.0)
+        await program.close()
+        await sky_drone.until(lambda: world.drone.control.mission(grant).outcome is not None)
+        assert world.drone.control.mission(grant).outcome.kind is OutcomeKind.COMPLETE
+        await idle.close()
+
+    fly(flight, tmp_path)
+
+
+def test_target_in_a_forbidden_zone_is_refused_with_the_reason(tmp_path: Path) -> None:
+    async def flight(world):
+        grant = world.drone.grants.put(mavlink_spec(zone("pool", "ignore", -20, 40, 20, 60)))
+        program = await world.program(grant.identity)
+        await program.up()
+        program.target(0, 50)
+        await program.until(lambda: "SET_POSITION_TARGET_GLOBAL_INT: " in program.texts)
+        assert "pool" in program.texts
+        assert program.mode == GUIDED
+        assert abs(program.place[1]) < 1.5
+        await program.close()
+
+    fly(flight, tmp_path)
+
+
+def test_program_without_mavlink_in_its_grant_gets_neither_control_nor_telemetry(tmp_path: Path) -> None:
+    async def flight(world):
+        grant = world.drone.grants.put(mavlink_spec(interfaces=("grpc",)))
+        program = await world.program(grant.identity)
+        assert await program.command(400, 1) != ACCEPTED
+        assert "over mavlink" in program.texts
+        assert set(program.latest) == {"COMMAND_ACK", "STATUSTEXT"}
+        assert not world.sky.truth.armed
+        await program.close()
+
+    fly(flight, tmp_path)
+
+
+def test_program_without_grant_receives_nothing(tmp_path: Path) -> None:
+    async def flight(world):
+        program = await world.program("spiffe://fractus.dev/ns/x/app/y/component/Z/instance/z")
+        assert await program.command(22, 0, 0, 0, 0, 0, 0, 10) != ACCEPTED
+        assert "HEARTBEAT" not in program.latest
+        await program.close()
+
+    fly(flight, tmp_path)
+
+
+def test_silent_program_loses_control_and_the_drone_returns(tmp_path: Path) -> None:
+    async def flight(world):
+        grant = world.drone.grants.put(mavlink_spec())
+        program = await world.program(grant.identity)
+        await program.up()
+        program.target(0, 60)
+        await program.until(lambda: program.place[1] > 10)
+        program.beats = False
+        await program.until(lambda: program.mode != GUIDED, 10.0)
+        await program.until(lambda: not program.armed, 180.0)
+        assert abs(program.place[0]) < 3.0
+        assert abs(program.place[1]) < 3.0
+        await program.close()
+
+    fly(flight, tmp_path)
+
+
+def test_program_that_dies_in_flight_is_brought_home(tmp_path: Path) -> None:
+    async def flight(world):
+        grant = world.drone.grants.put(mavlink_spec())
+        program = await world.program(grant.identity)
+        await program.up()
+        await program.close()
+        await sky_drone.until(lambda: not world.sky.truth.armed, 180.0)
+
+    fly(flight, tmp_path)
+
+
+def test_escapes_are_refused_and_audited_and_the_flight_continues(tmp_path: Path) -> None:
+    async def flight(world):
+        grant = world.drone.grants.put(mavlink_spec())
+        program = await world.program(grant.identity)
+        await program.up()
+        assert await program.command(400, 0, 21196) == DENIED
+        assert await program.command(185, 1) == DENIED
+        assert await program.command(246, 1) == DENIED
+        assert await program.command(32000, 1) == DENIED
+        program.send("PARAM_SET", param_id=b"FS_GCS_ENABLE", param_value=0.0)
+        program.send("SERIAL_CONTROL", device=0, flags=1)
+        program.send("RC_CHANNELS_OVERRIDE", chan3_raw=1000)
+        program.send("FILE_TRANSFER_PROTOCOL", payload=(0, 0, 0, 4))
+        program.target(0, 20)
+        await program.until(lambda: program.place[1] > 19)
+        assert {entry["message"] for entry in world.refused} == {
+            "COMPONENT_ARM_DISARM", "DO_FLIGHTTERMINATION", "PREFLIGHT_REBOOT_SHUTDOWN", "CAN_FORWARD", "PARAM_SET",
+            "SERIAL_CONTROL", "RC_CHANNELS_OVERRIDE", "FILE_TRANSFER_PROTOCOL",
+        }  # fmt: skip
+        assert world.sky.truth.params["FS_GCS_ENABLE"] != 0.0
+        await program.close()
+
+    fly(flight, tmp_path)
+
+
+def test_vehicle_receives_no_frame_that_the_service_did_not_encode(tmp_path: Path) -> None:
+    async def flight(world):
+        grant = world.drone.grants.put(mavlink_spec())
+        program = await world.program(grant.identity)
+        await program.until(lambda: program.mode == GUIDED)
+        senders = set()
+        receive = world.sky.craft.receive
+
+        def tap(channel, data):
+            senders.update((data[5], data[6]) for _ in (data,))
+            receive(channel, data)
+
+        world.sky.craft.receive = tap
+        await program.up()
+        for name in ("MANUAL_CONTROL", "SET_ATTITUDE_TARGET", "HIL_SENSOR", "GPS_INPUT", "SET_MODE"):
+            program.send(name)
+        await program.until(lambda: "GPS_INPUT" in program.texts)
+        assert senders == {(244, 191)}
+        await program.close()
+
+    fly(flight, tmp_path)
+
+
+def test_parameters_are_one_dense_list(tmp_path: Path) -> None:
+    async def flight(world):
+        grant = world.drone.grants.put(mavlink_spec())
+        program = await world.program(grant.identity)
+        program.send("PARAM_REQUEST_LIST")
+
+        def values():
+            return {m.integer("param_index"): m for m in program.received if m.name == "PARAM_VALUE"}
+
+        await program.until(lambda: values() and len(values()) == values()[0].integer("param_count"), 120.0)
+        assert len(values()) > 1000
+        assert {m.integer("param_count") for m in values().values()} == {len(values())}
+        await program.close()
+
+    fly(flight, tmp_path)

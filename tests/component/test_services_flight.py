@@ -587,3 +587,40 @@ def test_drone_returns_home_straight_if_planner_raises(tmp_path: Path, monkeypat
             assert math.dist(world.plane.xy, (0, 0)) < 1.5
 
     fly(flight)
+
+
+@pytest.mark.parametrize(("idle_s", "replaced"), [(10.0, False), (31.0, True)])
+def test_second_process_replaces_driver_without_liveness_requests_that_makes_no_calls(
+    tmp_path: Path, idle_s: float, replaced: bool
+) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            grant = world.grants.put(spec())
+            first = await world.up(grant)
+            await asyncio.sleep(idle_s)
+            if not replaced:
+                assert (await refusal(world.drive(grant))).verdict.code == "ControlHeld"
+                assert not first.done()
+                return
+            await world.drive(grant)
+            assert first.done()
+            states = [event.state.name for event in world.events]
+            assert sorted(states[-2:]) == ["GRANTED", "LOST"]
+            await end(world.service.goto(grant, goto(0, 20), 0))
+
+    fly(flight)
+
+
+def test_second_process_does_not_replace_driver_during_its_motion(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            grant = world.grants.put(spec())
+            first = await world.up(grant)
+            leg = asyncio.ensure_future(end(world.service.goto(grant, goto(0, 190, speed_mps=3.0), 0)))
+            await asyncio.sleep(40)
+            assert not leg.done()
+            assert (await refusal(world.drive(grant))).verdict.code == "ControlHeld"
+            assert not first.done()
+            await leg
+
+    fly(flight)

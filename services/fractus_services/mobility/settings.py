@@ -303,6 +303,12 @@ class MobilitySettings:
     It is longer than the 4 s after which the gRPC server disconnects a client that does not reply to pings.
     """
 
+    silent_driver_s: float = 30.0
+    """Time without a motion call, and without a motion in progress, after which a second process may replace a driver.
+
+    Only drivers without liveness requests are replaced. All other drivers lose control when they do not answer.
+    """
+
     telemetry_min_interval_s: float = 0.05
     """Shortest interval of a telemetry stream."""
 

@@ -56,6 +56,7 @@ class Lease:
         key: Key of the mission.
         grant: Current Grant of the driver. Its key does not change.
         responded: True if the driver has answered the last liveness request.
+        called_at: Time of the driver's last motion call, or of the begin of its control.
     """
 
     def __init__(self, grant: ActiveGrant) -> None:
@@ -65,6 +66,7 @@ class Lease:
         self._events: asyncio.Queue[ControlEvent | None] = asyncio.Queue()
         self._ping = 0
         self.responded = True
+        self.called_at = math.inf
 
     def send(self, event: ControlEvent | None) -> None:
         """Queue an event for the driver. None ends the stream without an event."""

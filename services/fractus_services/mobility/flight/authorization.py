@@ -256,6 +256,9 @@ class CallAuthorizer:
         # Check control before the verdict has consequences: a call of a driver that waits for the drone must neither brake
         # it nor take it from the driver in control.
         self._control.require_control(grant)
+        lease = self._control.lease
+        if lease is not None and math.isfinite(lease.called_at):
+            lease.called_at = self._control.autopilot.now
         if verdict.action == "takeover":
             self._control.take_over(verdict)
             raise denied(verdict)

@@ -68,6 +68,8 @@ class ControlStreams:
                         yield ControlEvent(StreamState.WAITING, control.mission(grant).points_done, reason)
                 if control.not_ready_reason(lease.key) is None:
                     control.grant_control(lease)
+            if not response_timeout_s:
+                lease.called_at = control.autopilot.now
             async with aclosing(self._events(lease, response_timeout_s)) as events:
                 async for event in events:
                     yield event
@@ -105,16 +107,21 @@ class ControlStreams:
         """Wait until no other stream of this driver is open, at most `second_stream_wait_s`. Yield the reason once.
 
         The other stream may belong to a connection whose client no longer exists. The pings of the gRPC server then close
-        the connection, and the driver continues. The stream of a client that exists stays open.
+        the connection, and the driver continues. The stream of a client that exists stays open, unless the client answers
+        no liveness requests and makes no motion call for `silent_driver_s`.
         """
         control = self._control
         give_up = control.autopilot.now + SETTINGS.second_stream_wait_s
         reported = False
-        while control.lease is not None and control.lease.key == grant.key and control.autopilot.now < give_up:
+        while (held := control.lease) is not None and held.key == grant.key and control.autopilot.now < give_up:
             if not reported:
                 reported = True
                 yield SECOND_STREAM
-            await control.changes.wait(SETTINGS.stream_check_interval_s)
+            silent_s = control.autopilot.now - held.called_at
+            if control.motion is None and silent_s >= SETTINGS.silent_driver_s:
+                control.drop_unresponsive_driver(held, round(silent_s))
+            else:
+                await control.changes.wait(SETTINGS.stream_check_interval_s)
 
     async def _until_ready(self, lease: Lease) -> AsyncGenerator[str, None]:
         """Yield each new reason to wait until the driver can get control."""

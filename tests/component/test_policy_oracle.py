@@ -20,7 +20,7 @@ from fractus_core.policy.engine import MIN_TAKEOFF_ALTITUDE_M
 from fractus_core.policy.limits import MIN_LEG_ALTITUDE_M
 from fractus_core.policy.monitoring import monitor
 from fractus_services.mobility.mavlink import failsafes
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from parameter_faults import parameter_faults
 from policy_flights import (
@@ -143,6 +143,7 @@ speeds = st.tuples(st.floats(-8, 8), st.floats(-8, 8)).filter(lambda v: math.hyp
     action=st.sampled_from(["ignore", "adjust"]),
     seed=st.integers(0, 10**6),
 )
+@example([[(-79.2, -30.7), (-96.7, 22.6), (-138.3, -5.8)]], (-149.8, -40.1), (0.0, 0.0), (-0.3, -7.1), "ignore", 331)
 def test_oracle_finds_no_permitted_goto_that_enters_a_zone(
     zones: list[Corners],
     start: tuple[float, float],
@@ -152,12 +153,11 @@ def test_oracle_finds_no_permitted_goto_that_enters_a_zone(
     seed: int,
 ) -> None:
     fences = [exclusion(ring(zone), action, f"z{i}") for i, zone in enumerate(zones)]
+    grant = compiled(*fences, operationArea=[])
     now = at(*start, east_mps=velocity[0], north_mps=velocity[1], speed_setpoint_mps=10.0)
-    verdict = ask(compiled(*fences, operationArea=[]), goto(*to), now)
+    verdict = ask(grant, goto(*to), now)
     if not verdict.permits:
         return
-    assert isinstance(verdict.args, GotoArgs)
-    end = flat(verdict.args.lat, verdict.args.lon)
     begun_outside = not any(inside(start, zone) for zone in zones)
     draw = random.Random(seed)
     error = (draw.uniform(-1, 1), draw.uniform(-1, 1))
@@ -173,6 +173,12 @@ def test_oracle_finds_no_permitted_goto_that_enters_a_zone(
         track = [(x + off[0], y + off[1]) for x, y in stop]
         begin = stop[-1]
         velocity = (0.0, 0.0)
+        # The drone stops up to 1.25 m from where the engine expects it, so the service judges the leg again.
+        verdict = ask(grant, goto(*to), at(*begin, speed_setpoint_mps=10.0))
+        if not verdict.permits:
+            return
+    assert isinstance(verdict.args, GotoArgs)
+    end = flat(verdict.args.lat, verdict.args.lon)
     track += fly(
         (begin[0] + off[0], begin[1] + off[1]), velocity, (end[0] + off[0], end[1] + off[1]), 10.0, now.latency_s
     )

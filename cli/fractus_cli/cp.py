@@ -46,28 +46,22 @@ class Source:
         return f"{self.application}/{self.component}:{self.path}"
 
 
-class SourceType(click.ParamType[Source]):
-    """Parameter of the form APPLICATION/COMPONENT:PATH."""
-
-    name = "source"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Source:
-        """Parse the parameter."""
-        match = re.fullmatch(r"([^/:]+)/([^/:]+):(/.*)", value)
-        if match is None:
-            self.fail(
-                f"{value!r} is not APPLICATION/COMPONENT:PATH with an absolute path, such as survey/Store:/data",
-                param,
-                ctx,
-            )
-        path = PurePosixPath(match[3])
-        if ".." in path.parts:
-            self.fail(f"{value!r} contains '..'; specify the path without it", param, ctx)
-        return Source(match[1], match[2], path)
+def _parse_source(context: click.Context, argument: click.Parameter, text: str) -> Source:
+    """Parse APPLICATION/COMPONENT:PATH."""
+    del context, argument
+    match = re.fullmatch(r"([^/:]+)/([^/:]+):(/.*)", text)
+    if match is None:
+        raise click.BadParameter(
+            f"{text!r} is not APPLICATION/COMPONENT:PATH with an absolute path, such as survey/Store:/data"
+        )
+    path = PurePosixPath(match[3])
+    if ".." in path.parts:
+        raise click.BadParameter(f"{text!r} contains '..'; specify the path without it")
+    return Source(match[1], match[2], path)
 
 
 @click.command()
-@click.argument("source", type=SourceType(), metavar="APPLICATION/COMPONENT:PATH")
+@click.argument("source", callback=_parse_source, metavar="APPLICATION/COMPONENT:PATH")
 @click.argument("destination", type=click.Path(path_type=Path))
 @click.option("-n", "--namespace", default="default", show_default=True, help="Namespace of the Application.")
 @click.option("--pod", help="Pod to copy from, if several pods of the component run.")

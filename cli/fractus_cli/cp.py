@@ -223,13 +223,13 @@ def _write(archive: tarfile.TarFile, member: tarfile.TarInfo, file: Path) -> Non
     """Write a file. An incomplete file never has its final name."""
     content = archive.extractfile(member)
     assert content is not None
-    with tempfile.NamedTemporaryFile(dir=file.parent, prefix=".fractus-cp-", delete=False) as scratch:
-        try:
-            shutil.copyfileobj(content, scratch)
-            scratch.close()
-            Path(scratch.name).replace(file)
-        finally:
-            Path(scratch.name).unlink(missing_ok=True)
+    scratch = file.with_name(f".fractus-cp-{secrets.token_hex(4)}")
+    try:
+        with scratch.open("xb") as out:
+            shutil.copyfileobj(content, out)
+        scratch.replace(file)
+    finally:
+        scratch.unlink(missing_ok=True)
 
 
 def reader_pod(component: Body, source: Source, image: str | None) -> Body:
@@ -294,7 +294,8 @@ def _reader(kubectl: Kubectl, body: Body) -> Iterator[str]:
         except click.ClickException as error:
             problem = reader_problem(kubectl.get("pod", name)) or error.message
             raise click.ClickException(
-                f"the claim cannot be read, because its reader pod does not start: {problem}"
+                f"the claim cannot be read, because its reader pod does not start: {problem}; if the image is the problem,"
+                " specify another one with --image"
             ) from None
         yield name
     finally:

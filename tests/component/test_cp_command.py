@@ -97,6 +97,8 @@ def test_cp_copies_a_directory_of_a_running_pod(cluster: Path, tmp_path: Path) -
     copied = {str(p.relative_to(tmp_path / "results")) for p in (tmp_path / "results").rglob("*")}
     assert copied == {"pictures", "pictures/1.jpg", "summary.csv"}
     assert (tmp_path / "results" / "pictures" / "1.jpg").read_bytes() == b"picture" * 10_000
+    (tmp_path / "other").write_text("")
+    assert (tmp_path / "results" / "summary.csv").stat().st_mode == (tmp_path / "other").stat().st_mode
     assert not any(call.startswith("create") for call in calls(cluster))
     # A second copy into the existing directory has the name of the source.
     assert run("survey/Store:/data/summary.csv", "results/pictures").exit_code == 0

@@ -1,4 +1,7 @@
-"""Run the commands of docs/tutorial.md on a cluster. Its program flies, and a policy and an update take effect."""
+"""Run the commands of docs/tutorial.md on a cluster.
+
+Its program flies, a policy and an update take effect, and the pictures of a survey are kept.
+"""
 
 from __future__ import annotations
 
@@ -66,7 +69,7 @@ def checkout(tmp_path: Path) -> Iterator[Path]:
         yield folder
     finally:
         subprocess.run(down, check=False, timeout=300)
-        built = [f"localhost/patrol:{version}" for version in (1, 2)]
+        built = ["localhost/patrol:1", "localhost/patrol:2", "localhost/survey:1"]
         subprocess.run(["buildah", "rmi", *built], check=False, capture_output=True, timeout=60)
 
 
@@ -77,7 +80,8 @@ def test_application_of_the_tutorial_flies_on_a_cluster(checkout: Path) -> None:
     page = PAGE[begin:end]
     (checkout / "patrol.py").write_text(files(PAGE[:begin])["patrol.py"])
     written = files(page)
-    assert {"Dockerfile", "application.yaml", "low.yaml"} == written.keys()
+    survey = {"survey.py", "viewer.py", "store.py", "survey.yaml"}
+    assert {"Dockerfile", "application.yaml", "low.yaml"} | survey == written.keys()
     commands = typed(page)
     assert sum(command.startswith("fractus ") for command, _ in commands) >= 5
     script = [
@@ -110,6 +114,9 @@ def test_application_of_the_tutorial_flies_on_a_cluster(checkout: Path) -> None:
     assert (container["image"], container["restartCount"]) == ("localhost/patrol:1", 0), (
         "the update took effect in flight"
     )
+    pictures = list((checkout / "patrol" / "pictures").iterdir())
+    assert len(pictures) >= 3
+    assert all(picture.read_bytes().startswith(b"\xff\xd8") for picture in pictures), "a picture is no JPEG file"
     events = json.loads((checkout / "patrol" / "events.json").read_text())["items"]
     missions = [e for e in events if e["reason"] == "MissionComplete" and e["involvedObject"]["name"] == "patrol"]
     assert len(missions) == 2, [f"{e['reason']}: {e['message']}" for e in events]

@@ -297,6 +297,17 @@ def gateway() -> None:
     "Seconds to wait for another process with the same --state or --audit to end.",
     _SECONDS,
 )
+@click.option(
+    "--recordings",
+    type=DIRECTORY,
+    help="Directory to record the messages of each instance into (docs/recordings.md). Without it nothing is recorded.",
+)
+@_option(
+    "--recordings-mb",
+    DEFAULT_RECORDINGS_MB,
+    "Maximum size of the recordings of each instance in megabytes; the oldest are removed first.",
+    click.IntRange(min=0),
+)
 def serve_gateway(mobility_socket: Path, **options: Any) -> None:
     """Serve until stopped. Waits for certificates and for the mobility service."""
     from fractus_services.gateway.gateway_server import GatewayOptions, run  # noqa: PLC0415 - keeps the command line fast

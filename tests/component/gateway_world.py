@@ -10,6 +10,7 @@ import contextlib
 import datetime
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -23,7 +24,7 @@ from fractus_core.api.grants import GrantSpec
 from fractus_runtime.mavlink_codec import Endpoint, Message, Parser, message
 from fractus_services.auth import Callers
 from fractus_services.gateway.decisions import DECISIONS
-from fractus_services.gateway.gateway_server import Gateway
+from fractus_services.gateway.gateway_server import Gateway, GatewayOptions, open_recorder
 from fractus_services.mobility.rpc.gateway_socket import GatewaySocket
 from fractus_services.mobility.rpc.handlers import MobilityHandlers
 from mobility_world import ALL, FRAME, spec
@@ -172,7 +173,12 @@ class GatewayWorld:
         audit = SimpleNamespace(append=lambda _kind, content: self.refused.append(content))
         path = directory / "gateway.sock"
         self.socket = GatewaySocket(path, handlers, drone.autopilot, DECISIONS.delivered)
-        self.gateway = Gateway(path, Callers(time.time), audit)  # type: ignore[arg-type]
+        self.recordings = directory / "recordings"
+        options = GatewayOptions(
+            tls=directory, mobility=path, listen="", state=directory, audit=directory, lock_timeout=0.0,
+            recordings=self.recordings, recordings_mb=10,
+        )  # fmt: skip
+        self.gateway = Gateway(path, Callers(time.time), audit, partial(open_recorder, options))  # type: ignore[arg-type]
         self._programs = directory / "programs.sock"
         self._certificates: dict[str, bytes] = {}
         self._count = 0

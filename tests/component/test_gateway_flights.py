@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
 import sky_drone
 from closed_loop import Sky
 from fractus_core.control import OutcomeKind
-from gateway_world import ACCEPTED, DENIED, GUIDED, Flight, flying, mavlink_spec
+from fractus_runtime.mavlink_codec import Parser
+from fractus_services.options import CannotServe
+from gateway_world import ACCEPTED, DENIED, GUIDED, Flight, GatewayWorld, flying, mavlink_spec
 from mobility_world import zone
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
@@ -195,3 +198,48 @@ def test_parameters_are_one_dense_list(tmp_path: Path) -> None:
         await program.close()
 
     fly(flight, tmp_path)
+
+
+def test_messages_of_an_instance_are_recorded_around_its_flight(tmp_path: Path) -> None:
+    async def flight(world):
+        grant = world.drone.grants.put(mavlink_spec())
+        program = await world.program(grant.identity)
+        await program.up()
+        program.send("SERIAL_CONTROL", device=0, flags=1)
+        await program.until(lambda: "SERIAL_CONTROL" in program.texts)
+        await program.close()
+        await world.gateway.close()
+        (log,) = (world.recordings / "default.app-navigator").glob("*.tlog")
+        recorded = [m.name for m in Parser().feed(log.read_bytes())]
+        assert {"COMMAND_LONG", "COMMAND_ACK", "SERIAL_CONTROL", "STATUSTEXT", "GLOBAL_POSITION_INT"} <= set(recorded)
+
+    fly(flight, tmp_path)
+
+
+def test_speed_written_before_control_is_applied_when_control_is_granted(tmp_path: Path) -> None:
+    async def flight(world):
+        grant = world.drone.grants.put(mavlink_spec())
+        program = await world.program(grant.identity)
+        await program.until(lambda: "HEARTBEAT" in program.latest)
+        assert program.mode != GUIDED
+        program.send("PARAM_SET", param_id=b"WPNAV_SPEED", param_value=300.0)
+        await program.until(lambda: "PARAM_VALUE" in program.latest)
+        assert program.latest["PARAM_VALUE"].real("param_value") == 300.0
+        await program.until(lambda: world.drone.control.cruise_mps == 3.0)
+        await program.close()
+
+    fly(flight, tmp_path)
+
+
+def test_gateway_socket_does_not_replace_a_file(tmp_path: Path) -> None:
+    async def work(sky: Sky, path: Path) -> None:
+        (path / "gateway.sock").write_text("notes")
+        world = GatewayWorld(sky, path)
+        try:
+            with pytest.raises(CannotServe, match="name a file that does not exist"):
+                await world.socket.run()
+        finally:
+            await world.drone.close()
+        assert (path / "gateway.sock").read_text() == "notes"
+
+    sky_drone.fly(work, tmp_path)

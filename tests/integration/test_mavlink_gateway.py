@@ -5,13 +5,21 @@
 
 from __future__ import annotations
 
+import asyncio
+import os
 import signal
+import sys
 from collections.abc import AsyncIterator
+from pathlib import Path
 from typing import Any
 
 import pytest
 from gateway_rig import ACCEPTED, START_S, GatewayRig, acknowledged, connected, in_thread, mavlink_grant, up
 from mobility_rig import FRAME, NODE, Rig
+
+CLIENTS = Path(__file__).with_name("vehicle_clients")
+CLIENTS_PYTHON = os.environ.get("FRACTUS_CLIENTS_PYTHON", sys.executable)
+"""Interpreter that has DroneKit, see test_vehicle_clients.py."""
 
 
 @pytest.fixture
@@ -46,6 +54,20 @@ async def test_pymavlink_program_flies_guided_over_tls(gateway: GatewayRig):
     await in_thread(_fly_guided, await gateway.connect())
     state = await gateway.rig.until(lambda t: bool(t.missions), description="end of the mission")
     assert [outcome.kind for outcome in state.missions.values()] == [1], state.missions
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+async def test_dronekit_program_flies_guided(gateway: GatewayRig):
+    """`test_pymavlink_program_flies_guided_over_tls` is the faster form."""
+    gateway.start_services()
+    gateway.rig.write_grant(mavlink_grant())
+    program = await asyncio.create_subprocess_exec(
+        CLIENTS_PYTHON, str(CLIENTS / "dronekit_guided.py"), await gateway.connect(),
+        stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.STDOUT,
+    )  # fmt: skip
+    output, _ = await program.communicate()
+    assert b"DONE" in output, output.decode()[-4000:]
 
 
 @pytest.mark.timeout(150)

@@ -268,12 +268,19 @@ def test_write_of_a_failsafe_parameter_is_refused_with_its_value() -> None:
     assert any("FS_GCS_ENABLE may not be written" in m.text("text") for m in replies if m.name == "STATUSTEXT")
 
 
-def test_write_of_the_speed_becomes_a_call_and_is_reported_after_it() -> None:
+def test_write_of_the_speed_is_reported_at_once_and_becomes_a_call() -> None:
     world = World()
     (call,) = world.send("PARAM_SET", target_system=1, param_id=b"WPNAV_SPEED", param_value=800.0)
     assert call.request.message.speed_mps == 8.0
-    world.session.finish(call, ACCEPTED, "", world.now)
     assert [m.real("param_value") for m in world.sent() if m.name == "PARAM_VALUE"] == [800.0]
+
+
+def test_refused_speed_is_replaced_by_the_former_value() -> None:
+    world = World()
+    (call,) = world.send("PARAM_SET", target_system=1, param_id=b"WPNAV_SPEED", param_value=9000.0)
+    world.sent()
+    world.session.finish(call, mavlink.MAV_RESULT_DENIED, "above the limit", world.now)
+    assert [m.real("param_value") for m in world.sent() if m.name == "PARAM_VALUE"] == [1000.0]
 
 
 def test_requested_stream_contains_only_new_messages_of_the_vehicle() -> None:

@@ -5,10 +5,13 @@ from __future__ import annotations
 import asyncio
 import logging
 import ssl
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
+from fractus_core.api.names import ComponentIdentity
 from fractus_runtime.audit import AuditLog
 
 from fractus_services.auth import FILES, Callers, TlsFiles
@@ -17,6 +20,9 @@ from fractus_services.errors import NotAuthenticated
 from fractus_services.gateway.instance import Instance
 from fractus_services.gateway.session import Session
 from fractus_services.options import CannotServe
+from fractus_services.recording.mavlink_messages import MavlinkDecoder
+from fractus_services.recording.recorder import Recorder
+from fractus_services.recording.segment_directory import segments_in
 
 log = logging.getLogger(__name__)
 
@@ -44,6 +50,8 @@ class GatewayOptions:
     state: Path
     audit: Path
     lock_timeout: float
+    recordings: Path | None = None
+    recordings_mb: int = 0
 
 
 class Gateway:
@@ -53,13 +61,18 @@ class Gateway:
         socket: Unix socket of the mobility service.
         callers: Authenticates the instances by their certificates.
         audit: Audit log of refused messages.
+        open_recorder: Returns the recorder of an instance.
     """
 
-    def __init__(self, socket: Path, callers: Callers, audit: AuditLog) -> None:
+    def __init__(
+        self, socket: Path, callers: Callers, audit: AuditLog, open_recorder: Callable[[str], Recorder]
+    ) -> None:
+        self._open_recorder = open_recorder
         self._socket = socket
         self._callers = callers
         self._audit = audit
         self._instances: dict[str, tuple[Instance, asyncio.Task[None]]] = {}
+        self._recorders: dict[str, Recorder] = {}
         self._writers: set[asyncio.StreamWriter] = set()
         self._ended = asyncio.Event()
         self._ended.set()
@@ -91,12 +104,15 @@ class Gateway:
             log.warning("gateway: connection refused, too many connections (instance=%s)", identity)
             writer.close()
             return
-        session = Session(instance.vehicle, instance.parameters)
+        recorder = self._recorders.get(identity)
+        if recorder is None:
+            recorder = self._recorders[identity] = self._open_recorder(identity)
+        session = Session(instance.vehicle, instance.parameters, recorder.take_sent)
         instance.sessions.add(session)
         self._writers.add(writer)
         self._ended.clear()
         log.info("gateway: application connected (instance=%s)", identity)
-        sending = asyncio.get_running_loop().create_task(self._send(instance, session, writer))
+        sending = asyncio.get_running_loop().create_task(self._send(session, writer, recorder))
         try:
             await self._receive(instance, session, reader)
         except (ConnectionError, ssl.SSLError, TimeoutError):
@@ -145,13 +161,14 @@ class Gateway:
             if delay_s > TICK_S:
                 await asyncio.sleep(delay_s)
 
-    async def _send(self, instance: Instance, session: Session, writer: asyncio.StreamWriter) -> None:
+    async def _send(self, session: Session, writer: asyncio.StreamWriter, recorder: Recorder) -> None:
         loop = asyncio.get_running_loop()
         while not writer.is_closing():
             session.step(loop.time())
             data = session.take()
             if data and writer.transport.get_write_buffer_size() < MAX_UNSENT_BYTES:
                 writer.write(data)
+                recorder.take_received(data)
             await asyncio.sleep(TICK_S)
 
     async def close(self) -> None:
@@ -159,6 +176,8 @@ class Gateway:
         for writer in self._writers:
             writer.close()
         await self._ended.wait()
+        for recorder in self._recorders.values():
+            await recorder.close()
 
 
 async def run(options: GatewayOptions, stop: asyncio.Event) -> None:
@@ -170,7 +189,7 @@ async def run(options: GatewayOptions, stop: asyncio.Event) -> None:
     await TlsFiles(options.tls).wait()
     clock = Clock()
     audit = AuditLog(options.audit, clock, tls=options.tls)
-    gateway = Gateway(options.mobility, Callers(clock), audit)
+    gateway = Gateway(options.mobility, Callers(clock), audit, partial(open_recorder, options))
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.verify_mode = ssl.CERT_REQUIRED
     host, _, port = options.listen.rpartition(":")
@@ -198,6 +217,14 @@ async def run(options: GatewayOptions, stop: asyncio.Event) -> None:
         server.close()
         await gateway.close()
         await audit.close()
+
+
+def open_recorder(options: GatewayOptions, identity: str) -> Recorder:
+    """Return the recorder of an instance. It records what the instance sends and receives around its flights."""
+    parsed = ComponentIdentity.parse(identity)
+    name = f"{parsed.namespace}.{parsed.instance}" if parsed is not None else "unknown"
+    directory = options.recordings / name if options.recordings is not None else None
+    return Recorder(segments_in(directory, options.recordings_mb), name, MavlinkDecoder(name))
 
 
 def _load(context: ssl.SSLContext, directory: Path) -> None:

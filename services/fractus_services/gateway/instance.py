@@ -110,7 +110,7 @@ class Instance:
         self._ended = False
         self._granted = asyncio.Event()
         self._calls: set[asyncio.Task[None]] = set()
-        self._setpoints = {"motion": _Setpoint(), "gimbal": _Setpoint()}
+        self._setpoints = {"motion": _Setpoint(), "gimbal": _Setpoint(), "speed": _Setpoint()}
 
     # Connection to the mobility service
 
@@ -279,6 +279,8 @@ class Instance:
         task.add_done_callback(self._calls.discard)
 
     def _setpoint(self, call: Call) -> _Setpoint | None:
+        if call.parameter:
+            return self._setpoints["speed"]
         if not call.is_setpoint:
             return None
         return self._setpoints["gimbal" if call.request.method == "PointGimbal" else "motion"]
@@ -287,8 +289,7 @@ class Instance:
         method = call.request.method
         judged = False
         try:
-            if method == "Arm" or call.parameter:
-                await self._wait_for_control()
+            await self._wait_for_control(call)
             timeout_s = CALL_TIMEOUT_S
             if method in _MOTIONS:
                 timeout_s = 0.0
@@ -316,9 +317,12 @@ class Instance:
             elif setpoint is not None and setpoint.flying is call.request.message:
                 setpoint.flying = None
 
-    async def _wait_for_control(self) -> None:
+    async def _wait_for_control(self, call: Call) -> None:
+        """Wait before arming, and before a speed is set. Other calls are judged at once."""
+        if call.request.method != "Arm" and not call.parameter:
+            return
         try:
-            async with asyncio.timeout(CONTROL_WAIT_S):
+            async with asyncio.timeout(None if call.parameter else CONTROL_WAIT_S):
                 await self._granted.wait()
         except TimeoutError:
             raise CallRefused(code_pb2.UNAVAILABLE, self.vehicle.waiting_reason) from None

@@ -57,6 +57,11 @@ CAPABILITIES = (
     | mavlink.MAV_PROTOCOL_CAPABILITY_MAVLINK2
 )
 
+
+def ignore(_frame: bytes) -> None:
+    """Record nothing."""
+
+
 Source = tuple[int, int]
 """System and component id of the sender."""
 
@@ -72,7 +77,7 @@ class Call:
         command: MAV_CMD or message id that COMMAND_ACK contains; None if the message has another response.
         mission_ack: True if the response is a MISSION_ACK.
         parameter: Parameter that the call sets; empty if it sets none.
-        value: Value of the parameter.
+        before: Value of the parameter before the write.
     """
 
     request: Request
@@ -81,7 +86,7 @@ class Call:
     command: int | None = None
     mission_ack: bool = False
     parameter: str = ""
-    value: float = 0.0
+    before: float = 0.0
 
     @property
     def is_setpoint(self) -> bool:
@@ -140,6 +145,7 @@ class Session:
     Args:
         vehicle: Vehicle as the instance sees it, shared by the sessions of the instance.
         parameters: Parameters of the instance.
+        record: Callback that receives each valid frame of the application.
 
     Attributes:
         refusals: Refusals since the last call of `take_refusals`.
@@ -147,9 +153,12 @@ class Session:
         frames: Number of valid frames that were received.
     """
 
-    def __init__(self, vehicle: VirtualVehicle, parameters: ParameterView) -> None:
+    def __init__(
+        self, vehicle: VirtualVehicle, parameters: ParameterView, record: Callable[[bytes], None] = ignore
+    ) -> None:
         self._vehicle = vehicle
         self._parameters = parameters
+        self._record = record
         self._channel = Channel(1, mavlink.MAV_COMP_ID_AUTOPILOT1)
         self._channel.set_default("HEARTBEAT", 1.0)
         self._in_progress: dict[tuple[Source, int | None], _InProgress] = {}
@@ -173,6 +182,7 @@ class Session:
         calls: list[Call] = []
         for message in self._channel.receive(data):
             self.frames += 1
+            self._record(message.frame)
             self._busy_until = max(self._busy_until, now) + 1.0 / MAX_FRAMES_PER_S
             if not _addresses_vehicle(message):
                 continue
@@ -307,17 +317,19 @@ class Session:
         return [Call(request, message.name, source, mission_ack=True)]
 
     def _set_parameter(self, message: Message, source: Source, now: float) -> list[Call]:
+        """Return the call for a write. The new value is reported at once, because clients do not wait for a verdict."""
         name = message.text("param_id")
         value = message.real("param_value")
+        before = self._parameters.values.get(name, 0.0)
         try:
             request = self._parameters.write(name, value)
         except Untranslatable:
             self._report_parameter(name)
             raise
-        if request is None:
-            self._report_parameter(name)
-            return []
-        return [Call(request, f"PARAM_SET {name}", source, parameter=name, value=value)]
+        if request is not None:
+            self._parameters.values[name] = value
+        self._report_parameter(name)
+        return [] if request is None else [Call(request, f"PARAM_SET {name}", source, parameter=name, before=before)]
 
     # Results of calls
 
@@ -332,15 +344,14 @@ class Session:
         """
         self._in_progress.pop(call.key, None)
         accepted = result == mavlink.MAV_RESULT_ACCEPTED
-        if accepted and call.parameter:
-            self._parameters.values[call.parameter] = call.value
         if call.command is not None:
             self._acknowledge(call.source, call.command, result)
         elif call.mission_ack:
             self._send_mission_ack(
                 call.source, mavlink.MAV_MISSION_ACCEPTED if accepted else mavlink.MAV_MISSION_DENIED
             )
-        elif call.parameter:
+        elif call.parameter and not accepted:
+            self._parameters.values[call.parameter] = call.before
             self._report_parameter(call.parameter)
         if text and accepted:
             self.send_text(mavlink.MAV_SEVERITY_NOTICE, text, now)

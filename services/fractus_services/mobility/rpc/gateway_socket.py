@@ -146,11 +146,14 @@ class GatewaySocket:
         """
         try:
             self._path.parent.mkdir(parents=True, exist_ok=True)
-            self._path.unlink(missing_ok=True)
+            if self._path.is_socket():  # of an earlier process
+                self._path.unlink()
             server = await asyncio.start_unix_server(self._serve, self._path)
             self._path.chmod(0o600)
         except OSError as error:
-            raise CannotServe(f"--gateway-socket {self._path}: cannot listen there ({error.strerror})") from None
+            raise CannotServe(
+                f"--gateway-socket {self._path}: cannot listen there ({error.strerror}); name a file that does not exist"
+            ) from None
         async with server:
             log.info("gateway: serving (socket=%s)", self._path)
             try:

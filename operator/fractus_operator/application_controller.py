@@ -466,10 +466,8 @@ class ApplicationController:
         deployments = self._objects.of(observed.key, kinds.DEPLOYMENT)
         refused = {body["metadata"]["name"]: refusal_of(body) for body in deployments}
         application = observed.submitted.application
-        awaits: tuple[str, ...] = ()
-        if application is not None:
-            awaits = PlanPods(plan, observed.pods, application.spec.start).awaited
-        return status.deployed(plan, observed.pods, granted, flown, refused, awaits=awaits)
+        waits = application is not None and bool(PlanPods(plan, observed.pods, application.spec.start).awaited)
+        return status.deployed(plan, observed.pods, granted, flown, refused, waits=waits)
 
 
 def _drone_of(plan: DeploymentPlanSpec | None) -> str | None:

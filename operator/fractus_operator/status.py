@@ -220,7 +220,7 @@ def deployed(
     flown: FlightStatus | None = None,
     refused: Mapping[str, str] = MappingProxyType({}),
     *,
-    awaits: Sequence[str] = (),
+    waits: bool = False,
 ) -> StatusUpdate:
     """Return the status of an Application whose child objects are all applied.
 
@@ -230,7 +230,7 @@ def deployed(
         granted: Number of instances with Grants.
         flown: Status of the flight, if the plan has a drone.
         refused: Reason why pods cannot be created, by instance. Empty if all pods can be created.
-        awaits: Components for which the takeoff waits.
+        waits: True if the takeoff waits until all pods are ready.
     """
     running = PlanPods(plan, pods)
     missing = [placed.instance for placed in running.unready]
@@ -257,8 +257,8 @@ def deployed(
     phase: Phase = "Deploying" if missing else "Running"
     if flown is not None:
         message = f"{message}; {flown.activity}"
-        if awaits:
-            message += f"; the mission begins when {', '.join(awaits)} {'is' if len(awaits) == 1 else 'are'} ready"
+        if waits:
+            message += "; the mission begins when all components are ready"
         # A drone in the air is more important than a restarting pod.
         if not missing or flown.phase not in {"Waiting", "Landed"}:
             phase = flown.phase

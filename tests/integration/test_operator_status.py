@@ -78,7 +78,11 @@ def test_application_that_starts_when_ready_waits_for_its_components_until_takeo
     wait_for(lambda: awaits(world, namespace) == [], lambda: f"no awaited component: {world.status(namespace)}")
     set_ready(world, namespace, "DataStore", "False")
     wait_for(lambda: awaits(world, namespace) == ["DataStore"], "the drone to wait for the DataStore")
-    wait_for(lambda: "the mission begins when DataStore is ready" in world.status(namespace)["message"], "the message")
+    expected = (
+        "waiting for traffic-data-store; drone-1 is on the ground, its mission has not begun;"
+        " the mission begins when all components are ready"
+    )
+    wait_for(lambda: world.status(namespace)["message"] == expected, lambda: f"{expected}: {world.status(namespace)}")
     set_ready(world, namespace, "DataStore", "True")
     wait_for(lambda: awaits(world, namespace) == [], "no awaited component again")
     world.drone_status("drone-1", "flying")

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, Literal, Self
 
 from fractus_core.api.model import InvalidObject, quantity
+from fractus_core.control.state import TaskKind
 from fractus_sim.errors import ExperimentError
 from fractus_sim.experiment.checks import Check
 from fractus_sim.experiment.definition import NamedZone
@@ -56,7 +57,7 @@ _SHORTENED = frozenset({"LegShortened", "VelocityScaled"})
 _LEAVING_WORDS = (" outside ", " leaves ", " border of ", "none of ")
 """Words in the reasons of fences that a drone must not leave."""
 
-_ENDING_TAKEOVERS = frozenset({"revoke", "returnToLaunch", "land", "abort"})
+_ENDING_TAKEOVERS = frozenset(task.value for task in (TaskKind.RETURN, TaskKind.LAND, TaskKind.LAND_AT))
 _PENDING_PHASES = frozenset({"", "Running", "Waiting", "Flying", "Returning", "Landed"})
 _SAME_CAUSE_S = 2.0
 """A takeover within this time after a violation of the same reason is its effect, and not another violation."""

@@ -61,12 +61,13 @@ def test_passed_test_leaves_its_folder_only_on_request(pytester: pytest.Pytester
     assert (folder / "summary.md").exists()
 
 
-def test_test_is_repeated_with_each_seed_in_its_own_folder(pytester: pytest.Pytester) -> None:
-    pytester.makepyfile(flight(north=50, marker=", seeds=2"))
-    result = pytester.runpytest_inprocess("-v")
-    result.assert_outcomes(failed=2)
-    result.stdout.fnmatch_lines(["*test_hop[[]seed3[]] FAILED*", "*test_hop[[]seed4[]] FAILED*"])
-    assert len(folders(pytester)) == 2
+def test_test_is_repeated_with_each_seed(pytester: pytest.Pytester) -> None:
+    pytester.makepyfile(flight(marker=", seeds=2"))
+    result = pytester.runpytest_inprocess("-v", "--junit-xml=junit.xml")
+    result.assert_outcomes(passed=2)
+    result.stdout.fnmatch_lines(["*test_hop[[]seed3[]] PASSED*", "*test_hop[[]seed4[]] PASSED*"])
+    seeds = [p.get("value") for p in ET.parse(pytester.path / "junit.xml").iter("property")]
+    assert seeds == ["3", "4"]
 
 
 def test_unknown_field_of_the_marker_is_named(pytester: pytest.Pytester) -> None:

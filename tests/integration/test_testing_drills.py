@@ -95,6 +95,9 @@ def test_attack_is_prevented_and_the_drone_returns(fractus: Scene, attack: App, 
     results.check_audit()
     if violation is not None:
         results.check_violations("vDrone-1", type=violation)  # type: ignore[arg-type]
+    if attack.command[-1] == "leaves-corridor":
+        callers = {v.caller for v in results.get_violations("vDrone-1")}
+        assert callers == {"App-vdrone-1"}, "the engine must refuse the calls before the monitor has to stop the drone"
     border = PATH[0][0] + SAFETY_RADIUS_M / 111_320
     assert max(sample.place.lat for sample in results.track("vDrone-1").samples) < border - KEPT_M / 111_320
 

@@ -187,7 +187,7 @@ async def test_view_receives_thumbnails_and_continues_after_the_last_one(
     first = next(event for event in events if isinstance(event, Picture))
     assert (first.drone, first.time_ms, bodies[0]) == ("drone-1", T_MS, b"\x00\x01\x02")
     program = "python3 -m fractus_services.recording.thumbnails /var/lib/fractus/recordings/camera --after"
-    expected = f"--context=town exec -n fractus-system fractus-camera-x -- {program}"
+    expected = f"--context=town exec -n fractus-system fractus-camera-x -c camera -- {program}"
     assert calls.read_text().splitlines()[:2] == [f"{expected} 0", f"{expected} {T_MS}"]
 
 

@@ -110,7 +110,10 @@ class Cluster:
     def __init__(self, *nodes: str) -> None:
         self.pods: list[Body] = [
             {
-                "metadata": {"namespace": "fractus-system", "name": f"fractus-mobility-{node}"},
+                "metadata": {
+                    "namespace": "fractus-system", "name": f"fractus-mobility-{node}",
+                    "labels": {"app.kubernetes.io/component": "mobility"},
+                },
                 "spec": {"nodeName": node}, "status": {"phase": "Running"},
             }
             for node in nodes
@@ -200,6 +203,7 @@ async def test_verdict_is_published_once_although_its_log_is_read_repeatedly(mon
         await events.until(lambda events: reasons(events)[-1] == "3")
     assert reasons(events) == ["1", "2", "3"], "drone-2 does not fly"
     assert problem(events) == ""
+    assert cluster.requests[0]["container"] == "mobility"
     assert "sinceTime" not in cluster.requests[0]
     assert cluster.requests[1]["sinceTime"] == call(1).split()[0]
 

@@ -114,7 +114,7 @@ class ClusterPictures:
         after_ms = 0
         while True:
             process = await asyncio.create_subprocess_exec(
-                *self._kubectl, "exec", "-n", self._system_namespace, pod, "--",
+                *self._kubectl, "exec", "-n", self._system_namespace, pod, "-c", "camera", "--",
                 "python3", "-m", "fractus_services.recording.thumbnails", DIRECTORY, "--after", str(after_ms),
                 stdin=asyncio.subprocess.DEVNULL, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE,
                 limit=MAX_LINE_BYTES,

@@ -38,7 +38,8 @@ MAX_HISTORY_LINES = 2_000
 MAX_LOGS = 40
 """Maximum number of logs that are followed. Each of them keeps one connection to the API server."""
 
-_SERVICES = "app.kubernetes.io/name=fractus,app.kubernetes.io/component in (mobility,camera)"
+_COMPONENT = "app.kubernetes.io/component"
+_SERVICES = f"app.kubernetes.io/name=fractus,{_COMPONENT} in (mobility,camera)"
 
 _END = r"reason=(?P<reason>.*?)\)(?: \(suppressed=\d+\))?"
 _CALL = re.compile(
@@ -175,14 +176,14 @@ class LogVerdicts:
         """Follow the logs of the current pods. Return the reasons why some verdicts are not received."""
         problems: list[str] = []
         drones = self._drones()
-        wanted: dict[Key, str] = {}
+        wanted: dict[Key, Body] = {}
         if drones:
             page = await self._client.list_whole(
                 POD, namespace=self._system_namespace, selectors={"labelSelector": _SERVICES}
             )
             running = (pod for pod in page.items if pod.get("status", {}).get("phase") == "Running")
             services = [pod for pod in running if pod["spec"].get("nodeName") in drones]
-            wanted = {_key(pod): pod["spec"]["nodeName"] for pod in services[:MAX_LOGS]}
+            wanted = {_key(pod): pod for pod in services[:MAX_LOGS]}
             if len(services) > MAX_LOGS:
                 problems.append(f"only the verdicts of {MAX_LOGS} of {len(services)} services are received")
             silent = sorted(drones.difference(pod["spec"]["nodeName"] for pod in services))
@@ -198,12 +199,15 @@ class LogVerdicts:
             self._tasks[key] = asyncio.create_task(self._follow(key, wanted[key]))
         return problems
 
-    async def _follow(self, pod: Key, node: str) -> None:
-        """Follow the log of a pod until cancelled."""
+    async def _follow(self, pod: Key, body: Body) -> None:
+        """Follow the log of a pod's service until cancelled."""
+        node = body["spec"]["nodeName"]
+        # Clusters may add other containers to the pod. The service's container has the name of the service.
+        container = body["metadata"]["labels"][_COMPONENT]
         while True:
             try:
                 async with asyncio.timeout(FOLLOW_S):
-                    await self._read(pod, node)
+                    await self._read(pod, node, container)
                 self._problems.pop(pod, None)
             except TimeoutError:
                 self._problems.pop(pod, None)
@@ -214,12 +218,14 @@ class LogVerdicts:
                 )
             await asyncio.sleep(RETRY_S)
 
-    async def _read(self, pod: Key, node: str) -> None:
+    async def _read(self, pod: Key, node: str, container: str) -> None:
         reached = self._reached.get(pod, "")
         start = (
             {"sinceTime": reached} if reached else {"sinceSeconds": str(HISTORY_S), "tailLines": str(MAX_HISTORY_LINES)}
         )
-        lines = self._client.log(pod, {"follow": "true", "timestamps": "true", **start}, silence_s=None)
+        lines = self._client.log(
+            pod, {"container": container, "follow": "true", "timestamps": "true", **start}, silence_s=None
+        )
         async with aclosing(lines):
             async for raw in lines:
                 line = raw.decode(errors="replace")

@@ -25,7 +25,10 @@ from fractus_agent.registration.registration import Registration
 from fractus_agent.settings import Settings
 from fractus_agent.store import Object, Store
 from fractus_agent.supervisor import Supervisor, run_watchdog
-from fractus_agent.telemetry import LINK_INTERVAL_S, TELEMETRY_INTERVAL_S, TelemetryFeed
+from fractus_agent.telemetry import CONTACT_INTERVAL_S, LINK_INTERVAL_S, TELEMETRY_INTERVAL_S, TelemetryFeed
+
+CONTACT_TIMEOUT_S = 3.0
+"""Longest duration of a request that tests the contact with the API server."""
 
 
 class Agent:
@@ -76,6 +79,7 @@ class Agent:
         self._supervisor.add("registration", self._registration.run)
         self._supervisor.add("status", self._reporter.run)
         self._supervisor.add("telemetry", self._run_telemetry)
+        self._supervisor.add("contact", self._keep_contact)
         if settings.direct_links:
             self._supervisor.add("links", self._run_links)
 
@@ -115,9 +119,17 @@ class Agent:
             self._settings.node,
             serial=lambda: self._identity.serial,
             on_change=self._on_telemetry,
+            contact_age_s=lambda: self._store.contact_age_s if self._grants.depends_on_contact else math.inf,
         )
         self._set_telemetry_interval()
         await self._feed.run()
+
+    async def _keep_contact(self) -> None:
+        """Contact the API server every second while an Application depends on the contact."""
+        while True:
+            if self._grants.depends_on_contact:
+                await self._store.is_reachable(CONTACT_TIMEOUT_S)
+            await asyncio.sleep(CONTACT_INTERVAL_S)
 
     async def _run_links(self) -> None:
         """Run direct links once the node has a direct interface and a certificate."""

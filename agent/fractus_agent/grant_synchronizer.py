@@ -238,6 +238,12 @@ class GrantSynchronizer:
             "unstored": len(self._unstored),
         }
 
+    @property
+    def depends_on_contact(self) -> bool:
+        """True if a stored Grant demands a reaction when contact with the API server is lost."""
+        demands = (grant.spec.contact_lost for grant in self._grants.values())
+        return any(demand is not None and demand.action != "continue" for demand in demands)
+
     def set_missions(self, missions: Mapping[str, Outcome]) -> None:
         """Set the outcomes of missions that the mobility service reports."""
         if dict(missions) != self._missions:

@@ -345,6 +345,11 @@ class Store:
                 backoff.succeeded()
             await asyncio.sleep(backoff.delay_s())
 
+    @property
+    def contact_age_s(self) -> float:
+        """Seconds since the last successful request to the API server, infinite before the first."""
+        return time.monotonic() - max(self._client.succeeded_at, self._own_client.succeeded_at)
+
     async def is_reachable(self, timeout_s: float) -> bool:
         """Return True if the API server responds within the timeout. A refusal counts as a response."""
         return await self._client.responds(timeout_s)

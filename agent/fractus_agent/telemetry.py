@@ -15,7 +15,12 @@ from fractus_core.api.geometry import Reference
 from fractus_core.api.names import node_server_name
 from fractus_core.control import Outcome, OutcomeKind, WaypointCounts
 from fractus_core.exhaustive import exhaustive
-from fractus_proto.v1.mobility_pb2 import MissionOutcome, SubscribeTelemetryRequest, Telemetry
+from fractus_proto.v1.mobility_pb2 import (
+    MissionOutcome,
+    ReportContactRequest,
+    SubscribeTelemetryRequest,
+    Telemetry,
+)
 from fractus_proto.v1.mobility_pb2_grpc import MobilityServiceStub
 from fractus_proto.v1.types_pb2 import AltitudeReference
 from fractus_runtime.backoff import Backoff
@@ -31,6 +36,9 @@ LINK_INTERVAL_S = 0.25
 """Seconds between messages while direct links are planned, because link decisions use them."""
 SILENCE_TIMEOUT_S = 5.0
 """Seconds without a message after which the service counts as unreachable."""
+
+CONTACT_INTERVAL_S = 1.0
+"""Seconds between two reports of the contact with the API server, and the longest duration of a report."""
 
 _PROTO_REFERENCES: dict[Reference, AltitudeReference] = exhaustive(
     Reference,
@@ -133,6 +141,8 @@ class TelemetryFeed:
         node: Name of the node, from which the server name is derived.
         serial: Returns the number of certificate changes. The feed reconnects when it changes.
         on_change: Called after each message and each loss of the connection.
+        contact_age_s: Returns the seconds since the last contact with the API server. The feed reports a finite age to the
+            service once per second.
 
     Attributes:
         latest: Latest telemetry, None before the first message.
@@ -140,13 +150,22 @@ class TelemetryFeed:
     """
 
     def __init__(
-        self, address: str, tls: Path, node: str, *, serial: Callable[[], int], on_change: Callable[[], None]
+        self,
+        address: str,
+        tls: Path,
+        node: str,
+        *,
+        serial: Callable[[], int],
+        on_change: Callable[[], None],
+        contact_age_s: Callable[[], float] = lambda: math.inf,
     ) -> None:
         self._address = address
         self._tls = tls
         self._node = node
         self._serial = serial
         self._on_change = on_change
+        self._contact_age_s = contact_age_s
+        self._reported_s = -math.inf
         self._interval_s = TELEMETRY_INTERVAL_S
         self._message_s = -math.inf
         self.latest: TelemetrySnapshot | None = None
@@ -198,9 +217,23 @@ class TelemetryFeed:
                     message = await asyncio.wait_for(call.read(), SILENCE_TIMEOUT_S)
                     if message is grpc.aio.EOF:
                         raise ConnectionResetError(f"the service ended the stream: {await call.details()}")
+                    await self._report_contact(stub)
                     yield message
             finally:
                 call.cancel()
+
+    async def _report_contact(self, stub: MobilityServiceStub) -> None:
+        """Report the contact with the API server if a report is due. To the service, a failed report is missing contact."""
+        age_s = self._contact_age_s()
+        # The interval is a little shorter than that of the telemetry, so that no message is skipped.
+        due = time.monotonic() - self._reported_s >= 0.9 * CONTACT_INTERVAL_S
+        if not (due and math.isfinite(age_s)):
+            return
+        self._reported_s = time.monotonic()
+        try:
+            await stub.ReportContact(ReportContactRequest(age_s=age_s), timeout=CONTACT_INTERVAL_S)
+        except grpc.aio.AioRpcError as error:
+            log.warning("telemetry: contact not reported (error=%s: %s)", error.code().name, error.details())
 
     def _lost(self, reason: str) -> None:
         problem = f"The mobility service is unreachable: {reason}."

@@ -21,8 +21,8 @@ CALL_TIMEOUT_S = 10.0
 RECONNECT_TIMEOUT_S = 30.0
 """Time for which a call retries while the service restarts. After its start, the service gives a driver 15 s to reconnect."""
 
-SUSPENDED = "Suspended"
-"""Code of a motion that is refused while the drone flies to a target that a geofence corrected, for at most 60 s."""
+WAITING_CODES = frozenset({"Suspended", "ContactLost"})
+"""Codes of motions that have to wait: for the end of a corrected leg, or for contact with the API server."""
 
 MAX_RETRY_DELAY_S = 2.0
 """Longest delay between two attempts."""
@@ -230,7 +230,7 @@ class Retries:
     async def pause(self, error: grpc.aio.AioRpcError | None = None) -> None:
         """Wait before the next attempt.
 
-        While a corrected leg suspends the driver, attempts continue until the leg ends, because the service responds.
+        While a motion has to wait for another leg or for contact, attempts continue, because the service responds.
 
         Args:
             error: Failure of the last attempt; None if the service ended the stream.
@@ -241,7 +241,7 @@ class Retries:
         now = asyncio.get_running_loop().time()
         delay = next(self._delays)
         decision = decision_of(error) if error is not None else None
-        if decision is not None and decision.code == SUSPENDED:
+        if decision is not None and decision.code in WAITING_CODES:
             self._give_up = None
         self._give_up = self._give_up or now + self._channel.reconnect_timeout_s
         transient = error is None or self._channel.transient(error)

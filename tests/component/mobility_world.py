@@ -22,6 +22,7 @@ from fractus_core.policy.decision_types import Airframe, GotoArgs, Home, Takeoff
 from fractus_runtime.mavlink_codec import Message, message
 from fractus_services.errors import Refused
 from fractus_services.grant_files import ActiveGrant
+from fractus_services.mobility.authority.contact import LastContactFile
 from fractus_services.mobility.authority.journal import Journal
 from fractus_services.mobility.autopilot import VELOCITY_HISTORY_S, FailsafeStatus
 from fractus_services.mobility.flight.service import Progress
@@ -328,6 +329,7 @@ class World:
         after: World | None = None,
         initialised: bool = True,
         step_s: float = STEP_S,
+        contact_file: LastContactFile | None = None,
     ) -> None:
         self.plane = after.plane if after is not None else Plane(step_s)
         if retraces:
@@ -341,7 +343,7 @@ class World:
         facts = self.plane.vehicle
         parts = MobilityComponents(
             self.plane, MavlinkFailsafes(self.plane), self.fence, RtlParameters(self.plane, directory), journal=self.journal, grants=self.grants,  # type: ignore[arg-type]
-            audit=self.audit, clock=lambda: 1_790_000_000.0 + self.plane.now, grace_s=grace_s, boarding_s=boarding_s,  # type: ignore[arg-type]
+            audit=self.audit, clock=lambda: 1_790_000_000.0 + self.plane.now, grace_s=grace_s, boarding_s=boarding_s, contact_file=contact_file,  # type: ignore[arg-type]
             state=ControlState(decided=initialised, armed_seen=facts.armed if initialised else None, expected_mode=GUIDED),
         )  # fmt: skip
         self.control = parts.control
@@ -350,6 +352,7 @@ class World:
         self.streams = parts.streams
         self.poi_missions = parts.poi_missions
         self.monitor = parts.monitor
+        self.contact = parts.control.contact
         self.supervisor = parts.supervisor
         self.observer = parts.observer  # fmt: skip
         self.control.failsafe_status = FailsafeStatus("", (), Airframe(retraces=retraces), 8.0, retraces)

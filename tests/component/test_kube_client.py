@@ -6,9 +6,11 @@ import asyncio
 import contextlib
 import gzip
 import json
+import math
 import socket
 import ssl
 import sys
+import time
 from collections.abc import AsyncGenerator, AsyncIterator
 from pathlib import Path
 from typing import Any
@@ -466,3 +468,15 @@ async def test_blocking_client_works_in_several_threads() -> None:
 
         await asyncio.gather(*(asyncio.to_thread(send_requests) for _ in range(3)))
     assert sum("fieldManager=kubectl&force=true" in r.line for r in server.requests) == 3
+
+
+async def test_client_records_time_of_successful_responses_only() -> None:
+    status = 403
+    server = Server(lambda _request: response({"kind": "Status", "message": "no"} if status != 200 else {}, status))
+    async with client_of(server) as client:
+        assert client.succeeded_at == -math.inf
+        assert await client.responds(5.0), "a refusal is a response"
+        assert client.succeeded_at == -math.inf
+        status = 200
+        assert await client.responds(5.0)
+        assert 0 <= time.monotonic() - client.succeeded_at < 5

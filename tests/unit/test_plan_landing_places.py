@@ -1,11 +1,13 @@
 """Legality of landing places before takeoff."""
 
 import pytest
+from fractus_core.api import Application
 from fractus_core.api.geometry import Point
 from fractus_core.planning import Infeasible, Settings, plan
+from fractus_core.planning.grant_compiler import compile_grants
 from test_grants import FENCE, policy, zone
 from test_plan_legality import APP, WARN, stock
-from test_planning import at, drone
+from test_planning import PATH, application, at, drone, navigator
 
 
 def aborting(place, **more):
@@ -66,6 +68,26 @@ def test_another_drone_is_selected_if_landing_place_is_legal_for_it_only():
     chosen = plan(APP, stock(only_a, zones=[FAR], drones=fleet), WARN)
     assert chosen.drone.node == "d"
     assert [(r.node, r.reason) for r in chosen.rejected] == [("a", "LandingPlaceIllegal")]
+
+
+def losing_contact(lost):
+    body = application(navigator(PATH)).to_dict()
+    return Application.from_body(body | {"spec": body["spec"] | {"contactLost": lost}})
+
+
+def test_landing_place_for_lost_contact_is_checked():
+    lost = {"action": "abort", "landAt": {name: at(100, 500)[name] for name in ("lat", "lon")}}
+    app = losing_contact(lost)
+    with pytest.raises(Infeasible) as refused:
+        plan(app, stock(), WARN)
+    assert refused.value.rejected[0].message.startswith("contactLost.landAt (")
+
+
+def test_grant_contains_reaction_to_lost_contact():
+    lost = {"after": 20, "action": "abort", "landAt": {name: at(100, 0)[name] for name in ("lat", "lon")}}
+    app = losing_contact(lost)
+    (grant,) = compile_grants(app, plan(app, stock(), WARN), stock())
+    assert grant.contact_lost == app.spec.contact_lost
 
 
 def test_landing_place_is_not_checked_without_time():

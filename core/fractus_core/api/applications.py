@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from pydantic import Field
 
-from fractus_core.api.components import Component, Placement, PointsOfInterest, ReferenceField
+from fractus_core.api.components import Component, ContactLoss, Placement, PointsOfInterest, ReferenceField
 from fractus_core.api.model import AGE, READY, Conditions, Model, ObservedGeneration, OpenModel, Resource, keyed
 from fractus_core.api.rules import Violation, rule
 
@@ -69,6 +69,9 @@ class ApplicationSpec(Model):
         default="immediately",
         description="When the mission may begin. immediately: as soon as the drone is ready. whenReady: the motors do not start"
         " while a pod of a component is not ready. After the takeoff, the mission continues without it.",
+    )
+    contact_lost: ContactLoss | None = Field(
+        default=None, description="Reaction when the drone loses contact with the API server; unset: it flies on."
     )
     update_policy: Literal["OnGround", "Immediate"] = Field(
         default="OnGround",

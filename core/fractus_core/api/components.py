@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, Self, assert_never
 from pydantic import Field, WithJsonSchema, model_validator
 
 from fractus_core.api.formats import IMAGE, MOUNT_PATH, VARIABLE
-from fractus_core.api.geometry import Area, Circle, Position
+from fractus_core.api.geometry import Area, Circle, Point, Position
 from fractus_core.api.methods import METHODS_OF, Interface, Method, Service
 from fractus_core.api.model import InvalidObject, Model, Quantity, keyed, quantity
 from fractus_core.api.names import ComponentName, HeuristicKind, Name, PortName, slug
@@ -296,6 +296,31 @@ def _belong(service: Service) -> Any:
         return next((f"methods[{i}]" for i in foreign), None)
 
     return belong
+
+
+class ContactLoss(Model):
+    """Reaction of the drone when its agent loses contact with the API server in flight."""
+
+    after: int = Field(
+        default=30, ge=10, le=86_400, description="Seconds without contact after which the action begins, at least 10."
+    )
+    action: Literal["continue", "hover", "abort"] = Field(
+        default="continue",
+        description="continue: fly on under the stored Grants. hover: hover until contact returns. abort: end the mission, and"
+        " land at landAt.",
+    )
+    land_at: Point | None = Field(
+        default=None,
+        description="For abort: place on the ground at which the system lands the drone; unset, or if it cannot be reached"
+        " legally: home.",
+    )
+
+    @rule(
+        "!has(self.landAt) || (has(self.action) && self.action == 'abort')",
+        "landAt is only allowed with action abort",
+    )
+    def _landing(self) -> Violation:
+        return "landAt" if self.land_at is not None and self.action != "abort" else None
 
 
 class ServiceRequest(Model):

@@ -14,6 +14,7 @@ from pydantic import Field, model_validator
 
 from fractus_core.api.components import (
     ComponentClass,
+    ContactLoss,
     ControlPoint,
     ControlScope,
     PointsOfInterest,
@@ -112,6 +113,9 @@ class GrantSpec(Model):
         " does not take off for the mission while there are any.",
     )
     policies: tuple[GrantedPolicy, ...] = Field(default=(), description="Policies that apply to the instance.")
+    contact_lost: ContactLoss | None = Field(
+        default=None, description="Reaction when the drone loses contact with the API server; unset: it flies on."
+    )
     mission: str | None = Field(
         default=None,
         max_length=253,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 from fractus_core.control.state import FlightMode, Outcome, VehicleFacts
 from fractus_core.policy.decision_types import Takeover
@@ -195,6 +196,26 @@ class PositionFound:
 
 
 @dataclass(frozen=True, slots=True)
+class ContactLost:
+    """There is no contact with the API server for so long that the mission must hover or end. Sent until contact returns.
+
+    Attributes:
+        action: `hover` until contact returns, or `abort` the mission.
+        reason: Reason in plain text.
+        land_at: Latitude and longitude of the landing place for `abort`; None: home.
+    """
+
+    action: Literal["hover", "abort"]
+    reason: str
+    land_at: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class ContactRestored:
+    """Contact with the API server is restored, or the mission does not depend on it any more."""
+
+
+@dataclass(frozen=True, slots=True)
 class GrantChanged:
     """A grant was added, changed or removed."""
 
@@ -375,7 +396,9 @@ DriverEvent = (
     | WaypointsDone | CruiseSpeedSet
 )  # fmt: skip
 MotionEvent = MotionBegan | MotionFinished | MotionFailed | MotionCancelled | MotionStopped
-PolicyEvent = TakeoverDemanded | BrakeDemanded | PositionLost | PositionFound | GrantChanged
+PolicyEvent = (
+    TakeoverDemanded | BrakeDemanded | PositionLost | PositionFound | ContactLost | ContactRestored | GrantChanged
+)  # fmt: skip
 VehicleEvent = VehicleObserved | VehicleFound | Heartbeat | Airborne | ModeChangeBegan | ModeChangeEnded
 ArmingEvent = ArmingRequested | ArmingPrepared | MotorStart
 SystemEvent = (

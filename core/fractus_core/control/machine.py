@@ -23,6 +23,8 @@ from fractus_core.control.actions import (
 from fractus_core.control.events import (
     ArmingEvent,
     BrakeDemanded,
+    ContactLost,
+    ContactRestored,
     ControlReturned,
     CruiseSpeedSet,
     DriverEvent,
@@ -60,6 +62,8 @@ from fractus_core.control.events import (
 )
 from fractus_core.control.state import (
     COMPLETE,
+    CONTACT_LOST,
+    DRIVER_LOST_CODE,
     NOTHING_FLOWN,
     ActiveFlight,
     ActiveMotion,
@@ -125,6 +129,9 @@ SECOND_STREAM = "another process of this component has the control stream; end t
 
 DESCENTS = frozenset({"Land", "ReturnToLaunch"})
 """Motions that end on the ground."""
+
+CORRECTION = "Correction"
+"""Kind of the motions with which the monitor flies a driver's drone back into its limits."""
 
 
 def transition(state: ControlState, event: Event, now: float) -> tuple[ControlState, tuple[Action, ...]]:
@@ -257,6 +264,7 @@ def _grant_control(update: StateUpdate, lease_id: int) -> None:
         return
     if (
         state.authority is Authority.PILOT
+        or state.contact_lost
         or state.home_for_good
         or not state.decided
         or state.armed_for_other(lease.key)
@@ -467,6 +475,10 @@ def _on_policy(update: StateUpdate, event: PolicyEvent) -> None:
             if update.state.grace is not None and update.state.grace.code == POSITION_UNKNOWN:
                 update.set(grace=None)
                 update.audit("control", "resumed", update.state.controller, "the position is known again")
+        case ContactLost():
+            _lose_contact(update, event)
+        case ContactRestored():
+            _restore_contact(update)
         case GrantChanged():
             _change_grant(update, event)
         case _:
@@ -501,6 +513,42 @@ def _lose_position(update: StateUpdate, reason: str) -> None:
     mission = update.state.mission
     if update.state.drives and update.state.grace is None and mission is not None:
         update.begin_grace(mission, reason, POSITION_UNKNOWN)
+
+
+def _lose_contact(update: StateUpdate, event: ContactLost) -> None:
+    """Hover until contact with the API server returns, or end the mission.
+
+    Neither a descent nor a pilot is interrupted. On the ground, the mission waits for contact.
+    """
+    state = update.state
+    if not state.contact_lost:
+        update.set(contact_lost=True)
+        update.audit("control", "contactLost", state.controller, event.reason, CONTACT_LOST)
+        update.act(WakeWaiters())
+    mission = state.mission
+    ends = mission is None or mission.outcome is not None
+    if ends or not state.vehicle.in_air or state.authority is Authority.PILOT or state.returning:
+        return
+    motion = state.motion
+    if event.action == "abort":
+        kind = update.plan_landing(mission, event.land_at)
+        update.seize(kind, CONTACT_LOST, event.reason, (), OutcomeKind.FAILED)
+    elif motion is not None and motion.kind not in DESCENTS | {CORRECTION}:
+        update.stop_motion(StopKind.PASSING, CONTACT_LOST, event.reason)
+        update.act(Brake())
+
+
+def _restore_contact(update: StateUpdate) -> None:
+    """Let the mission continue. A drone that hovers without a driver waits for the driver once more."""
+    state = update.state
+    if not state.contact_lost:
+        return
+    if state.waits_for_contact and state.grace is not None:
+        update.set(grace=replace(state.grace, until=update.now + state.grace_s))
+    update.set(contact_lost=False)
+    reason = "there is contact with the API server again"
+    update.audit("control", "contactRestored", state.controller, reason, CONTACT_LOST)
+    update.act(WakeWaiters())
 
 
 def _change_grant(update: StateUpdate, event: GrantChanged) -> None:
@@ -594,7 +642,7 @@ def _on_tour(update: StateUpdate, event: TourBegan | TourInterrupted | TourEnded
             mission = update.state.missions.get(key)
             if mission is not None and _flies_tour(update, key):
                 update.start(TaskKind.HOVER)
-                update.begin_grace(mission, reason)
+                update.begin_grace(mission, reason, CONTACT_LOST if update.state.contact_lost else DRIVER_LOST_CODE)
         case TourEnded(key, outcome):
             mission = update.state.missions.get(key)
             if mission is not None and _flies_tour(update, key):
@@ -630,7 +678,8 @@ def _on_tick(update: StateUpdate) -> None:
     """Handle expired deadlines, and take over an armed vehicle for which no party is responsible."""
     grace = update.state.grace
     motion = update.state.motion
-    if grace is not None and update.now >= grace.until and not update.state.in_transit:
+    waits = update.state.in_transit or update.state.waits_for_contact
+    if grace is not None and update.now >= grace.until and not waits:
         _end_grace(update)
     if (
         motion is update.state.motion

@@ -20,6 +20,7 @@ class Readiness:
         link: Problem of the link to the autopilot.
         absent: Reason why received messages do not come from the autopilot. Empty while the autopilot is connected.
         awaited: Reason why the mission must not begin yet.
+        contact: Reason why the mission waits for contact with the API server.
     """
 
     unverified: str
@@ -28,6 +29,7 @@ class Readiness:
     link: str = ""
     absent: str = ""
     awaited: str = ""
+    contact: str = ""
 
 
 def not_ready_reason(state: ControlState, key: str, readiness: Readiness) -> str | None:
@@ -45,6 +47,7 @@ def not_ready_reason(state: ControlState, key: str, readiness: Readiness) -> str
             f"the autopilot is not ready to arm: {readiness.unready}",
         ),
         (not readiness.located, "position and home are not known yet"),
+        (bool(readiness.contact), readiness.contact),
         (not vehicle.armed and bool(readiness.link), readiness.link),
         (not vehicle.armed and bool(readiness.awaited), readiness.awaited),
     )

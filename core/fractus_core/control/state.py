@@ -292,6 +292,13 @@ class ActiveMotion:
     hover_at: float | None = None
 
 
+DRIVER_LOST_CODE = "DriverLost"
+"""Code of the grace period of a lost driver."""
+
+CONTACT_LOST = "ContactLost"
+"""Code of the reaction to lost contact with the API server."""
+
+
 @dataclass(frozen=True, slots=True)
 class Grace:
     """Grace period after the loss of the driver or the position.
@@ -302,7 +309,7 @@ class Grace:
     until: float
     key: str
     reason: str
-    code: str = "DriverLost"
+    code: str = DRIVER_LOST_CODE
 
 
 @dataclass(frozen=True, slots=True)
@@ -345,6 +352,7 @@ class ControlState:
         unattended: Number of times the system took over the unattended vehicle since it last had a driver or was
             disarmed.
         last_task_id: Id of the latest system task.
+        contact_lost: True while there is no contact with the API server, and the mission must therefore hover or end.
     """
 
     grace_s: float = 5.0
@@ -376,6 +384,7 @@ class ControlState:
     unattended_since: float | None = None
     unattended: int = 0
     last_task_id: int = 0
+    contact_lost: bool = False
 
     @property
     def mission(self) -> Mission | None:
@@ -454,9 +463,21 @@ class ControlState:
         return lease is not None and flight is not None and not lease.granted and lease.key == flight.key
 
     @property
+    def waits_for_contact(self) -> bool:
+        """True if the drone hovers for a mission that continues as soon as contact with the API server returns.
+
+        The grace period does not expire meanwhile, except that of a driver that does not wait for control, or of an unknown
+        position.
+        """
+        if not self.contact_lost or self.grace is None:
+            return False
+        waiting = self.lease is not None and not self.lease.granted
+        return self.grace.code == CONTACT_LOST or (waiting and self.grace.code == DRIVER_LOST_CODE)
+
+    @property
     def deadline(self) -> float | None:
         """Time from which a Tick has an effect; None if no deadline is set."""
-        grace = self.grace if not self.in_transit else None
+        grace = self.grace if not (self.in_transit or self.waits_for_contact) else None
         deadlines = (grace.until if grace else None, self.motion.hover_at if self.motion else None)
         return min((deadline for deadline in deadlines if deadline is not None), default=None)
 

@@ -180,6 +180,7 @@ def _drone_grant(
         depot=depot.spec.location if depot is not None else None,
         home=home,
         limits=GrantedLimits(max_altitude=mobility.max_altitude, max_speed=mobility.max_speed) if mobility else None,
+        contact_lost=application.spec.contact_lost,
     )
 
 

@@ -36,7 +36,7 @@ def check_landing_places(
         settings: Settings with the time. Without a time, no place is checked.
     """
     home = home_of(drone, inventory.depots)
-    if settings.time_s is None or home is None or not _may_abort(inventory):
+    if settings.time_s is None or home is None or not _may_abort(application, inventory):
         return ""
     granted = flight_grant(application, drone, inventory, area)
     places = list(landing_places(granted))
@@ -67,10 +67,15 @@ def landing_places(grant: GrantSpec) -> Iterator[tuple[str, Point]]:
     for policy in grant.policies:
         if policy.spec.land_at is not None:
             yield f"landAt of policy {policy.name}", policy.spec.land_at
+    if grant.contact_lost is not None and grant.contact_lost.land_at is not None:
+        yield "contactLost.landAt", grant.contact_lost.land_at
 
 
-def _may_abort(inventory: Inventory) -> bool:
-    """Return True if a policy specifies a landing place. This check is quicker than the compilation of a Grant."""
+def _may_abort(application: Application, inventory: Inventory) -> bool:
+    """Return True if a landing place may apply. This check is quicker than the compilation of a Grant."""
+    lost = application.spec.contact_lost
+    if lost is not None and lost.land_at is not None:
+        return True
     return any(policy.spec.land_at is not None for policy in inventory.policies.values())
 
 

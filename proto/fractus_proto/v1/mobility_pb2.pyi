@@ -71,6 +71,16 @@ class ReportProgressResponse(_message.Message):
     __slots__ = ()
     def __init__(self) -> None: ...
 
+class ReportContactRequest(_message.Message):
+    __slots__ = ("age_s",)
+    AGE_S_FIELD_NUMBER: _ClassVar[int]
+    age_s: float
+    def __init__(self, age_s: _Optional[float] = ...) -> None: ...
+
+class ReportContactResponse(_message.Message):
+    __slots__ = ()
+    def __init__(self) -> None: ...
+
 class ReturnControlRequest(_message.Message):
     __slots__ = ()
     def __init__(self) -> None: ...

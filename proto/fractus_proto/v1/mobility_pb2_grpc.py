@@ -124,6 +124,11 @@ class MobilityServiceStub(object):
                 request_serializer=fractus__proto_dot_v1_dot_mobility__pb2.CheckCallRequest.SerializeToString,
                 response_deserializer=fractus__proto_dot_v1_dot_mobility__pb2.CheckCallResponse.FromString,
                 _registered_method=True)
+        self.ReportContact = channel.unary_unary(
+                '/fractus.v1.MobilityService/ReportContact',
+                request_serializer=fractus__proto_dot_v1_dot_mobility__pb2.ReportContactRequest.SerializeToString,
+                response_deserializer=fractus__proto_dot_v1_dot_mobility__pb2.ReportContactResponse.FromString,
+                _registered_method=True)
 
 
 class MobilityServiceServicer(object):
@@ -249,6 +254,14 @@ class MobilityServiceServicer(object):
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
+    def ReportContact(self, request, context):
+        """Reports the contact of the node's agent with the API server. Only the agent may call it, once per second. Missing reports count
+        as missing contact.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
 
 def add_MobilityServiceServicer_to_server(servicer, server):
     rpc_method_handlers = {
@@ -341,6 +354,11 @@ def add_MobilityServiceServicer_to_server(servicer, server):
                     servicer.CheckCall,
                     request_deserializer=fractus__proto_dot_v1_dot_mobility__pb2.CheckCallRequest.FromString,
                     response_serializer=fractus__proto_dot_v1_dot_mobility__pb2.CheckCallResponse.SerializeToString,
+            ),
+            'ReportContact': grpc.unary_unary_rpc_method_handler(
+                    servicer.ReportContact,
+                    request_deserializer=fractus__proto_dot_v1_dot_mobility__pb2.ReportContactRequest.FromString,
+                    response_serializer=fractus__proto_dot_v1_dot_mobility__pb2.ReportContactResponse.SerializeToString,
             ),
     }
     generic_handler = grpc.method_handlers_generic_handler(
@@ -829,6 +847,33 @@ class MobilityService(object):
             '/fractus.v1.MobilityService/CheckCall',
             fractus__proto_dot_v1_dot_mobility__pb2.CheckCallRequest.SerializeToString,
             fractus__proto_dot_v1_dot_mobility__pb2.CheckCallResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def ReportContact(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/fractus.v1.MobilityService/ReportContact',
+            fractus__proto_dot_v1_dot_mobility__pb2.ReportContactRequest.SerializeToString,
+            fractus__proto_dot_v1_dot_mobility__pb2.ReportContactResponse.FromString,
             options,
             channel_credentials,
             insecure,

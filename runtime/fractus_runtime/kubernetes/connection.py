@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import json
+import math
 import socket
 import ssl
+import time
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
 from contextlib import asynccontextmanager, contextmanager
 from enum import StrEnum
@@ -50,6 +52,9 @@ class Connection:
         may_write_s: Returns the seconds for which writes may still take effect. 0 if another process may write instead.
         trust_env: Use the proxies of the environment.
 
+    Attributes:
+        succeeded_at: Monotonic time of the last response that reported success.
+
     Raises:
         Unconfigured: A certificate or key cannot be read.
     """
@@ -66,6 +71,7 @@ class Connection:
         self._access = access
         self._may_write_s = may_write_s
         self._trust_env = trust_env
+        self.succeeded_at = -math.inf
         self._closed = False
         # Python 3.13 rejects certificates without an authority key identifier by default. Kubernetes and kubectl accept them.
         access.configuration.disable_strict_ssl_verification = True
@@ -167,6 +173,7 @@ class Connection:
                 if response.status >= HTTPStatus.BAD_REQUEST:
                     async with asyncio.timeout(silence_s):
                         raise _refusal(response.status, await response.read())
+                self.succeeded_at = time.monotonic()
                 yield response
                 return
             finally:

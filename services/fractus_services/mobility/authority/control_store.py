@@ -17,6 +17,8 @@ from fractus_core.control import Authority, ControlState, Mission
 from fractus_core.control.actions import Action, RecordAudit, RefuseStream
 from fractus_core.control.events import (
     BrakeDemanded,
+    ContactLost,
+    ContactRestored,
     ControlReturned,
     CruiseSpeedSet,
     DriverUnresponsive,
@@ -39,24 +41,24 @@ from fractus_core.control.events import (
     TransitBegan,
     WaypointsDone,
 )
-from fractus_core.control.machine import transition
+from fractus_core.control.machine import CORRECTION, transition
 from fractus_core.control.readiness import NOT_CONNECTED, Readiness, not_ready_reason
-from fractus_core.control.state import VehicleFacts
+from fractus_core.control.state import CONTACT_LOST, VehicleFacts
 from fractus_core.geo import LocalFrame
 from fractus_core.policy.compiled_grant import CompiledGrant, compile_transit_grant
-from fractus_core.policy.decision_types import Home, Verdict
+from fractus_core.policy.decision_types import Home, Verdict, deny
 from fractus_runtime.audit import AuditLog
 
 from fractus_services.errors import AutopilotError, PreconditionFailed, Unavailable
 from fractus_services.grant_files import ActiveGrant, GrantFiles
+from fractus_services.mobility.authority.contact import Contact
 from fractus_services.mobility.authority.effects import ChangeSignal, EffectRunner, FlightConstraints, Lease, Motion
 from fractus_services.mobility.authority.journal import Journal, record_of
 from fractus_services.mobility.authority.mode_controller import ModeController
 from fractus_services.mobility.autopilot import BEING_SET, Approach, Autopilot, FailsafeStatus, Permit, always
 from fractus_services.mobility.settings import SETTINGS
 
-CORRECTION = "Correction"
-"""Kind of the motions with which the monitor flies a driver's drone back into its limits."""
+NO_CONTACT = deny(CONTACT_LOST, "the drone has no contact with the API server, on which the application depends")
 
 
 class ControlStore:
@@ -69,9 +71,11 @@ class ControlStore:
         audit: Audit log for changes of control.
         approach: Return flight up to the final descent.
         grace_s: Seconds within which a lost driver may come back.
+        contact: Contact of the node with the API server.
         state: Initial state; by default only what the journal contains.
 
     Attributes:
+        contact: Contact of the node with the API server.
         modes: Mode changes, braking and descent.
         changes: Signal of changes that drivers and passengers wait for.
         effects: Execution of the state machine's actions.
@@ -89,9 +93,11 @@ class ControlStore:
         *,
         approach: Approach,
         grace_s: float,
+        contact: Contact,
         state: ControlState | None = None,
     ) -> None:
         self.autopilot = autopilot
+        self.contact = contact
         self.audit = audit
         self.modes = ModeController(autopilot, self)
         self.changes = ChangeSignal()
@@ -195,7 +201,12 @@ class ControlStore:
 
     @property
     def suspension(self) -> Verdict | None:
-        """Correction that suspends the driver: the verdict on a leg that must be completed first; None if there is none."""
+        """Reason why new motions of the driver must wait; None if there is none.
+
+        Its code is `ContactLost`, or the code of the correction of the leg that must be completed first.
+        """
+        if self._state.contact_lost:
+            return NO_CONTACT
         active = self._state.motion
         motion = self.motion
         if active is None or motion is None or active.hover_at is not None:
@@ -274,8 +285,13 @@ class ControlStore:
             self.autopilot.link_problem,
             vehicle.identity_problem,
             self.awaited(key),
+            NO_CONTACT.reason if self._depends_on_lost_contact(key) else "",
         )
         return not_ready_reason(self.state, key, readiness)
+
+    def _depends_on_lost_contact(self, key: str) -> bool:
+        grant = next((grant for grant in self._grants.active.values() if grant.key == key), None)
+        return grant is not None and self.contact.lost(grant.spec.contact_lost)
 
     def awaited(self, key: str) -> str:
         """Return why a mission must not begin yet, or an empty string if it may begin or has begun."""
@@ -575,6 +591,18 @@ class ControlStore:
         self.dispatch(MotionStopped(verdict.code, verdict.reason, verdict.policies))
 
     # Policies and grants
+
+    def check_contact(self) -> None:
+        """React to lost or restored contact with the API server as the current mission requires."""
+        grant = self.mission_grant
+        demand = grant.spec.contact_lost if grant is not None else None
+        self.contact.store(demand)
+        if demand is None or demand.action == "continue" or not self.contact.lost(demand):
+            self.dispatch(ContactRestored())
+            return
+        place = (demand.land_at.lat, demand.land_at.lon) if demand.land_at is not None else None
+        reason = f"no contact with the API server for {self.contact.age_s:.0f} s"
+        self.dispatch(ContactLost(demand.action, reason, place))
 
     def brake(self, verdict: Verdict) -> None:
         """Stop the current motion. The driver keeps control."""

@@ -28,7 +28,7 @@ from fractus_core.control.actions import (
     WakeWaiters,
 )
 from fractus_core.control.events import SystemTaskEnded
-from fractus_core.control.state import SystemTask
+from fractus_core.control.state import CONTACT_LOST, SystemTask
 from fractus_core.control.state_update import DRIVER_LOST
 from fractus_core.control.vehicle_events import MOTORS_STOPPED
 from fractus_core.policy.compiled_grant import CompiledGrant
@@ -326,6 +326,7 @@ def _refusal(stop: StopMotion) -> Refused:
         case StopKind.LOST:
             return PreconditionFailed(stop.code, stop.reason)
         case StopKind.PASSING:
-            return Unavailable("AutopilotUnavailable", stop.reason)
+            code = CONTACT_LOST if stop.code == CONTACT_LOST else "AutopilotUnavailable"
+            return Unavailable(code, stop.reason)
         case _:
             assert_never(stop.kind)

@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict, replace
 
+from fractus_core.control.state import CONTACT_LOST
 from fractus_core.policy.compiled_grant import CompiledGrant
 from fractus_core.policy.decision_types import DENY_POSITION_UNKNOWN, Airframe, Call, Situation, Verdict
 from fractus_core.policy.engine import judge
@@ -48,6 +49,9 @@ DRIVER_METHODS = frozenset(
 
 SUSPENDED_METHODS = frozenset({"Takeoff", "Goto", "SetVelocity"})
 """Motions that are refused while the drone flies to a target that a geofence corrected."""
+
+CONTACT_METHODS = SUSPENDED_METHODS | {"Arm"}
+"""Methods that are refused while contact with the API server is lost, if the application depends on it."""
 
 
 class PolicyGate:
@@ -248,8 +252,8 @@ class CallAuthorizer:
         if grant.spec.class_ != "driver":
             raise denied(self._deny_passenger(call, grant))
         suspension = self._control.suspension
-        if suspension is not None and known is None and call.method in SUSPENDED_METHODS and self._has_control(grant):
-            raise self._suspend(call, grant, suspension)
+        if suspension is not None and known is None and call.method in CONTACT_METHODS and self._has_control(grant):
+            self._suspend(call, grant, suspension)
         verdict = self._judge(call, grant, known=known)
         if verdict.code == "MethodNotGranted":
             raise denied(verdict)
@@ -270,16 +274,25 @@ class CallAuthorizer:
             raise denied(verdict)
         return verdict
 
-    def _suspend(self, call: Call, grant: ActiveGrant, suspension: Verdict) -> Unavailable:
-        """Record the refusal of a motion while a corrected leg is flown, and return it."""
-        reason = (
-            f"the drone first completes its corrected leg ({suspension.reason});"
-            " repeat the call when it has arrived, or call Hover, Land or ReturnToLaunch"
-        )
-        verdict = Verdict("deny", None, "Suspended", reason, suspension.policies)
+    def _suspend(self, call: Call, grant: ActiveGrant, suspension: Verdict) -> None:
+        """Refuse a call that has to wait for contact or for the end of a corrected leg, and record the refusal.
+
+        Raises:
+            Unavailable: The call has to wait.
+        """
+        if suspension.code == CONTACT_LOST:
+            verdict = replace(suspension, reason=f"{suspension.reason}; wait until it returns, or land")
+        elif call.method in SUSPENDED_METHODS:
+            reason = (
+                f"the drone first completes its corrected leg ({suspension.reason});"
+                " repeat the call when it has arrived, or call Hover, Land or ReturnToLaunch"
+            )
+            verdict = Verdict("deny", None, "Suspended", reason, suspension.policies)
+        else:
+            return
         self._gate.record(call, grant.identity, verdict, self._gate.situation())
         self._free_at[True] = max(self._free_at[True], self._control.autopilot.now + SETTINGS.suspended_rest_s)
-        return Unavailable(verdict.code, reason, verdict=verdict, retry_after_s=SETTINGS.suspended_retry_after_s)
+        raise Unavailable(verdict.code, verdict.reason, verdict=verdict, retry_after_s=SETTINGS.suspended_retry_after_s)
 
     def _judge(self, call: Call, grant: ActiveGrant, *, kind: str = "call", known: Verdict | None = None) -> Verdict:
         has_control = self._has_control(grant)

@@ -11,6 +11,7 @@ from typing import Any
 
 from fractus_core.control import Authority
 from fractus_core.control.events import Airborne, PositionFound, PositionLost
+from fractus_core.control.machine import CORRECTION
 from fractus_core.control.state import ModeKind, TaskKind
 from fractus_core.control.state_update import POSITION_UNKNOWN
 from fractus_core.policy.compiled_grant import CompiledGrant
@@ -20,7 +21,7 @@ from fractus_runtime.audit import AuditLog
 
 from fractus_services.errors import Aborted, AutopilotError, Refused
 from fractus_services.grant_files import ActiveGrant
-from fractus_services.mobility.authority.control_store import CORRECTION, ControlStore
+from fractus_services.mobility.authority.control_store import ControlStore
 from fractus_services.mobility.authority.effects import Motion
 from fractus_services.mobility.authority.supervisor import Supervisor
 from fractus_services.mobility.autopilot import Permit
@@ -90,6 +91,7 @@ class MotionMonitor:
                     reason = "the motion monitor failed"
                     self._control.brake(Verdict("deny", None, "InternalError", reason, (), "hover"))
             try:
+                self._control.check_contact()
                 self._supervisor.tick()
             except Exception:
                 # A failing supervisor stops the heartbeats: within seconds the autopilot brings the drone home.

@@ -16,7 +16,14 @@ from fractus_proto.v1 import mobility_pb2, mobility_pb2_grpc
 
 from fractus_services.clock import Clock
 from fractus_services.error_details import decision
-from fractus_services.errors import AutopilotError, PreconditionFailed, Refused, Unavailable
+from fractus_services.errors import (
+    AutopilotError,
+    InvalidRequest,
+    PolicyDenied,
+    PreconditionFailed,
+    Refused,
+    Unavailable,
+)
 from fractus_services.grant_files import ActiveGrant, GrantFiles
 from fractus_services.grpc_server import CallAdmission
 from fractus_services.mobility.authority.control_store import ControlStore
@@ -59,6 +66,7 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
         clock: Unix time.
         on_passenger: Called with the Grant of the caller for every call of a component that is no driver.
         fixed_camera: Returns True if the node description declares a camera that does not move.
+        on_contact: Called with the seconds since the last contact of the node's agent with the API server.
         recording_problem: Returns why flights are not recorded; an empty string if there is no problem.
         interface: Protocol of the calls.
     """
@@ -76,7 +84,9 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
         fixed_camera: Callable[[], bool] = bool,
         recording_problem: Callable[[], str] = str,
         interface: Interface = "grpc",
+        on_contact: Callable[[float], None] = lambda _age_s: None,
     ) -> None:
+        self._on_contact = on_contact
         self._fixed_camera = fixed_camera
         self._recording_problem = recording_problem
         self._service = service
@@ -142,6 +152,18 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
         async with self.admission.call(context) as caller:
             await self._control.report_waypoints(self.admission.grant_of(caller), request.waypoints)
             return mobility_pb2.ReportProgressResponse()
+
+    async def ReportContact(  # noqa: N802
+        self, request: mobility_pb2.ReportContactRequest, context: CallContext
+    ) -> mobility_pb2.ReportContactResponse:
+        """See mobility.proto."""
+        async with self.admission.call(context) as caller:
+            if caller.identity != self._node:
+                raise PolicyDenied("NotTheNode", "only the agent of this node may report its contact")
+            if not (math.isfinite(request.age_s) and request.age_s >= 0.0):
+                raise InvalidRequest("InvalidArgument", f"age_s must be at least 0 s, not {request.age_s:g}")
+            self._on_contact(request.age_s)
+            return mobility_pb2.ReportContactResponse()
 
     # Calls without a motion
 

@@ -11,6 +11,7 @@ from fractus_runtime.audit import AuditLog
 
 from fractus_services.grant_files import ActiveGrant, GrantFiles
 from fractus_services.mobility.authority.arming import Arming
+from fractus_services.mobility.authority.contact import Contact, LastContactFile
 from fractus_services.mobility.authority.control_store import ControlStore
 from fractus_services.mobility.authority.journal import Journal
 from fractus_services.mobility.authority.supervisor import Supervisor
@@ -40,6 +41,7 @@ class MobilityComponents:
         clock: Unix time.
         grace_s: Seconds within which a lost driver may come back.
         boarding_s: Seconds for which a mission over points of interest waits for its passengers.
+        contact_file: Last contact with the API server on disk; None if it is not stored.
         state: Initial control state; by default only what the journal contains.
     """
 
@@ -56,6 +58,7 @@ class MobilityComponents:
         clock: Callable[[], float],
         grace_s: float,
         boarding_s: float,
+        contact_file: LastContactFile | None = None,
         state: ControlState | None = None,
     ) -> None:
         # The control store starts return flights, which need the control store. So this function refers to the return
@@ -63,7 +66,16 @@ class MobilityComponents:
         async def approach(kind: TaskKind, is_current: Callable[[], bool], attempts: int) -> FlightMode:
             return await return_flight.approach(kind, is_current, attempts)
 
-        control = ControlStore(autopilot, journal, grants, audit, approach=approach, grace_s=grace_s, state=state)
+        control = ControlStore(
+            autopilot,
+            journal,
+            grants,
+            audit,
+            approach=approach,
+            grace_s=grace_s,
+            contact=Contact(lambda: autopilot.now, contact_file),
+            state=state,
+        )
         gate = PolicyGate(control, clock, audit)
         routes = RouteFollower(control, gate)
         return_flight = ReturnFlight(control, gate, routes)

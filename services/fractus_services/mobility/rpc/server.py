@@ -20,6 +20,7 @@ from fractus_services.gateway.decisions import DECISIONS
 from fractus_services.grant_files import GrantFiles
 from fractus_services.grant_verifier import GrantVerifier
 from fractus_services.grpc_server import run_until, serve_grpc
+from fractus_services.mobility.authority.contact import CONTACT_FILE, LastContactFile
 from fractus_services.mobility.authority.journal import Journal
 from fractus_services.mobility.authority.supervisor import Supervisor
 from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
@@ -128,6 +129,7 @@ def _connect(
         clock=clock,
         grace_s=options.driver_grace,
         boarding_s=options.boarding,
+        contact_file=LastContactFile(options.state / CONTACT_FILE),
     )
     return autopilot, components
 
@@ -175,6 +177,7 @@ async def run(options: MobilityOptions, stop: asyncio.Event) -> None:
         on_passenger=poi_missions.passenger_called,
         fixed_camera=partial(_fixed_camera, description),
         recording_problem=lambda: recorder.problem,
+        on_contact=control.contact.report,
     )
     handlers = create_handlers()
 

@@ -6,6 +6,9 @@ position has a fault: a wrong GPS, a wrong second GPS, a jump of the estimate, a
 zones and limits are added while the driver flies or during the return flight. The oracle knows the true position of the
 vehicle. It reports every breach of a zone or limit that the documented guarantee rules out. A drift that no sign shows
 may lead the drone into a zone by as much as the position is wrong.
+
+With --repairs, each flight selects a repair (tests/component/repair_flights.py), and the oracle determines independently
+where the drone must be in the end.
 """
 
 from __future__ import annotations
@@ -22,6 +25,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "component"))
 
 from closed_loop import Account, flight, parameters_of, weather_of
 from harness import Progress, Report, parser
+from repair_flights import repair_flight
 
 
 def fly(seed: int) -> Account:
@@ -31,10 +35,20 @@ def fly(seed: int) -> Account:
         return flight(seed, Path(directory))
 
 
+def fly_repair(seed: int) -> Account:
+    """Fly the repair flight of a seed, with its files in a temporary directory."""
+    logging.disable(logging.CRITICAL)
+    with tempfile.TemporaryDirectory() as directory:
+        return repair_flight(seed, Path(directory))
+
+
 def main() -> int:
     arguments = parser(__doc__, quick="20 flights")
     arguments.add_argument("--flights", type=int, default=500, help="number of flights")
     arguments.add_argument("--seed", type=int, default=1, help="seed of the first flight; each flight adds one")
+    arguments.add_argument(
+        "--repairs", action="store_true", help="fly repairs: suspension, abort with a landing place, lost contact"
+    )
     arguments.add_argument("--events", action="store_true", help="print the events of each flight with a breach")
     options = arguments.parse_args()
     seeds = range(options.seed, options.seed + (20 if options.quick else options.flights))
@@ -43,7 +57,7 @@ def main() -> int:
     flew = 0
     deepest_m = 0.0
     with ProcessPoolExecutor(max_workers=os.cpu_count()) as pool:
-        for done, account in enumerate(pool.map(fly, seeds), start=1):
+        for done, account in enumerate(pool.map(fly_repair if options.repairs else fly, seeds), start=1):
             flew += account.flew
             deepest_m = max(deepest_m, account.depth_m)
             if account.wrong:

@@ -77,11 +77,19 @@ def collect(cluster: ClusterReader, namespace: str, name: str) -> dict[str, Any]
         "awaits": [component for grant in grants for component in grant.get("awaits") or ()],
         "policies": {
             grant["instance"]: [
-                {"name": p["name"], "type": p["spec"]["type"], "zones": [z["name"] for z in p.get("zones") or ()]}
+                {
+                    "name": p["name"],
+                    "type": p["spec"]["type"],
+                    "zones": [z["name"] for z in p.get("zones") or ()],
+                    "action": p["spec"].get("action"),
+                    "selected": bool(p.get("selected")),
+                    "landAt": p["spec"].get("landAt"),
+                }
                 for p in grant.get("policies") or ()
             ]
             for grant in sorted(grants, key=lambda grant: str(grant["instance"]))
         },
+        "contactLost": (body.get("spec") or {}).get("contactLost"),
         "forbidden": ["grants"] if listed is None else [],
         "events": [
             {k: event.get(k) for k in ("lastTimestamp", "type", "reason", "message")}
@@ -110,6 +118,8 @@ def lines(summary: dict[str, Any], limit: int | None) -> Iterator[str]:
         yield from _placement(placement)
     yield from _rejections(summary, limit)
     yield from _policies(summary["policies"])
+    if summary["contactLost"]:
+        yield _contact_lost(summary["contactLost"])
     if summary["forbidden"]:
         yield f"You are not permitted to list {' and '.join(summary['forbidden'])} of this cluster, so the applied policies are unknown."
     if summary["events"]:
@@ -170,8 +180,27 @@ def _rejections(summary: dict[str, Any], limit: int | None) -> Iterator[str]:
 def _policies(policies: dict[str, Sequence[Body]]) -> Iterator[str]:
     for instance, granted in policies.items():
         yield f"Policies for {instance}: " + (
-            "; ".join(f"{p['name']} ({p['type']}{_scope(p['zones'])})" for p in granted) or "none"
+            "; ".join(f"{p['name']} ({p['type']}{_scope(p['zones'])}{_action(p)})" for p in granted) or "none"
         )
+
+
+def _action(policy: Body) -> str:
+    """Return the repair action of a granted policy; empty for the default action."""
+    if not policy["action"]:
+        return ""
+    by = ", selected by the application" if policy["selected"] else ""
+    return f": {policy['action']}{_place(policy['landAt'])}{by}"
+
+
+def _place(place: Body | None) -> str:
+    return f" and land at {place['lat']:.6f}, {place['lon']:.6f}" if place else ""
+
+
+def _contact_lost(demand: Body) -> str:
+    action = demand.get("action", "continue")
+    return (
+        f"Without contact with the API server for {demand.get('after', 30)} s: {action}{_place(demand.get('landAt'))}"
+    )
 
 
 def _scope(zones: Sequence[str]) -> str:

@@ -11,6 +11,7 @@ from fractus_core.api.plans import DeploymentPlanSpec, PlannedInstance, Role
 from fractus_core.exhaustive import exhaustive
 from fractus_core.geo import line_geojson, multipolygon_geojson
 from fractus_core.planning import Inventory, Settings, operation_area
+from fractus_core.planning.landing_places import planned_landing_places
 
 _COLOURS: dict[Role, str] = exhaustive(
     Role,
@@ -29,7 +30,7 @@ Feature = dict[str, Any]
 def plan_map(
     application: Application, plan: DeploymentPlanSpec, inventory: Inventory, settings: Settings
 ) -> Iterator[Feature]:
-    """Yield features: the operation area, the area of each control point, the route, transit legs and nodes."""
+    """Yield features: operation area, area of each control point, route, transit legs, landing places and nodes."""
     name = "/".join(application.key)
     area = operation_area(application.spec, inventory.depots, settings.safety_radius_m)
     if plan.operation_area is not None:
@@ -44,6 +45,9 @@ def plan_map(
             yield _feature(line_geojson(area.route), name, "route", {"stroke": "#d62728", "stroke-width": 2})
     for leg in plan.drone.transit if plan.drone is not None else ():
         yield _feature(line_geojson((leg.start, leg.end)), name, "transit", {"stroke": "#7f7f7f"})
+    for title, place in planned_landing_places(application, plan, inventory, area):
+        shape = {"type": "Point", "coordinates": [place.lon, place.lat]}
+        yield _feature(shape, name, title, {"marker-color": "#17becf", "marker-symbol": "heliport"})
     for node, instances in _by_node(plan.placements).items():
         position = _position(node, inventory)
         if position is not None:

@@ -57,6 +57,7 @@ DRONE = named(
 APPLICATION = named(
     "traffic",
     "default",
+    spec={"contactLost": {"after": 20, "action": "hover"}},
     status={"phase": "Flying", "drone": "drone-1", "pods": "3/3", "message": "drone-1 flies"},
 )
 
@@ -128,7 +129,9 @@ PLAN: Body = {
 @pytest.fixture
 def explained(monkeypatch: pytest.MonkeyPatch) -> Body:
     owner = {"namespace": "default", "name": "traffic"}
-    policy = {"name": "school", "spec": {"type": "GeofenceControl"}, "zones": [{"name": "yard"}]}
+    place = {"lat": 39.4, "lon": 22.4}
+    spec = {"type": "GeofenceControl", "action": "abort", "landAt": place}
+    policy = {"name": "school", "spec": spec, "selected": True, "zones": [{"name": "yard"}]}
     grant = {"spec": {"instance": "navigator-x", "application": owner, "policies": [policy]}}
     event = {"lastTimestamp": "2026-01-01T00:00:00Z", "type": "Normal", "reason": "Planned", "message": "drone-1 flies"}
     objects: Body = {
@@ -155,7 +158,9 @@ def test_explain_prints_placements_rejected_nodes_and_policies(run: Run, explain
         "drone-3: FlightTooLong: needs 9 min",
         "and 2 more (--all)",
         "40 more rejected nodes",
-        "Policies for navigator-x: school (GeofenceControl in yard)",
+        "Policies for navigator-x: school (GeofenceControl in yard:"
+        " abort and land at 39.400000, 22.400000, selected by the application)",
+        "Without contact with the API server for 20 s: hover",
         "Normal Planned: drone-1 flies",
     ):
         assert sentence in output

@@ -11,6 +11,7 @@ from pydantic import Field
 
 from fractus_core.api.components import Component, ContactLoss, Placement, PointsOfInterest, ReferenceField
 from fractus_core.api.model import AGE, READY, Conditions, Model, ObservedGeneration, OpenModel, Resource, keyed
+from fractus_core.api.policies import PolicyAction
 from fractus_core.api.rules import Violation, rule
 
 
@@ -70,6 +71,13 @@ class ApplicationSpec(Model):
         description="When the mission may begin. immediately: as soon as the drone is ready. whenReady: the motors do not start"
         " while a pod of a component is not ready. After the takeoff, the mission continues without it.",
     )
+    policy_actions: tuple[PolicyAction, ...] = Field(
+        default=(),
+        max_length=100,
+        json_schema_extra=keyed("policy"),
+        description="Repair actions that the application selects for policies with choices. For other policies, their own"
+        " action applies.",
+    )
     contact_lost: ContactLoss | None = Field(
         default=None, description="Reaction when the drone loses contact with the API server; unset: it flies on."
     )
@@ -106,6 +114,14 @@ class ApplicationSpec(Model):
                 return f"components[{i}].name", f"{component.name} and {seen[plain]}"
             seen[plain] = component.name
         return None
+
+    @rule(
+        "!has(self.policyActions) || self.policyActions.all(a, self.policyActions.exists_one(b, b.policy == a.policy))",
+        "policyActions has at most one entry for each policy",
+    )
+    def _distinct_policies(self) -> Violation:
+        names = [each.policy for each in self.policy_actions]
+        return next(((f"policyActions[{i}].policy", name) for i, name in enumerate(names) if name in names[:i]), None)
 
     @rule(
         "self.components.filter(c, has(c.class) && c.class == 'driver').size() <= 1",

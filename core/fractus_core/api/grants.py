@@ -38,6 +38,9 @@ class GrantedPolicy(Model):
 
     name: str = Field(description="Name of the Policy.")
     spec: PolicySpec
+    selected: bool = Field(
+        default=False, description="True if the application selected spec.action; otherwise it is that of the Policy."
+    )
     zones: tuple[GrantedZone, ...] = Field(
         default=(),
         description="Zones of spec.selector.zones with their areas; empty if the policy applies everywhere.",

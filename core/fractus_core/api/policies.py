@@ -203,6 +203,11 @@ class PolicySpec(Validity):
         default=None,
         description="Repair action on a violation. Default: enforce for limits, ignore (discard the request) for geofences.",
     )
+    choices: tuple[Literal[LimitAction, GeofenceAction, FilterAction], ...] = Field(
+        default=(),
+        max_length=16,
+        description="Actions that an Application may select instead of action (spec.policyActions); empty: no choice.",
+    )
     land_at: Point | None = Field(
         default=None,
         description="For abort: place on the ground at which the system lands the drone; unset, or if it cannot be reached"
@@ -367,11 +372,28 @@ class PolicySpec(Validity):
         return "action" if self.type == "GeofenceControl" and not self._acts(GeofenceAction) else None
 
     @rule(
-        "!has(self.landAt) || (self.type == 'GeofenceControl' && has(self.action) && self.action == 'abort')",
-        "landAt is only allowed for GeofenceControl with action abort",
+        "!has(self.choices) || size(self.choices) == 0"
+        f" || (self.type == 'GeofenceControl' && self.choices.all(c, c in {list(get_args(GeofenceAction))}))"
+        f" || (self.type == 'LimitControl' && self.choices.all(c, c in {list(get_args(LimitAction))}))"
+        f" || (self.type == 'PrivacyControl' && self.choices.all(c, c in {list(get_args(PrivacyAction))}))",
+        "choices must be actions of the type of the policy",
+    )
+    def _choices_fit(self) -> Violation:
+        actions = {
+            "GeofenceControl": get_args(GeofenceAction),
+            "LimitControl": get_args(LimitAction),
+            "PrivacyControl": get_args(PrivacyAction),
+        }
+        allowed = actions.get(self.type, ())
+        return next(((f"choices[{i}]", choice) for i, choice in enumerate(self.choices) if choice not in allowed), None)
+
+    @rule(
+        "!has(self.landAt) || (self.type == 'GeofenceControl' && ((has(self.action) && self.action == 'abort')"
+        " || (has(self.choices) && self.choices.exists(c, c == 'abort'))))",
+        "landAt is only allowed for GeofenceControl with action abort, or with the choice abort",
     )
     def _landing(self) -> Violation:
-        aborts = self.type == "GeofenceControl" and self.action == "abort"
+        aborts = self.type == "GeofenceControl" and "abort" in {self.action, *self.choices}
         return "landAt" if self.land_at is not None and not aborts else None
 
     @rule(
@@ -399,6 +421,24 @@ class PolicySpec(Validity):
 
     def _acts(self, actions: object) -> bool:
         return self.action is None or self.action in get_args(actions)
+
+
+class PolicyAction(Model):
+    """Repair action that an application selects among the choices of a policy."""
+
+    policy: Name = Field(description="Name of the Policy.")
+    action: Literal[LimitAction, GeofenceAction, FilterAction] = Field(
+        description="Selected action: one of spec.choices of the Policy, or its spec.action."
+    )
+    land_at: Point | None = Field(
+        default=None,
+        description="For abort: place on the ground at which the system lands the drone; unset: landAt of the Policy, else"
+        " home.",
+    )
+
+    @rule("!has(self.landAt) || self.action == 'abort'", "landAt is only allowed with action abort")
+    def _landing(self) -> Violation:
+        return "landAt" if self.land_at is not None and self.action != "abort" else None
 
 
 class Policy(Resource, plural="policies", short="pol"):

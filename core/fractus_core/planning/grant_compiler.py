@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import weakref
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -19,7 +19,7 @@ from fractus_core.api.geometry import MAX_HOLES, MAX_RING_POINTS, Area, Circle, 
 from fractus_core.api.grants import GrantedLimits, GrantedPolicy, GrantedZone, GrantSpec
 from fractus_core.api.methods import MOBILITY_METHODS
 from fractus_core.api.plans import DeploymentPlanSpec, PlannedInstance
-from fractus_core.api.policies import PolicySpec
+from fractus_core.api.policies import PolicyAction, PolicySpec
 from fractus_core.geo import (
     LocalFrame,
     area_center,
@@ -31,6 +31,7 @@ from fractus_core.geo import (
 )
 from fractus_core.planning.inventory import Inventory, Settings
 from fractus_core.planning.operation_area import MAX_CROSSINGS, OperationArea, operation_area
+from fractus_core.policy.decision_types import distinct
 from fractus_core.policy.engine import PICTURE_METHODS
 from fractus_core.policy.footprint import MAX_SIGHT_M
 from fractus_core.policy.selectors import application_reference, node_attributes, policy_applies
@@ -115,7 +116,8 @@ def compile_grants(
             grant = _edge_grant(application, component, placed, inventory)
         if last is None:
             check_policies(inventory)
-        policies = _policies(grant, inventory, last.policies if last is not None else None)
+        actions = application.spec.policy_actions
+        policies = _policies(grant, inventory, last.policies if last is not None else None, actions=actions)
         grants.append(grant.model_copy(update={"policies": policies}))
     return tuple(grants)
 
@@ -153,7 +155,8 @@ def flight_grant(application: Application, drone: Drone, inventory: Inventory, a
     corners = shapely.get_coordinates([area_polygon(area.frame, part) for part in grant.corridor])
     reach_m = float(np.hypot(*corners.T).max()) + AROUND_CORRIDOR_M
     center = Point(lat=area.frame.lat, lon=area.frame.lon)
-    policies = _policies(grant, inventory, (), (center, reach_m))
+    actions = application.spec.policy_actions
+    policies = _policies(grant, inventory, (), (center, reach_m), actions=actions)
     services = (ServiceRequest(service="mobility", methods=MOBILITY_METHODS),)
     return grant.model_copy(update={"policies": policies, "services": services, "control": "full"})
 
@@ -262,6 +265,8 @@ def _policies(
     inventory: Inventory,
     last: Sequence[GrantedPolicy] | None,
     bounds: _Bounds | None = None,
+    *,
+    actions: Iterable[PolicyAction] | None = None,
 ) -> tuple[GrantedPolicy, ...]:
     """Return the policies of a Grant, sorted by name.
 
@@ -271,6 +276,7 @@ def _policies(
         last: Policies of the previous Grant as a fallback, or None for a new Grant.
         bounds: Position and distance up to which zones matter, or None for the range of the node. With bounds, invalid zones
             out of reach are ignored.
+        actions: Actions that the application selects. None: those that it selected for the previous Grant.
 
     Raises:
         InvalidObject: A policy is invalid, and `last` is None.
@@ -278,6 +284,7 @@ def _policies(
     node = inventory.drones.get(grant.node) or inventory.edge_nodes.get(grant.node)
     attributes = node_attributes(node) if node is not None else {"name": grant.node}
     kept = {policy.name: policy for policy in last or ()}
+    selected_actions = {each.policy: each for each in (_selections(kept) if actions is None else actions)}
     beyond = bounds
     bounds = bounds or _bounds(grant, node, inventory)
     granted = {name: policy for name, policy in kept.items() if name in inventory.unreadable_policies}
@@ -295,8 +302,57 @@ def _policies(
                 raise InvalidObject(f"Policy {name}", str(error)) from error
             selected = kept.get(name)
         if selected is not None:
-            granted[name] = selected
+            granted[name] = selected if selected is kept.get(name) else _choose(selected, selected_actions.get(name))
     return tuple(granted[name] for name in sorted(granted))
+
+
+def _selections(granted: Mapping[str, GrantedPolicy]) -> list[PolicyAction]:
+    """Return the actions that an application selected for granted policies."""
+    return [
+        PolicyAction(policy=name, action=policy.spec.action, land_at=policy.spec.land_at)
+        for name, policy in granted.items()
+        if policy.selected and policy.spec.action is not None
+    ]
+
+
+def _choose(granted: GrantedPolicy, selection: PolicyAction | None) -> GrantedPolicy:
+    """Return a policy with the selected action and its landing place, and without choices.
+
+    If the policy does not permit the selected action any more, its own action applies.
+    """
+    spec = granted.spec
+    chosen = selection is not None and selection.action in {spec.action, *spec.choices}
+    action = selection.action if selection is not None and chosen else spec.action
+    changes: dict[str, Any] = {"action": action, "choices": ()}
+    if action != "abort":
+        changes["land_at"] = None
+    elif selection is not None and chosen and selection.land_at is not None:
+        changes["land_at"] = selection.land_at
+    if action != "blurFaces":
+        changes |= {"faces": None, "fallback": None}
+    return granted.model_copy(update={"spec": spec.model_copy(update=changes), "selected": chosen})
+
+
+def check_policy_actions(application: Application, inventory: Inventory) -> None:
+    """Refuse an application that selects a missing policy, or an action that a policy does not permit.
+
+    Raises:
+        InvalidObject: A selection is not permitted.
+    """
+    for i, selection in enumerate(application.spec.policy_actions):
+        field = f"spec.policyActions[{i}]"
+        policy = inventory.policies.get(selection.policy)
+        if policy is None:
+            raise InvalidObject(
+                f"{field}.policy", f"there is no Policy {selection.policy}; apply it, or remove this entry"
+            )
+        permitted = distinct(str(action) for action in (policy.spec.action or "", *policy.spec.choices))
+        if selection.action not in permitted:
+            named = ", ".join(permitted) or "no choice"
+            raise InvalidObject(
+                f"{field}.action",
+                f"policy {selection.policy} does not permit {selection.action}; select one of: {named}",
+            )
 
 
 def _granted(

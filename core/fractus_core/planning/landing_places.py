@@ -10,6 +10,7 @@ from fractus_core.api.applications import Application
 from fractus_core.api.geometry import Point
 from fractus_core.api.grants import GrantSpec
 from fractus_core.api.nodes import Drone
+from fractus_core.api.plans import DeploymentPlanSpec
 from fractus_core.planning.grant_compiler import flight_grant
 from fractus_core.planning.inventory import Inventory, Settings
 from fractus_core.planning.mission import home_of
@@ -71,10 +72,22 @@ def landing_places(grant: GrantSpec) -> Iterator[tuple[str, Point]]:
         yield "contactLost.landAt", grant.contact_lost.land_at
 
 
+def planned_landing_places(
+    application: Application, plan: DeploymentPlanSpec, inventory: Inventory, area: OperationArea | None
+) -> list[tuple[str, Point]]:
+    """Return the landing places of a plan, each with the name of its field."""
+    drone = inventory.drones.get(plan.drone.node) if plan.drone is not None else None
+    if drone is None or area is None or not _may_abort(application, inventory):
+        return []
+    return list(landing_places(flight_grant(application, drone, inventory, area)))
+
+
 def _may_abort(application: Application, inventory: Inventory) -> bool:
     """Return True if a landing place may apply. This check is quicker than the compilation of a Grant."""
     lost = application.spec.contact_lost
     if lost is not None and lost.land_at is not None:
+        return True
+    if any(selection.land_at is not None for selection in application.spec.policy_actions):
         return True
     return any(policy.spec.land_at is not None for policy in inventory.policies.values())
 

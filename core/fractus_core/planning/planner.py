@@ -20,6 +20,7 @@ from fractus_core.planning.edge_placement import (
     place_near,
     place_static,
 )
+from fractus_core.planning.grant_compiler import check_policy_actions
 from fractus_core.planning.inventory import Inventory, Settings
 from fractus_core.planning.operation_area import OperationArea, operation_area
 from fractus_core.planning.plan_builder import Infeasible, PlanBuilder, instance_name
@@ -49,8 +50,12 @@ def plan(
 
     Raises:
         Infeasible: A component has no suitable node.
-        InvalidObject: The application names an unknown depot, or its geometry is invalid.
+        InvalidObject: The application names an unknown depot, its geometry is invalid, or it selects an action that a policy
+            does not permit.
     """
+    if previous is None or previous.application_digest != application.spec.mission_digest:
+        # A policy that changes in flight must not take the drone of a running mission.
+        check_policy_actions(application, inventory)
     steps = plan_in_steps(application, inventory, settings, previous)
     while True:
         try:

@@ -80,6 +80,7 @@ class FlightMap:
     Attributes:
         area: Shape of the operation area.
         depots: Names and positions.
+        landings: Names and positions of landing places.
         links: For each direct link, the positions of the drone when it began to use the link, and of the node.
     """
 
@@ -90,6 +91,7 @@ class FlightMap:
     area: Any = None
     nodes: tuple[DrawnNode, ...] = ()
     depots: tuple[tuple[str, XY], ...] = ()
+    landings: tuple[tuple[str, XY], ...] = ()
     marks: tuple[Mark, ...] = ()
     links: tuple[tuple[XY, XY], ...] = ()
 
@@ -239,9 +241,12 @@ def _draw_nodes(axes: Any, content: FlightMap, bounds: Bounds) -> None:
         axes.annotate(
             node.name, at, xytext=(0, -15), textcoords="offset points", ha="center", fontsize=8.5, color=INK, zorder=6
         )
-    for name, at in content.depots:
+    for letter, name, at in (
+        *(("H", name, at) for name, at in content.depots),
+        *(("L", name, at) for name, at in content.landings),
+    ):
         axes.plot(*at, marker="o", markersize=11, color="white", markeredgecolor=INK, markeredgewidth=1.5, zorder=6)
-        axes.annotate("H", at, ha="center", va="center", fontsize=7.5, fontweight="bold", color=INK, zorder=7)
+        axes.annotate(letter, at, ha="center", va="center", fontsize=7.5, fontweight="bold", color=INK, zorder=7)
         axes.annotate(
             name, at, xytext=(0, -16), textcoords="offset points", ha="center", fontsize=8.5, color=INK, zorder=6
         )

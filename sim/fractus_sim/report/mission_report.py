@@ -283,9 +283,23 @@ def mission_map(record: FlightRecord) -> FlightMap:
         area=_operation_area(record),
         nodes=nodes,
         depots=tuple((d.name, frame.xy(d.spec.location.lat, d.spec.location.lon)) for d in record.depots),
+        landings=tuple(_landing_places(record)),
         marks=tuple(decision_marks(record.decisions, frame)),
         links=tuple(_link_lines(record, {node.name: node.position for node in nodes})),
     )
+
+
+def _landing_places(record: FlightRecord) -> Iterable[tuple[str, tuple[float, float]]]:
+    """Yield the names and positions of the landing places that the application or its policies specify."""
+    spec = record.application.spec
+    places = [(selection.policy, selection.land_at) for selection in spec.policy_actions]
+    selected = {selection.policy for selection in spec.policy_actions}
+    places += [(policy.name, policy.spec.land_at) for policy in record.policies if policy.name not in selected]
+    if spec.contact_lost is not None:
+        places.append(("contact lost", spec.contact_lost.land_at))
+    for name, place in places:
+        if place is not None:
+            yield f"landing ({name})", record.frame.xy(place.lat, place.lon)
 
 
 def mission_profile(record: FlightRecord) -> Profile:

@@ -367,7 +367,8 @@ def _violation(drone: str, entry: Entry) -> Violation | None:
     """Return the violation of an audit log entry. Return None for a permitted call and for other entries."""
     kind = entry.get("kind")
     action = str(entry.get("action", ""))
-    if kind not in JUDGED_KINDS or (kind == "call" and action == "allow"):
+    stopped = kind == "control" and action == "brake"
+    if (kind not in JUDGED_KINDS and not stopped) or (kind == "call" and action == "allow"):
         return None
     code = str(entry.get("code", ""))
     reason = str(entry.get("reason", ""))

@@ -92,6 +92,13 @@ def test_takeover_counts_once_with_the_call_that_caused_it() -> None:
     assert [v.time_s for v in results(call, effect, later).get_violations("vDrone-1")] == [5.0, 60.0]
 
 
+def test_motion_that_the_monitor_stops_is_a_violation_of_the_system() -> None:
+    stop = entry("OperationAreaBorderAhead", "brake", kind="control")
+    unknown_position = entry("PositionUnknown", "brake", kind="control")
+    (violation,) = results(stop, unknown_position).get_violations("vDrone-1")
+    assert (violation.type, violation.action, violation.caller) == ("flight_path", "brake", "the system")
+
+
 def test_check_violations_lists_what_happened() -> None:
     record = results(entry("SpeedAboveLimit", "correct", at=7.0))
     record.check_violations("vDrone-1", type="speed", count=1)

@@ -9,6 +9,7 @@ import sky_drone
 from closed_loop import Sky
 from fractus_core.control import OutcomeKind
 from fractus_runtime.mavlink_codec import Parser
+from fractus_services.gateway.mobility_client import MobilityClient
 from fractus_services.options import CannotServe
 from gateway_world import ACCEPTED, DENIED, GUIDED, Flight, GatewayWorld, flying, mavlink_spec
 from mobility_world import zone
@@ -243,3 +244,20 @@ def test_gateway_socket_does_not_replace_a_file(tmp_path: Path) -> None:
         assert (path / "gateway.sock").read_text() == "notes"
 
     sky_drone.fly(work, tmp_path)
+
+
+def test_unexpected_error_closes_the_connections_of_one_instance_only(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def flight(world):
+        grant = world.drone.grants.put(mavlink_spec())
+        other = await world.program(grant.identity)
+        await other.until(lambda: other.mode == GUIDED)
+        monkeypatch.setattr(MobilityClient, "open", lambda *_args: 1 / 0)
+        program = await world.program("spiffe://fractus.dev/ns/x/app/y/component/Z/instance/z")
+        await program.until(program.reader.at_eof, 5.0)
+        assert await other.command(400, 1) == ACCEPTED
+        for each in (program, other):
+            await each.close()
+
+    fly(flight, tmp_path)

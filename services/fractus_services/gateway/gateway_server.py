@@ -73,7 +73,7 @@ class Gateway:
         self._audit = audit
         self._instances: dict[str, tuple[Instance, asyncio.Task[None]]] = {}
         self._recorders: dict[str, Recorder] = {}
-        self._writers: set[asyncio.StreamWriter] = set()
+        self._writers: dict[asyncio.StreamWriter, str] = {}
         self._ended = asyncio.Event()
         self._ended.set()
 
@@ -109,7 +109,7 @@ class Gateway:
             recorder = self._recorders[identity] = self._open_recorder(identity)
         session = Session(instance.vehicle, instance.parameters, recorder.take_sent)
         instance.sessions.add(session)
-        self._writers.add(writer)
+        self._writers[writer] = identity
         self._ended.clear()
         log.info("gateway: application connected (instance=%s)", identity)
         sending = asyncio.get_running_loop().create_task(self._send(session, writer, recorder))
@@ -124,7 +124,7 @@ class Gateway:
             log.info("gateway: application disconnected (instance=%s)", identity)
             if not instance.sessions:
                 await self._detach(identity)
-            self._writers.discard(writer)
+            del self._writers[writer]
             if not self._writers:
                 self._ended.set()
 
@@ -136,18 +136,28 @@ class Gateway:
         if entry is None:
             instance = Instance(identity, self._socket)
             instance.certificate = certificate
-            self._instances[identity] = instance, asyncio.get_running_loop().create_task(instance.run())
+            task = asyncio.get_running_loop().create_task(instance.run())
+            task.add_done_callback(partial(self._close_failed, identity))
+            self._instances[identity] = instance, task
             return instance
         if len(entry[0].sessions) >= MAX_CONNECTIONS_PER_INSTANCE:
             return None
         entry[0].certificate = certificate
         return entry[0]
 
+    def _close_failed(self, identity: str, task: asyncio.Task[None]) -> None:
+        """Close the connections of an instance after an unexpected error. Its program may connect again."""
+        if task.cancelled() or task.exception() is None:
+            return
+        log.error("gateway: unexpected error, connections closed (instance=%s)", identity, exc_info=task.exception())
+        for writer, owner in self._writers.items():
+            if owner == identity:
+                writer.close()
+
     async def _detach(self, identity: str) -> None:
         _, task = self._instances.pop(identity)
         task.cancel()
-        with suppress(asyncio.CancelledError):
-            await task
+        await asyncio.gather(task, return_exceptions=True)
 
     async def _receive(self, instance: Instance, session: Session, reader: asyncio.StreamReader) -> None:
         loop = asyncio.get_running_loop()

@@ -114,11 +114,11 @@ def shell(tmp_path: Path) -> Iterator[Shell]:
     """A shell in an empty directory. The cluster and the images are removed at the end."""
     shell = Shell(tmp_path)
     yield shell
-    shell.type(f"fractus cluster down --name {NAME}", 300)
+    shell.type(f"fractus cluster down --name {NAME}", 600)
     subprocess.run(["buildah", "rmi", "localhost/survey:1", "localhost/survey:2"], check=False, capture_output=True)
 
 
-@pytest.mark.timeout(LIMIT_S + 300)
+@pytest.mark.timeout(LIMIT_S + 600)  # with the removal of the cluster
 def test_new_user_flies_keeps_results_and_flies_again_after_charging(shell: Shell) -> None:
     assert "fractus plan -f application.yaml -f place.yaml" in NEXT_STEPS
     shell.type("fractus init survey")

@@ -285,7 +285,7 @@ def test_saved_values_with_parameter_names_of_another_firmware_are_ignored(tmp_p
 
 
 def test_saved_values_are_deleted_if_all_belong_to_another_firmware(tmp_path: Path) -> None:
-    (tmp_path / "return.json").write_text('{"RTL_ALT_M": 40.0, "WP_SPD": 3.0}')
+    (tmp_path / "return.json").write_text('{"RTL_RETURN_ALT": 40.0, "MPC_XY_CRUISE": 3.0}')
 
     async def flight() -> None:
         world = World(tmp_path)

@@ -421,10 +421,14 @@ async def test_invalid_kubeconfig_raises_one_sentence(
 ) -> None:
     (tmp_path / "config").write_text(text)
     monkeypatch.setenv("KUBECONFIG", str(tmp_path / "config"))
-    with pytest.raises(Unconfigured, match=r"^no cluster: set KUBECONFIG to the kubeconfig of a cluster, or run in a pod"):
+    with pytest.raises(
+        Unconfigured, match=r"^no cluster: set KUBECONFIG to the kubeconfig of a cluster, or run in a pod"
+    ):
         await from_environment()
     monkeypatch.setenv("KUBECONFIG", str(tmp_path / "none"))
-    with pytest.raises(Unconfigured, match=r"^no cluster: set KUBECONFIG to the kubeconfig of a cluster, or run in a pod"):
+    with pytest.raises(
+        Unconfigured, match=r"^no cluster: set KUBECONFIG to the kubeconfig of a cluster, or run in a pod"
+    ):
         await from_environment()
 
 

@@ -74,6 +74,10 @@ def test_selected_filter_has_no_settings_of_another_filter():
             {"policy": "far", "action": "ignore"},
             r"spec\.policyActions\[0\]\.action: policy far does not permit ignore; select one of: revoke, hover",
         ),
+        (
+            {"policy": "fixed", "action": "abort", "landAt": OTHER},
+            r"spec\.policyActions\[0\]\.landAt: policy fixed does not offer abort in spec\.choices",
+        ),
         ({"policy": "alone", "action": "hover"}, "policy alone does not permit hover; select one of: revoke"),
         ({"policy": "limit", "action": "enforce"}, "policy limit does not permit enforce; select one of: no choice"),
     ],
@@ -82,6 +86,7 @@ def test_missing_or_foreign_selection_is_refused(selection, problem):
     policies = (
         fence(action="revoke", choices=["hover"]),
         fence("alone", action="revoke"),
+        fence("fixed", action="abort", choices=["hover"], landAt=PLACE),
         policy("limit", type="LimitControl", kind="speed", upperLimit=5),
     )
     with pytest.raises(InvalidObject, match=problem):
@@ -106,6 +111,27 @@ def test_selection_is_kept_by_refresh_while_policy_permits_it():
     assert same.policies[0].spec.land_at == grant.policies[0].spec.land_at
     assert effects(refreshed(action="land", choices=["revoke"])) == [("far", "land", False, ())]
     assert refreshed(action="land").policies[0].spec.land_at is None
+
+
+@pytest.mark.parametrize("moved", [{"landAt": OTHER}, {}], ids=["moved", "withdrawn"])
+@pytest.mark.parametrize(
+    "spec", [{"action": "abort"}, {"action": "hover", "choices": ["abort"]}], ids=["action", "choice"]
+)
+def test_landing_place_of_policy_follows_the_policy_when_refreshed(spec, moved):
+    grant = granted(choosing({"policy": "far", "action": "abort"}), fence(landAt=PLACE, **spec))
+    now = fence(**spec, **moved)
+    (kept,) = refresh(grant, stock(now, zones=[FAR])).policies
+    assert (kept.spec.action, kept.selected, kept.spec.land_at) == ("abort", True, now.spec.land_at)
+
+
+def test_landing_place_of_application_ends_when_abort_is_not_a_choice_any_more():
+    app = choosing({"policy": "far", "action": "abort", "landAt": OTHER})
+    grant = granted(app, fence(action="hover", choices=["abort"]))
+    fixed = stock(fence(action="abort", landAt=PLACE), zones=[FAR])
+    (kept,) = refresh(grant, fixed).policies
+    (compiled,) = compile_grants(app, plan(APP, fixed, WARN), fixed, present=[grant])
+    assert kept.spec.land_at.to_dict() == pytest.approx(PLACE)
+    assert compiled.policies == (kept,)
 
 
 def test_policy_without_selection_follows_its_own_action_when_refreshed():

@@ -41,6 +41,9 @@ class GrantedPolicy(Model):
     selected: bool = Field(
         default=False, description="True if the application selected spec.action; otherwise it is that of the Policy."
     )
+    selected_land_at: Point | None = Field(
+        default=None, description="spec.landAt if the application selected it; unset if it is that of the Policy."
+    )
     zones: tuple[GrantedZone, ...] = Field(
         default=(),
         description="Zones of spec.selector.zones with their areas; empty if the policy applies everywhere.",

@@ -432,8 +432,8 @@ class PolicyAction(Model):
     )
     land_at: Point | None = Field(
         default=None,
-        description="For abort: place on the ground at which the system lands the drone; unset: landAt of the Policy, else"
-        " home.",
+        description="For abort: place on the ground at which the system lands the drone, if spec.choices of the Policy"
+        " contains abort; unset: landAt of the Policy, else home.",
     )
 
     @rule("!has(self.landAt) || self.action == 'abort'", "landAt is only allowed with action abort")

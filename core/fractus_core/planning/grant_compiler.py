@@ -309,7 +309,7 @@ def _policies(
 def _selections(granted: Mapping[str, GrantedPolicy]) -> list[PolicyAction]:
     """Return the actions that an application selected for granted policies."""
     return [
-        PolicyAction(policy=name, action=policy.spec.action, land_at=policy.spec.land_at)
+        PolicyAction(policy=name, action=policy.spec.action, land_at=policy.selected_land_at)
         for name, policy in granted.items()
         if policy.selected and policy.spec.action is not None
     ]
@@ -318,23 +318,28 @@ def _selections(granted: Mapping[str, GrantedPolicy]) -> list[PolicyAction]:
 def _choose(granted: GrantedPolicy, selection: PolicyAction | None) -> GrantedPolicy:
     """Return a policy with the selected action and its landing place, and without choices.
 
-    If the policy does not permit the selected action any more, its own action applies.
+    If the policy does not permit the selected action or landing place any more, its own applies.
     """
     spec = granted.spec
     chosen = selection is not None and selection.action in {spec.action, *spec.choices}
     action = selection.action if selection is not None and chosen else spec.action
     changes: dict[str, Any] = {"action": action, "choices": ()}
+    own_place = None
+    if selection is not None and chosen and "abort" in spec.choices:
+        own_place = selection.land_at
     if action != "abort":
         changes["land_at"] = None
-    elif selection is not None and chosen and selection.land_at is not None:
-        changes["land_at"] = selection.land_at
+    elif own_place is not None:
+        changes["land_at"] = own_place
     if action != "blurFaces":
         changes |= {"faces": None, "fallback": None}
-    return granted.model_copy(update={"spec": spec.model_copy(update=changes), "selected": chosen})
+    return granted.model_copy(
+        update={"spec": spec.model_copy(update=changes), "selected": chosen, "selected_land_at": own_place}
+    )
 
 
 def check_policy_actions(application: Application, inventory: Inventory) -> None:
-    """Refuse an application that selects a missing policy, or an action that a policy does not permit.
+    """Refuse an application that selects a missing policy, or an action or landing place that a policy does not permit.
 
     Raises:
         InvalidObject: A selection is not permitted.
@@ -352,6 +357,12 @@ def check_policy_actions(application: Application, inventory: Inventory) -> None
             raise InvalidObject(
                 f"{field}.action",
                 f"policy {selection.policy} does not permit {selection.action}; select one of: {named}",
+            )
+        if selection.land_at is not None and "abort" not in policy.spec.choices:
+            raise InvalidObject(
+                f"{field}.landAt",
+                f"policy {selection.policy} does not offer abort in spec.choices, so its own landing place applies;"
+                " remove landAt",
             )
 
 

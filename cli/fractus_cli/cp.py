@@ -6,6 +6,7 @@ import json
 import re
 import secrets
 import shutil
+import signal
 import subprocess
 import tarfile
 import tempfile
@@ -16,6 +17,7 @@ from pathlib import Path, PurePosixPath
 from typing import IO, Any
 
 import click
+from fractus_core.api import API_VERSION
 from fractus_core.api.names import CLASS_LABEL, shortened
 
 from fractus_cli.output import printable
@@ -23,6 +25,8 @@ from fractus_cli.output import printable
 _READER_LIFETIME_S = 3600
 """Time after which Kubernetes ends a reader pod that was not deleted."""
 _READER_READY_S = 120
+_MAX_PADDING_BYTES = 2**20
+"""Maximum length of the data after the end of an archive. tar fills its last 10 KiB."""
 _USER = 10001
 """User and group of the pods of components, who own the files in their claims."""
 
@@ -82,7 +86,8 @@ def cp(
     If DESTINATION is an existing directory, the files are copied into it. Only regular files and directories are copied.
     """
     kubectl = Kubectl(namespace, kubeconfig)
-    component = _component(kubectl.get("application.fractus.dev", source.application), source)
+    application = kubectl.get("application.fractus.dev", source.application)
+    component = _component(application, source)
     labels = f"fractus.dev/application={shortened(source.application, 63)},fractus.dev/component={source.component}"
     running = [body["metadata"]["name"] for body in kubectl.get("pods", "-l", labels)["items"] if _runs(body)]
     if pod is not None and pod not in running:
@@ -91,12 +96,26 @@ def cp(
         raise click.ClickException(
             f"{source.component} has several running pods; select one with --pod: {_listed(running)}"
         )
-    if running:
-        copied = _copy(kubectl, pod or running[0], source.path, destination)
-    else:
-        with _reader(kubectl, reader_pod(component, source, image)) as name:
-            copied = _copy(kubectl, name, source.path, destination)
+    with _interrupted_by_signals():
+        if running:
+            copied = _copy(kubectl, pod or running[0], source.path, destination)
+        else:
+            with _reader(kubectl, reader_pod(application, component, source, image)) as name:
+                copied = _copy(kubectl, name, source.path, destination)
     click.echo(f"copied {copied} files from {source}")
+
+
+@contextmanager
+def _interrupted_by_signals() -> Iterator[None]:
+    """Treat SIGTERM and SIGHUP as Ctrl+C, so that the command deletes its pod and its incomplete file. nohup ignores SIGHUP."""
+    default = [s for s in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(s) == signal.SIG_DFL]
+    for number in default:
+        signal.signal(number, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        for number in default:
+            signal.signal(number, signal.SIG_DFL)
 
 
 class Kubectl:
@@ -133,7 +152,7 @@ class Kubectl:
         """Run kubectl and yield its standard output as a stream.
 
         Raises:
-            ClickException: The command failed. The stream is then incomplete.
+            ClickException: The command failed, its archive is invalid, or data follows the archive.
         """
         with tempfile.TemporaryFile() as errors:
             with subprocess.Popen([*self._command, *arguments], stdout=subprocess.PIPE, stderr=errors) as process:
@@ -141,8 +160,9 @@ class Kubectl:
                 failed = False
                 try:
                     yield process.stdout
-                    process.stdout.read()  # padding after the end of the archive
-                except tarfile.TarError:
+                    if len(process.stdout.read(_MAX_PADDING_BYTES + 1)) > _MAX_PADDING_BYTES:
+                        raise click.ClickException("stopped: the pod sends data after the end of its archive")
+                except (tarfile.TarError, ValueError):
                     failed = True
                 except BaseException:
                     process.kill()
@@ -150,7 +170,7 @@ class Kubectl:
             if process.returncode or failed:
                 errors.seek(0)
                 text = errors.read().decode(errors="replace").strip().splitlines()
-                reason = "; ".join(text) or "the connection ended early"
+                reason = "; ".join(text) or "the connection ended early, or the archive is invalid"
                 raise click.ClickException(f"the files were not copied completely: {printable(reason)}")
 
 
@@ -193,16 +213,20 @@ def extract(stream: IO[bytes], name: str, target: Path) -> int:
         Number of files.
 
     Raises:
-        ClickException: The archive contains a path outside of `name`, or a file cannot be written.
+        ClickException: The archive contains a path with NUL or outside of `name`, or a file cannot be written.
         TarError: The archive is incomplete.
+        ValueError: A header of the archive is invalid.
     """
     copied = 0
     with tarfile.open(fileobj=stream, mode="r|") as archive:
         for member in archive:
             path = PurePosixPath(member.name)
             inside = path.parts[1:] if name != "." and path.parts[:1] == (name,) else path.parts
-            if path.is_absolute() or ".." in inside or (name != "." and path.parts[:1] != (name,)):
-                raise click.ClickException(f"refused: the archive of the pod contains the path {member.name!r}")
+            outside = path.is_absolute() or ".." in inside or (name != "." and path.parts[:1] != (name,))
+            if outside or "\0" in member.name:
+                raise click.ClickException(
+                    f"refused: the archive of the pod contains the path {printable(member.name)}"
+                )
             file = target.joinpath(*inside)
             try:
                 if member.isdir():
@@ -215,7 +239,7 @@ def extract(stream: IO[bytes], name: str, target: Path) -> int:
                         printable(f"warning: not copied, because it is no regular file: {member.name}"), err=True
                     )
             except OSError as error:
-                raise click.ClickException(f"cannot write {file}: {error.strerror or error}") from None
+                raise click.ClickException(f"cannot write {printable(str(file))}: {error.strerror or error}") from None
     return copied
 
 
@@ -232,10 +256,11 @@ def _write(archive: tarfile.TarFile, member: tarfile.TarInfo, file: Path) -> Non
         scratch.unlink(missing_ok=True)
 
 
-def reader_pod(component: Body, source: Source, image: str | None) -> Body:
+def reader_pod(application: Body, component: Body, source: Source, image: str | None) -> Body:
     """Return a pod that mounts the claim with the files of a component, without write access.
 
     It is as restricted as the pods of components, so it may run on drones and edge nodes, where claims of local storage are.
+    The Application owns the pod: if the command is killed, the pod is deleted with the Application.
 
     Raises:
         ClickException: The files are in no claim.
@@ -279,7 +304,12 @@ def reader_pod(component: Body, source: Source, image: str | None) -> Body:
         "containers": [reader],
         "volumes": [{"name": "results", "persistentVolumeClaim": {"claimName": mounts[mount]["claim"]}}],
     }
-    metadata = {"name": f"fractus-cp-{secrets.token_hex(4)}", "labels": {"app.kubernetes.io/name": "fractus-cp"}}
+    owner = {"apiVersion": API_VERSION, "kind": "Application", "name": source.application}
+    metadata = {
+        "name": f"fractus-cp-{secrets.token_hex(4)}",
+        "labels": {"app.kubernetes.io/name": "fractus-cp"},
+        "ownerReferences": [{**owner, "uid": application["metadata"]["uid"]}],
+    }
     return {"apiVersion": "v1", "kind": "Pod", "metadata": metadata, "spec": spec}
 
 

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import io
 import json
+import signal
+import subprocess
 import sys
 import tarfile
+import time
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +17,7 @@ from click.testing import CliRunner, Result
 from fractus_cli.cp import cp, extract
 
 KUBECTL = f"""#!{sys.executable}
-import json, os, subprocess, sys
+import json, os, subprocess, sys, time
 from pathlib import Path
 root = Path(os.environ["FAKE_CLUSTER"])
 arguments = sys.argv[1:]
@@ -31,6 +34,8 @@ elif verb == "create":
     (root / "created.json").write_text(sys.stdin.read())
 elif verb == "wait" and (root / "pod-status.json").exists():
     sys.exit("error: timed out waiting for the condition")
+elif verb == "wait" and (root / "slow").exists():
+    time.sleep(60)
 elif verb == "exec":
     pod, _, *command = rest
     place = command.index("-C") + 1
@@ -40,12 +45,13 @@ elif verb == "exec":
 
 CLAIM = {"name": "results", "mountPath": "/data", "claim": "survey-results"}
 APPLICATION = {
+    "metadata": {"name": "survey", "uid": "uid-1"},
     "spec": {
         "components": [
             {"name": "Navigator", "container": {"image": "navigator:1"}},
             {"name": "Store", "container": {"image": "store:1", "volumes": [CLAIM]}},
         ]
-    }
+    },
 }
 
 
@@ -117,6 +123,8 @@ def test_cp_reads_the_claim_of_a_finished_pod_with_a_restricted_pod(cluster: Pat
     assert reader["volumeMounts"] == [{"name": "results", "mountPath": "/data", "readOnly": True}]
     assert reader["securityContext"]["capabilities"] == {"drop": ["ALL"]}
     assert pod["spec"]["automountServiceAccountToken"] is False
+    (owner,) = pod["metadata"]["ownerReferences"]
+    assert (owner["kind"], owner["name"], owner["uid"]) == ("Application", "survey", "uid-1")
     assert calls(cluster)[-1].startswith(f"delete pod {pod['metadata']['name']} ")
 
 
@@ -127,6 +135,32 @@ def test_cp_deletes_its_pod_and_reports_why_it_does_not_start(cluster: Path) -> 
     assert result.exit_code == 1
     assert "its reader pod does not start: 0/6 nodes are available" in result.output
     assert calls(cluster)[-1].startswith("delete pod")
+
+
+def test_cp_deletes_its_pod_when_it_is_terminated(cluster: Path) -> None:
+    (cluster / "slow").touch()
+    program = "from fractus_cli.main import main; main()"
+    command = [sys.executable, "-c", program, "cp", "survey/Store:/data", "results", "-n", "survey"]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        end = time.monotonic() + 20
+        while not (cluster / "calls").exists() or not calls(cluster)[-1].startswith("wait"):
+            assert time.monotonic() < end, "the command does not wait for its pod"
+            time.sleep(0.05)
+        process.send_signal(signal.SIGTERM)
+        _, errors = process.communicate(timeout=20)
+    assert "interrupted" in errors
+    pod = json.loads((cluster / "created.json").read_text())
+    assert calls(cluster)[-1].startswith(f"delete pod {pod['metadata']['name']} ")
+
+
+def test_cp_stops_a_container_that_sends_more_than_its_archive(cluster: Path, tmp_path: Path) -> None:
+    put_pods(cluster, store="Running")
+    endless = tmp_path / "bin" / "tar"
+    endless.write_text('#!/bin/sh\n/bin/tar "$@"\nexec head -c 20000000 /dev/zero\n')
+    endless.chmod(0o755)
+    result = run("survey/Store:/data", "results")
+    assert result.exit_code == 1
+    assert "the pod sends data after the end of its archive" in result.output
 
 
 def test_cp_reports_a_missing_file(cluster: Path, tmp_path: Path) -> None:
@@ -185,6 +219,31 @@ def test_archive_with_a_path_outside_of_the_source_is_refused(tmp_path: Path, na
     with pytest.raises(Exception, match="refused: the archive of the pod contains the path"):
         extract(io.BytesIO(archive((name, tarfile.REGTYPE, "evil"))), "data", target)
     assert [p for p in tmp_path.rglob("*") if p.is_file()] == []
+
+
+def test_archive_with_a_nul_character_in_a_path_is_refused_in_one_line(tmp_path: Path) -> None:
+    out = io.BytesIO()
+    with tarfile.open(fileobj=out, mode="w", format=tarfile.PAX_FORMAT) as tar:
+        info = tarfile.TarInfo("data/x")
+        info.pax_headers = {"path": "data/x\0\x1b[2J"}
+        tar.addfile(info)
+    out.seek(0)
+    with pytest.raises(Exception, match=r"refused: the archive of the pod contains the path data/x\\x00\\x1b\[2J"):
+        extract(out, "data", tmp_path / "results")
+
+
+def test_invalid_archive_is_reported_in_one_sentence(cluster: Path, tmp_path: Path) -> None:
+    put_pods(cluster, store="Running")
+    out = io.BytesIO()
+    with tarfile.open(fileobj=out, mode="w", format=tarfile.PAX_FORMAT) as tar:
+        info = tarfile.TarInfo("data/x")
+        info.pax_headers = {"GNU.sparse.map": "x,y"}
+        tar.addfile(info)
+    (tmp_path / "invalid.tar").write_bytes(out.getvalue())
+    invalid = tmp_path / "bin" / "tar"
+    invalid.write_text(f"#!/bin/sh\nexec cat {tmp_path}/invalid.tar\n")
+    invalid.chmod(0o755)
+    assert "the files were not copied completely" in run("survey/Store:/data", "results").output
 
 
 def test_archive_cannot_write_through_its_own_links(tmp_path: Path) -> None:

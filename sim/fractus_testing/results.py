@@ -137,6 +137,9 @@ class Results:
         Args:
             drone: Drone.
             method: Method to select, such as `Goto`. None: all methods.
+
+        Raises:
+            ExperimentError: The drone has no audit log entries.
         """
         calls = [_judged(entry) for entry in self._entries(drone) if entry.get("kind") == "call"]
         return [call for call in calls if method in {None, call.method}]
@@ -147,6 +150,9 @@ class Results:
         Args:
             drone: Drone.
             type: Type to select. None: all types.
+
+        Raises:
+            ExperimentError: The drone has no audit log entries.
         """
         violations: list[Violation] = []
         for entry in self._entries(drone):
@@ -256,6 +262,7 @@ class Results:
 
         Raises:
             AssertionError: The number differs.
+            ExperimentError: The drone has no audit log entries.
         """
         __tracebackhide__ = True
         matching = self.get_violations(drone, type)
@@ -272,6 +279,7 @@ class Results:
 
         Raises:
             AssertionError: A policy was violated.
+            ExperimentError: The drone has no audit log entries.
         """
         __tracebackhide__ = True
         self.check_violations(drone, count=0)
@@ -340,7 +348,12 @@ class Results:
 
     def _entries(self, drone: str) -> Sequence[Entry]:
         record = self._read()
-        return record.entries.get(self._name(record, drone), ())
+        entries = record.entries.get(self._name(record, drone), ())
+        if not entries:
+            raise ExperimentError(
+                f"{drone} has no audit log entries, so its calls are unknown; start its program first"
+            )
+        return entries
 
     def _name(self, record: RunRecord, drone: str) -> str:
         """Return the node name of a drone."""

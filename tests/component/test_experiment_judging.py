@@ -163,7 +163,8 @@ def test_call_check_finds_matching_audit_entries() -> None:
     assert not service({**check, "code": "AltitudeAboveLimit"}, calls=[entry])
     assert not service({**check, "component": "Viewer"}, calls=[entry])
     assert not service({**check, "absent": True}, calls=[entry])
-    assert service({**check, "absent": True})
+    assert service({**check, "absent": True}, audit_problems={"d/mobility.jsonl": ""})
+    assert not service({**check, "absent": True}), "without any log, the calls are unknown"
 
 
 def test_audit_phase_and_program_checks_fail_on_problems() -> None:

@@ -85,6 +85,15 @@ def test_permitted_calls_and_states_of_the_drone_are_no_violations() -> None:
     record.check_no_violations("vDrone-1")
 
 
+def test_record_without_audit_log_does_not_show_that_policies_were_kept() -> None:
+    record = results()
+    for query in (record.get_violations, record.check_no_violations, record.requests):
+        with pytest.raises(ExperimentError, match="vDrone-1 has no audit log entries, so its calls are unknown"):
+            query("vDrone-1")
+    with pytest.raises(AssertionError, match=r"call: .* does not hold: no audit log"):
+        record.check("call", action="deny", absent=True)
+
+
 def test_takeover_counts_once_with_the_call_that_caused_it() -> None:
     call = entry("InsideExclusionZone", "takeover", at=5.0)
     effect = entry("InsideExclusionZone", "returnToLaunch", kind="takeover", at=5.2)

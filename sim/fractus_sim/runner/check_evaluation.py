@@ -278,6 +278,8 @@ def _call(check: checks.CallJudged, evidence: Evidence) -> tuple[bool, str]:
         )
 
     calls = [entry for entry in evidence.findings.calls if matches(entry)]
+    if check.absent and not evidence.findings.audit_problems and not calls:
+        return False, "no audit log"
     if not calls:
         return check.absent, f"no match in {len(evidence.findings.calls)} entries"
     return not check.absent, f"{len(calls)}, for example: {calls[0].get('reason') or calls[0].get('method', '')}"

@@ -4,7 +4,8 @@
 
 Each program takes off, tries its attack, and returns control. It ends with exit code 0 if the platform prevented the
 attack, and with `BREACH` if the attack succeeded. `results.check_app_status(drone, SUCCESS)` is therefore a test of the
-platform. `stalls` and `crashes` lose control by design: check with `results.check_landed` that the drone came home.
+platform. `leaves_corridor` and `presses_border` do not know the border, so compare `results.track` with it. `stalls` and
+`crashes` lose control by design: check with `results.check_landed` that the drone came home.
 """
 
 from __future__ import annotations
@@ -16,12 +17,18 @@ BREACH = 3
 
 
 def leaves_corridor(distance_m: float = 200.0) -> App:
-    """Fly out of the permitted area, to a position this far north, and to the same position in short steps."""
+    """Fly out of the permitted area, to a position this far north, and to the same position in short steps.
+
+    Only the full distance counts as a breach. The test must compare the track with the border.
+    """
     return _app("leaves-corridor", DISTANCE_M=distance_m)
 
 
 def presses_border(seconds: float = 20.0, speed_mps: float = 5.0) -> App:
-    """Fly north by velocity commands for some seconds, against the border of the permitted area."""
+    """Fly north by velocity commands for some seconds, against the border of the permitted area.
+
+    The program reports no breach. The test must compare the track with the border.
+    """
     return _app("presses-border", SECONDS=seconds, SPEED_MPS=speed_mps)
 
 

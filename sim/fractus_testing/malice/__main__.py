@@ -42,7 +42,10 @@ def _number(name: str) -> float:
 
 
 async def leaves_corridor(drone: fractus.Mobility) -> None:
-    """Request a position far north, and then the same position in short steps."""
+    """Request a position far north, and then the same position in short steps.
+
+    The program does not know the border: the test checks the track.
+    """
     start = (await drone.position()).position
     distance_m = _number("DISTANCE_M")
     steps = [distance_m, *(STEP_M * step for step in range(1, math.ceil(distance_m / STEP_M) + 1))]
@@ -138,7 +141,7 @@ def _forged_certificates(real: Endpoint, scratch: Path) -> Mapping[str, Path]:
 
 
 async def forces_arming(drone: fractus.Mobility) -> None:
-    """Stop the motors in flight, and arm over a second connection without control."""
+    """Stop the motors in flight, and arm in flight. `main` has tried to arm without control before."""
     for title, call in (("disarm in flight", drone.disarm), ("arm in flight", drone.arm)):
         try:
             await call()

@@ -56,6 +56,12 @@ def test_view_account_may_read_logs_only_if_verdicts_are_shown() -> None:
     assert not hidden.keys() & {"Role", "RoleBinding"}
 
 
+def test_view_of_one_namespace_may_read_logs_only_on_request() -> None:
+    city = ("--set", "view.enabled=true", "--set", "view.namespace=city")
+    assert not view_objects(*city).keys() & {"Role", "RoleBinding"}
+    assert view_objects(*city, "--set", "view.verdicts=true").keys() >= {"Role", "RoleBinding"}
+
+
 def test_view_has_pod_monitor_if_enabled() -> None:
     monitored = ("--set", "metrics.podMonitor.enabled=true")
     assert view_objects(*monitored) == {}

@@ -352,6 +352,13 @@ def test_flood_is_delayed() -> None:
     assert world.session.delay_s(world.now) == pytest.approx(0.5, abs=0.01)
 
 
+@pytest.mark.parametrize("garbage", [b"\xfe", b"\xfd", b"\0"])
+def test_garbage_is_delayed(garbage: bytes) -> None:
+    world = World()
+    world.session.receive(garbage * 50_000, world.now)
+    assert world.session.delay_s(world.now) >= 0.5
+
+
 # Hostile input
 
 _KINDS = sorted(mavlink.mavlink_map.values(), key=lambda kind: kind.id)

@@ -26,7 +26,9 @@ from fractus_services.recording.segment_directory import segments_in
 
 log = logging.getLogger(__name__)
 
-READ_BYTES = 4096
+READ_BYTES = 512
+"""Number of bytes that are parsed at once. Each may begin a damaged frame, and other connections wait meanwhile."""
+
 MAX_UNSENT_BYTES = 64 * 1024
 """Size of unsent data from which messages for an application are dropped, because it does not read."""
 
@@ -168,8 +170,7 @@ class Gateway:
                 entry = {"identity": instance.identity, "message": refusal.name, "reason": refusal.reason}
                 self._audit.append("mavlink_refused", entry)
             delay_s = session.delay_s(loop.time())
-            if delay_s > TICK_S:
-                await asyncio.sleep(delay_s)
+            await asyncio.sleep(delay_s if delay_s > TICK_S else 0.0)  # other connections run in between
 
     async def _send(self, session: Session, writer: asyncio.StreamWriter, recorder: Recorder) -> None:
         loop = asyncio.get_running_loop()

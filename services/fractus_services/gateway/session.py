@@ -21,7 +21,8 @@ from fractus_services.mavlink_server.mission_items import item_from
 from fractus_services.mavlink_server.stream_groups import ALL_GROUPS, GROUPS
 
 MAX_FRAMES_PER_S = 1000.0
-"""Rate above which the gateway delays reading. Faster applications are slowed down by TCP."""
+MAX_BYTES_PER_S = 100_000.0
+"""Rates above which the gateway delays reading. Damaged frames count too. Faster applications are slowed down by TCP."""
 
 MAX_INTERVAL_HZ = 50.0
 """Maximum rate of a message, in Hz."""
@@ -180,10 +181,14 @@ class Session:
     def receive(self, data: bytes, now: float) -> list[Call]:
         """Process received bytes and return the calls that they cause."""
         calls: list[Call] = []
-        for message in self._channel.receive(data):
+        bad = self._channel.parser.bad
+        messages = self._channel.receive(data)
+        frames = len(messages) + self._channel.parser.bad - bad
+        cost_s = max(frames / MAX_FRAMES_PER_S, len(data) / MAX_BYTES_PER_S)
+        self._busy_until = max(self._busy_until, now) + cost_s
+        for message in messages:
             self.frames += 1
             self._record(message.frame)
-            self._busy_until = max(self._busy_until, now) + 1.0 / MAX_FRAMES_PER_S
             if not _addresses_vehicle(message):
                 continue
             try:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from pathlib import Path
 
 import pytest
@@ -242,6 +243,23 @@ def test_gateway_socket_does_not_replace_a_file(tmp_path: Path) -> None:
         finally:
             await world.drone.close()
         assert (path / "gateway.sock").read_text() == "notes"
+
+    sky_drone.fly(work, tmp_path)
+
+
+def test_gateway_socket_closes_open_connections_when_it_ends(tmp_path: Path) -> None:
+    async def work(sky: Sky, path: Path) -> None:
+        world = GatewayWorld(sky, path)
+        serving = asyncio.ensure_future(world.socket.run())
+        await asyncio.sleep(0.1)
+        reader, writer = await asyncio.open_unix_connection(path / "gateway.sock")
+        await asyncio.sleep(0.1)
+        serving.cancel()
+        await asyncio.gather(serving, return_exceptions=True)
+        async with asyncio.timeout(1.0):
+            assert await reader.read() == b""
+        writer.close()
+        await world.drone.close()
 
     sky_drone.fly(work, tmp_path)
 

@@ -144,8 +144,11 @@ async def run(options: SidecarOptions, stop: asyncio.Event) -> None:
         raise CannotServe(f"--tcp {options.tcp}: cannot listen there ({error.strerror}); choose a free port") from None
     log.info("gateway: waiting for MAVLink programs (tcp=%d udp=%s)", options.tcp, options.udp)
     tasks = [asyncio.create_task(sidecar.serve_udp(port)) for port in options.udp]
-    async with server:
+    try:
         await stop.wait()
+    finally:
+        # Since Python 3.12, `Server.wait_closed` waits for connections, also for one that waits for the gateway.
+        server.close()
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)

@@ -137,6 +137,7 @@ class GatewaySocket:
         self._handlers = handlers
         self._vehicle = vehicle
         self._delivered = delivered
+        self._connections: set[asyncio.Task[Any]] = set()
 
     async def run(self) -> None:
         """Serve until cancelled.
@@ -154,14 +155,22 @@ class GatewaySocket:
             raise CannotServe(
                 f"--gateway-socket {self._path}: cannot listen there ({error.strerror}); name a file that does not exist"
             ) from None
-        async with server:
-            log.info("gateway: serving (socket=%s)", self._path)
-            try:
-                await server.serve_forever()
-            finally:
-                self._path.unlink(missing_ok=True)
+        log.info("gateway: serving (socket=%s)", self._path)
+        try:
+            await asyncio.Event().wait()
+        finally:
+            # Since Python 3.12, `Server.wait_closed` and `serve_forever` wait for connections that the gateway keeps open.
+            server.close()
+            self._path.unlink(missing_ok=True)
+            connections = list(self._connections)
+            for connection in connections:
+                connection.cancel()
+            await asyncio.gather(*connections, return_exceptions=True)
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        task = asyncio.current_task()
+        assert task is not None  # a coroutine runs in a task
+        self._connections.add(task)
         try:
             uid = _peer_uid(writer)
             if uid not in {0, os.getuid()}:
@@ -170,7 +179,10 @@ class GatewaySocket:
             await _Connection(reader, writer, self._handlers, self._vehicle, self._delivered).run()
         except (asyncio.IncompleteReadError, ConnectionError, DecodeError) as error:
             log.info("gateway: connection ended (reason=%s)", type(error).__name__)
+        except asyncio.CancelledError:
+            log.info("gateway: connection closed, the service stops")  # Python 3.11 logs a cancelled task as an error
         finally:
+            self._connections.discard(task)
             writer.close()
 
 

@@ -56,6 +56,9 @@ _REPLIES: Mapping[str, type[ProtobufMessage]] = {
 _MOTIONS = frozenset({"Takeoff", "Land", "Goto", "ReturnToLaunch"})
 """Methods whose call lasts until the motion is complete."""
 
+_STEERING = _MOTIONS | {"Hover", "SetVelocity"}
+"""Methods that move or stop the drone. Each ends the motion of the method before."""
+
 _RESULTS = {
     code_pb2.PERMISSION_DENIED: mavlink.MAV_RESULT_DENIED,
     code_pb2.INVALID_ARGUMENT: mavlink.MAV_RESULT_DENIED,
@@ -108,6 +111,10 @@ class Instance:
         self._client: MobilityClient | None = None
         self._control: asyncio.Task[None] | None = None
         self._ended = False
+        self._known: set[Session] = set()  # sessions that have received a valid frame
+        self._steering: set[Session] = (
+            set()
+        )  # sessions that have moved the drone; control ends when one of them is lost
         self._granted = asyncio.Event()
         self._calls: set[asyncio.Task[None]] = set()
         self._setpoints = {"motion": _Setpoint(), "gimbal": _Setpoint(), "speed": _Setpoint()}
@@ -204,24 +211,34 @@ class Instance:
     # Control
 
     async def _supervise(self, client: MobilityClient) -> None:
-        """Hold a control stream while an application is alive."""
+        """Hold a control stream while an application is alive, and all sessions that have moved the drone are."""
+        was_alive = False
         while True:
             now = self._loop.time()
-            alive = any(session.frames and not session.silent(now) for session in self.sessions)
-            if self._ended and any(session.reopen for session in self.sessions):
-                self._ended = False
-            if alive and self._control is None and not self._ended:
-                self._control = self._loop.create_task(self._hold_control(client))
-            elif not alive and self._control is not None:
-                log.info("gateway: no application is alive, control stream closed (instance=%s)", self.identity)
+            known = {session for session in self.sessions if session.frames}
+            alive = {session for session in known if not session.silent(now)}
+            if self._control is not None and (not alive or self._steering - alive):
+                log.info("gateway: the application is lost, control stream closed (instance=%s)", self.identity)
                 await self._end_control(client)
+            requested = bool(known - self._known) or any(session.reopen for session in self.sessions)
+            if requested:
+                self._steering &= alive
+            if requested or (alive and not was_alive):
+                self._ended = False
+            self._known = known
+            was_alive = bool(alive)
+            if alive and self._control is None and not self._ended and not self._steering - alive:
+                self._control = self._loop.create_task(self._hold_control(client))
             if self._control is not None and self._control.done():
                 self._control = None
             await asyncio.sleep(SUPERVISE_S)
 
-    async def _hold_control(self, client: MobilityClient) -> None:
+    def _clear_requests(self) -> None:
         for session in self.sessions:
             session.reopen = False
+
+    async def _hold_control(self, client: MobilityClient) -> None:
+        self._clear_requests()
         request = mobility_pb2.GetControlRequest(response_timeout_s=RESPONSE_TIMEOUT_S)
         try:
             async with aclosing(client.stream("GetControl", request, mobility_pb2.ControlEvent)) as events:
@@ -243,6 +260,7 @@ class Instance:
             self.vehicle.granted = True
             self.vehicle.flying_mode = mavlink.COPTER_MODE_GUIDED
             self.vehicle.target = None
+            self._clear_requests()
             self._granted.set()
             self._report("control granted")
         elif event.state in _FINAL:
@@ -261,6 +279,9 @@ class Instance:
 
     def start(self, session: Session, call: Call) -> None:
         """Start a call of a session. A later setpoint replaces one that still waits for its verdict."""
+        steers = call.request.method in _STEERING
+        if steers and self.vehicle.granted:
+            self._steering.add(session)
         setpoint = self._setpoint(call)
         if setpoint is not None:
             if setpoint.busy:
@@ -274,6 +295,8 @@ class Instance:
             return
         if setpoint is not None:
             setpoint.busy = True
+        elif steers:
+            self._setpoints["motion"].pending = None  # sent before this call
         task = self._loop.create_task(self._run_call(self._client, session, call, setpoint))
         self._calls.add(task)
         task.add_done_callback(self._calls.discard)
@@ -342,7 +365,9 @@ class Instance:
                     f"flown to {target.latitude_deg:.6f}, {target.longitude_deg:.6f}, {target.altitude_m:.1f} m: "
                     f"{reply.decision.reason}"
                 )
-        elif corrected:
+        elif call.request.method in _STEERING:
+            vehicle.target = None
+        if corrected and not text:
             text = f"{call.name} corrected: {reply.decision.reason}"
         session.finish(call, mavlink.MAV_RESULT_ACCEPTED, text, self._loop.time())
 

@@ -1,0 +1,259 @@
+"""Control and calls of one instance of the gateway, with a mobility service that a test controls."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import AsyncGenerator, AsyncIterator, Awaitable, Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fractus_proto.v1 import mobility_pb2
+from fractus_runtime.mavlink_codec import Endpoint, Parser
+from fractus_services.gateway import instance as instance_module
+from fractus_services.gateway import session as session_module
+from fractus_services.gateway.instance import Instance
+from fractus_services.gateway.mobility_client import CallRefused, MobilityClient
+from fractus_services.gateway.session import Session
+from google.rpc import code_pb2
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+ControlEvent = mobility_pb2.ControlEvent
+ACCEPTED = mavlink.MAV_RESULT_ACCEPTED
+TEMPORARILY_REJECTED = mavlink.MAV_RESULT_TEMPORARILY_REJECTED
+
+
+class Service:
+    """A mobility service that grants control and accepts every call whose method is not held."""
+
+    def __init__(self) -> None:
+        self.closed = asyncio.Event()
+        self.calls: list[str] = []
+        self.streams = 0
+        self.events: asyncio.Queue[Any] = asyncio.Queue()
+        self.verdict = asyncio.Event()
+        self.verdict.set()
+        """Cleared while targets wait for their verdict."""
+
+    @property
+    def controlled(self) -> bool:
+        return self.streams > 0
+
+    async def stream(
+        self, method: str, _request: Any, reply: Any, _timeout_s: float = 0.0
+    ) -> AsyncGenerator[Any, None]:
+        self.calls.append(method)
+        if method == "GetControl":
+            self.streams += 1
+            try:
+                yield ControlEvent(state=ControlEvent.STATE_GRANTED)
+                while True:
+                    yield await self.events.get()
+            finally:
+                self.streams -= 1
+        if method == "SubscribeVehicle":
+            await asyncio.Event().wait()
+        if method == "Goto":
+            await self.verdict.wait()
+        yield reply()
+
+    async def call(self, method: str, *_arguments: Any) -> Any:
+        self.calls.append(method)
+        if method == "ConfirmAlive":
+            raise CallRefused(code_pb2.UNAVAILABLE, "too many calls")
+        return mobility_pb2.ReturnControlResponse()
+
+    async def close(self) -> None:
+        self.closed.set()
+
+
+class Program:
+    """A session with the frames of a program."""
+
+    def __init__(self, instance: Instance) -> None:
+        self._instance = instance
+        self._loop = asyncio.get_running_loop()
+        self._endpoint = Endpoint(255, 190)
+        self.session = Session(instance.vehicle, instance.parameters)
+        self.acks: list[tuple[int, int]] = []
+        instance.sessions.add(self.session)
+
+    def send(self, name: str, **values: Any) -> None:
+        data = self._endpoint.encode(name, {"target_system": 1, "target_component": 1, **values})
+        for call in self.session.receive(data, self._loop.time()):
+            self._instance.start(self.session, call)
+
+    def beat(self) -> None:
+        for call in self.session.receive(self._endpoint.encode("HEARTBEAT", {}), self._loop.time()):
+            raise AssertionError(call)
+
+    def command(self, number: int, *params: float) -> None:
+        self.send("COMMAND_LONG", command=number, **{f"param{at}": value for at, value in enumerate(params, 1)})
+
+    def target(self, lat: int = 10_000_000) -> None:
+        self.send(
+            "SET_POSITION_TARGET_GLOBAL_INT", coordinate_frame=6, type_mask=0b110111111000,
+            lat_int=lat, lon_int=10_000_000, alt=10.0,
+        )  # fmt: skip
+
+    def results(self) -> list[tuple[int, int]]:
+        for message in Parser().feed(self.session.take()):
+            if message.name == "COMMAND_ACK":
+                self.acks.append((message.integer("command"), message.integer("result")))
+        return self.acks
+
+    def close(self) -> None:
+        self._instance.sessions.discard(self.session)
+
+
+@contextlib.asynccontextmanager
+async def running(monkeypatch: pytest.MonkeyPatch, service: Service) -> AsyncIterator[Instance]:
+    async def connect(*_arguments: Any) -> Service:
+        service.closed.clear()
+        return service
+
+    monkeypatch.setattr(MobilityClient, "open", connect)
+    monkeypatch.setattr(instance_module, "SUPERVISE_S", 0.005)
+    monkeypatch.setattr(instance_module, "RETRY_S", 0.005)
+    instance = Instance("spiffe://fractus.dev/x", Path("unused"))
+    instance.parameters.replace({"WPNAV_SPEED": 1000.0})
+    task = asyncio.create_task(instance.run())
+    try:
+        yield instance
+    finally:
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+
+
+async def until(condition: Callable[[], object]) -> None:
+    async with asyncio.timeout(5.0):
+        while not condition():  # noqa: ASYNC110 - the instance has no notification
+            await asyncio.sleep(0.005)
+
+
+Scenario = Callable[[Instance, Service], Awaitable[None]]
+
+
+def run(monkeypatch: pytest.MonkeyPatch, scenario: Scenario) -> None:
+    async def work() -> None:
+        service = Service()
+        async with running(monkeypatch, service) as instance:
+            await scenario(instance, service)
+
+    asyncio.run(work())
+
+
+def test_control_ends_when_the_steering_program_closes_while_a_ground_station_listens(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    async def scenario(instance: Instance, service: Service) -> None:
+        program = Program(instance)
+        station = Program(instance)
+        program.beat()
+        station.beat()
+        await until(lambda: instance.vehicle.granted)
+        program.target()
+        program.close()
+        await until(lambda: not service.controlled)
+        for _ in range(10):
+            station.beat()
+            await asyncio.sleep(0.01)
+        assert not service.controlled
+        restarted = Program(instance)
+        restarted.beat()
+        await until(lambda: service.controlled)
+
+    run(monkeypatch, scenario)
+
+
+def test_control_ends_when_the_steering_program_is_silent_and_returns_with_its_heartbeats(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(session_module, "HEARTBEAT_SILENCE_S", 0.2)
+
+    async def scenario(instance: Instance, service: Service) -> None:
+        program = Program(instance)
+        station = Program(instance)
+        program.beat()
+        await until(lambda: instance.vehicle.granted)
+        program.target()
+
+        def station_sees(controlled: bool) -> bool:
+            station.beat()
+            return service.controlled is controlled
+
+        await until(lambda: station_sees(controlled=False))
+        program.beat()
+        await until(lambda: station_sees(controlled=True))
+
+    run(monkeypatch, scenario)
+
+
+def test_control_continues_when_a_listening_ground_station_closes(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def scenario(instance: Instance, service: Service) -> None:
+        program = Program(instance)
+        station = Program(instance)
+        program.beat()
+        station.beat()
+        await until(lambda: instance.vehicle.granted)
+        program.target()
+        station.close()
+        await asyncio.sleep(0.1)
+        assert service.calls.count("GetControl") == 1
+        assert service.controlled
+
+    run(monkeypatch, scenario)
+
+
+@pytest.mark.parametrize("number", [20, 21, 17])
+def test_target_of_an_earlier_goto_is_forgotten_when_another_motion_is_accepted(
+    number: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def scenario(instance: Instance, service: Service) -> None:
+        program = Program(instance)
+        program.beat()
+        await until(lambda: instance.vehicle.granted)
+        program.target()
+        await until(lambda: instance.vehicle.target is not None)
+        program.command(number)
+        await until(lambda: (number, ACCEPTED) in program.results())
+        assert instance.vehicle.target is None
+
+    run(monkeypatch, scenario)
+
+
+def test_target_of_an_earlier_goto_is_forgotten_when_a_velocity_is_accepted(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def scenario(instance: Instance, service: Service) -> None:
+        program = Program(instance)
+        program.beat()
+        await until(lambda: instance.vehicle.granted)
+        program.target()
+        await until(lambda: instance.vehicle.target is not None)
+        program.send("SET_POSITION_TARGET_LOCAL_NED", coordinate_frame=1, type_mask=0b110111000111, vx=1.0)
+        await until(lambda: "SetVelocity" in service.calls)
+        await asyncio.sleep(0.05)
+        assert instance.vehicle.target is None
+
+    run(monkeypatch, scenario)
+
+
+@pytest.mark.parametrize("mode", [mavlink.COPTER_MODE_BRAKE, mavlink.COPTER_MODE_LAND, mavlink.COPTER_MODE_RTL])
+def test_waiting_target_is_dropped_when_the_program_stops_or_lands_later(
+    mode: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def scenario(instance: Instance, service: Service) -> None:
+        program = Program(instance)
+        program.beat()
+        await until(lambda: instance.vehicle.granted)
+        service.verdict.clear()
+        program.target()
+        await until(lambda: "Goto" in service.calls)
+        program.target(11_000_000)
+        program.command(mavlink.MAV_CMD_DO_SET_MODE, 1, mode)
+        await until(lambda: (mavlink.MAV_CMD_DO_SET_MODE, ACCEPTED) in program.results())
+        service.verdict.set()
+        await asyncio.sleep(0.05)
+        assert service.calls.count("Goto") == 1
+
+    run(monkeypatch, scenario)

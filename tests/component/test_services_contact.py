@@ -374,3 +374,52 @@ def test_contact_in_the_future_counts_from_now(tmp_path: Path) -> None:
             assert 2.5 < world.contact.age_s < 4
 
     fly(flight)
+
+def test_waiting_stream_does_not_block_when_contact_returns_between_two_checks(tmp_path: Path) -> None:
+    checks = 0
+
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            grant = world.grants.put(spec(contactLost=HOVER))
+            await asyncio.sleep(14)
+            waiting = asyncio.ensure_future(world.drive(grant))
+            await world.until(lambda: world.control.state.contact_lost, 5)
+            await asyncio.sleep(0.03)
+            examine = world.control.not_ready_reason
+
+            def counted(key: str) -> str | None:
+                nonlocal checks
+                checks += 1
+                assert checks < 100, "the stream checks without end, and the event loop hangs"
+                return examine(key)
+
+            world.control.not_ready_reason = counted  # type: ignore[method-assign]
+            world.contact.report(0.0)
+            world.control.changes.notify()  # the stream checks before the next tick of the monitor
+            await asyncio.wait_for(waiting, 3)
+            assert world.control.state.drives
+
+    fly(flight)
+
+
+def test_driver_without_control_waits_between_two_attempts_for_any_reason(tmp_path: Path) -> None:
+    attempts = 0
+
+    async def flight() -> None:
+        nonlocal attempts
+        async with World(tmp_path) as world:
+            grant = world.grants.put(spec())
+
+            def refuse(_lease: object) -> None:
+                nonlocal attempts
+                attempts += 1
+                assert attempts < 100, "the stream tries without end, and the event loop hangs"
+
+            world.control.grant_control = refuse  # type: ignore[assignment,method-assign]
+            waiting = asyncio.ensure_future(world.drive(grant))
+            await asyncio.sleep(3)
+            assert not waiting.done()
+            waiting.cancel()
+            assert 1 < attempts < 10
+
+    fly(flight)

@@ -285,7 +285,7 @@ class ControlStore:
             self.autopilot.link_problem,
             vehicle.identity_problem,
             self.awaited(key),
-            NO_CONTACT.reason if self._depends_on_lost_contact(key) else "",
+            NO_CONTACT.reason if self._state.contact_lost or self._depends_on_lost_contact(key) else "",
         )
         return not_ready_reason(self.state, key, readiness)
 

@@ -68,6 +68,8 @@ class ControlStreams:
                         yield ControlEvent(StreamState.WAITING, control.mission(grant).points_done, reason)
                 if control.not_ready_reason(lease.key) is None:
                     control.grant_control(lease)
+                if not control.state.granted:
+                    await control.changes.wait(SETTINGS.stream_check_interval_s)
             if not response_timeout_s:
                 lease.called_at = control.autopilot.now
             async with aclosing(self._events(lease, response_timeout_s)) as events:

@@ -375,6 +375,7 @@ def test_contact_in_the_future_counts_from_now(tmp_path: Path) -> None:
 
     fly(flight)
 
+
 def test_waiting_stream_does_not_block_when_contact_returns_between_two_checks(tmp_path: Path) -> None:
     checks = 0
 
@@ -421,5 +422,39 @@ def test_driver_without_control_waits_between_two_attempts_for_any_reason(tmp_pa
             assert not waiting.done()
             waiting.cancel()
             assert 1 < attempts < 10
+
+    fly(flight)
+
+
+@pytest.mark.parametrize("demand", [HOVER, ABORT])
+def test_time_without_contact_counts_from_the_begin_of_the_demand(tmp_path: Path, demand: dict[str, Any]) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            grant = world.grants.put(spec())
+            await world.up(grant)
+            await asyncio.sleep(40)
+            world.grants.put(spec(contactLost=demand))
+            await asyncio.sleep(1)
+            agent = Agent(world)
+            await asyncio.sleep(5)
+            assert (world.outcome(), contact_entries(world)) == ("", [])
+            agent.runs = False
+            await asyncio.sleep(12)
+            assert contact_entries(world) == ["contactLost"]
+
+    fly(flight)
+
+
+def test_mission_start_records_no_lost_contact_before_the_first_report(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            await asyncio.sleep(60)
+            grant = world.grants.put(spec(contactLost=HOVER))
+            driving = asyncio.ensure_future(world.drive(grant))
+            await asyncio.sleep(1)
+            Agent(world)
+            await driving
+            assert contact_entries(world) == []
+            assert all("contact" not in event.reason for event in world.events)
 
     fly(flight)

@@ -6,7 +6,7 @@ import asyncio
 import json
 import logging
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -58,6 +58,11 @@ class LastContactFile:
             self.contact_at = contact_at
 
 
+def depends_on_contact(demand: ContactLoss | None) -> bool:
+    """Return True if an application with this demand needs contact with the API server."""
+    return demand is not None and demand.action != "continue"
+
+
 def _boot_id() -> str:
     try:
         return _BOOT_ID.read_text().strip()
@@ -91,12 +96,26 @@ class Contact:
         self._now = now
         self._file = file
         stored = file.contact_at if file is not None else None
-        # A stored time in the future is wrong. Without a stored time, contact counts from the start of the service.
+        self._restored = stored is not None
+        # A stored time in the future is wrong.
         self._contact_at = now() if stored is None else min(stored, now())
+        self._demanded = False
+
+    def demand(self, demands: Iterable[ContactLoss | None]) -> None:
+        """Take the demands of all stored Grants. The agent reports only while one of them depends on contact.
+
+        The time without contact is therefore counted from the begin of the first demand. A time from the file is kept until
+        a report arrives, because the service restarted without contact.
+        """
+        demanded = any(depends_on_contact(demand) for demand in demands)
+        if demanded and not self._demanded and not self._restored:
+            self._contact_at = max(self._contact_at, self._now())
+        self._demanded = demanded
 
     def report(self, age_s: float) -> None:
         """Take a report of the agent: seconds since its last contact. A report that arrives late does not set the time back."""
         self._contact_at = max(self._contact_at, self._now() - age_s)
+        self._restored = False
 
     @property
     def age_s(self) -> float:
@@ -105,10 +124,10 @@ class Contact:
 
     def lost(self, demand: ContactLoss | None) -> bool:
         """Return True if contact is lost for so long that the reaction of an application begins."""
-        return demand is not None and demand.action != "continue" and self.age_s >= demand.after
+        return demand is not None and depends_on_contact(demand) and self.age_s >= demand.after
 
     def store(self, demand: ContactLoss | None) -> None:
         """Store the last contact while it may be lost for an application in flight. Otherwise remove the stored time."""
         if self._file is not None:
-            needed = demand is not None and demand.action != "continue" and self.age_s >= STORE_AFTER_S
+            needed = depends_on_contact(demand) and self.age_s >= STORE_AFTER_S
             self._file.keep(self._contact_at if needed else None)

@@ -122,6 +122,7 @@ class ControlStore:
         self._constraints: FlightConstraints | None = None
         self._removed: ActiveGrant | None = None
         self._transit: tuple[ActiveGrant, CompiledGrant] | None = None
+        self._update_contact_demand()
         grants.listen(self._grant_changed)
 
     # The state machine
@@ -604,6 +605,9 @@ class ControlStore:
         reason = f"no contact with the API server for {self.contact.age_s:.0f} s"
         self.dispatch(ContactLost(demand.action, reason, place))
 
+    def _update_contact_demand(self) -> None:
+        self.contact.demand(grant.spec.contact_lost for grant in self._grants.active.values())
+
     def brake(self, verdict: Verdict) -> None:
         """Stop the current motion. The driver keeps control."""
         self.dispatch(BrakeDemanded(verdict.code, verdict.reason, verdict.policies))
@@ -632,6 +636,7 @@ class ControlStore:
         return (place.lat, place.lon) if place is not None else None
 
     def _grant_changed(self, old: ActiveGrant | None, new: ActiveGrant | None) -> None:
+        self._update_contact_demand()
         lease = self.lease
         constraints = self.constraints
         if old is not None and new is not None and old.key == new.key:

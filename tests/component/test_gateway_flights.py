@@ -10,6 +10,7 @@ import sky_drone
 from closed_loop import Sky
 from fractus_core.control import OutcomeKind
 from fractus_runtime.mavlink_codec import Parser
+from fractus_services.gateway.decisions import DECISIONS
 from fractus_services.gateway.mobility_client import MobilityClient
 from fractus_services.options import CannotServe
 from gateway_world import ACCEPTED, DENIED, GUIDED, Flight, GatewayWorld, flying, mavlink_spec
@@ -245,6 +246,24 @@ def test_gateway_socket_does_not_replace_a_file(tmp_path: Path) -> None:
         assert (path / "gateway.sock").read_text() == "notes"
 
     sky_drone.fly(work, tmp_path)
+
+
+def test_audit_entries_about_refused_messages_are_limited_for_each_instance(tmp_path: Path) -> None:
+    async def flight(world):
+        refused = [number for number, entry in mavlink.enums["MAV_CMD"].items() if _is_refused(entry.name)][:60]
+        programs = [await world.program("spiffe://fractus.dev/ns/x/app/y/component/Z/instance/z") for _ in range(2)]
+        for program in programs:
+            results = [await program.command(number) for number in refused]
+            assert set(results) == {DENIED}
+        assert 50 <= len(world.refused) < 80
+        for program in programs:
+            await program.close()
+
+    fly(flight, tmp_path)
+
+
+def _is_refused(name: str) -> bool:
+    return DECISIONS.commands.get(name.removeprefix("MAV_CMD_")) == "refuse"
 
 
 def test_gateway_socket_closes_open_connections_when_it_ends(tmp_path: Path) -> None:

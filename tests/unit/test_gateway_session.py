@@ -189,6 +189,22 @@ def test_repeated_command_is_one_call_while_it_is_in_progress() -> None:
     assert len(world.command(22, 0, 0, 0, 0, 0, 0, 10)) == 1
 
 
+@pytest.mark.parametrize("name", ["SET_MODE", "COMMAND_LONG"])
+def test_repeated_mode_is_one_call_while_it_is_in_progress_and_another_mode_is_a_new_call(name: str) -> None:
+    world = World()
+
+    def select(mode: int) -> list[Call]:
+        if name == "SET_MODE":
+            return world.send(name, target_system=1, base_mode=1, custom_mode=mode)
+        return world.command(176, 1, mode)
+
+    assert len(select(mavlink.COPTER_MODE_RTL)) == 1
+    assert select(mavlink.COPTER_MODE_RTL) == []
+    (land,) = select(mavlink.COPTER_MODE_LAND)
+    assert land.request.method == "Land"
+    assert [result for _, result in world.results()] == [mavlink.MAV_RESULT_IN_PROGRESS]
+
+
 def test_mode_guided_is_temporarily_rejected_without_control_and_requests_control() -> None:
     world = World(granted=False)
     assert world.command(176, 1, mavlink.COPTER_MODE_GUIDED) == []
@@ -247,6 +263,13 @@ def test_refused_message_is_reported_once_in_five_seconds() -> None:
     world.now += 5.1
     world.send("RC_CHANNELS_OVERRIDE", target_system=1, target_component=1)
     assert world.texts().count("RC_CHANNELS_OVERRIDE") == 1
+
+
+def test_unknown_commands_are_reported_once_in_five_seconds() -> None:
+    world = World()
+    for number in range(50_000, 50_400):
+        world.command(number)
+    assert [refusal.name for refusal in world.session.take_refusals()] == ["50000"]
 
 
 def test_parameter_list_is_dense_and_waits_for_the_vehicle() -> None:

@@ -16,9 +16,10 @@ from fractus_runtime.audit import AuditLog
 
 from fractus_services.auth import FILES, Callers, TlsFiles
 from fractus_services.clock import Clock
-from fractus_services.errors import NotAuthenticated
+from fractus_services.errors import NotAuthenticated, ResourceExhausted
 from fractus_services.gateway.instance import Instance
 from fractus_services.gateway.session import Session
+from fractus_services.grpc_server import RateLimiter
 from fractus_services.options import CannotServe
 from fractus_services.recording.mavlink_messages import MavlinkDecoder
 from fractus_services.recording.recorder import Recorder
@@ -34,6 +35,10 @@ MAX_UNSENT_BYTES = 64 * 1024
 
 TICK_S = 0.02
 """Interval at which due messages are sent."""
+
+AUDITED_PER_S = 2.0
+AUDITED_BURST = 50.0
+"""Rate and burst of audit entries about refused messages of an instance. Further refusals are not entered."""
 
 MAX_CONNECTIONS = 64
 MAX_CONNECTIONS_PER_INSTANCE = 4
@@ -73,6 +78,7 @@ class Gateway:
         self._socket = socket
         self._callers = callers
         self._audit = audit
+        self._audited = RateLimiter(AUDITED_PER_S, AUDITED_BURST)
         self._instances: dict[str, tuple[Instance, asyncio.Task[None]]] = {}
         self._recorders: dict[str, Recorder] = {}
         self._writers: dict[asyncio.StreamWriter, str] = {}
@@ -167,6 +173,10 @@ class Gateway:
             for call in session.receive(data, loop.time()):
                 instance.start(session, call)
             for refusal in session.take_refusals():
+                try:
+                    self._audited.take(instance.identity, loop.time())
+                except ResourceExhausted:
+                    continue
                 entry = {"identity": instance.identity, "message": refusal.name, "reason": refusal.reason}
                 self._audit.append("mavlink_refused", entry)
             delay_s = session.delay_s(loop.time())

@@ -249,8 +249,7 @@ class Session:
         if decision == "respond":
             self._acknowledge(source, fields.number, _COMMAND_RESPONSES[name](self, fields, now))
             return []
-        key = (source, fields.number)
-        if key in self._in_progress:
+        if name != "DO_SET_MODE" and (source, fields.number) in self._in_progress:
             # The application repeats a command whose acknowledgement it has not received yet.
             self._acknowledge(source, fields.number, mavlink.MAV_RESULT_IN_PROGRESS)
             return []
@@ -264,13 +263,18 @@ class Session:
             self._acknowledge(source, fields.number, mavlink.MAV_RESULT_DENIED)
             self._refuse(name, str(problem), now)
             return []
-        return [self._begin(Call(request, name, source, fields.number), now)]
+        return self._begin(Call(request, name, source, fields.number), now)
 
-    def _begin(self, call: Call, now: float) -> Call:
+    def _begin(self, call: Call, now: float) -> list[Call]:
+        progress = self._in_progress.get(call.key)
+        if progress is not None and progress.call.request == call.request:
+            # The application repeats a mode. Another mode would be a new call.
+            self._acknowledge(call.source, call.command or 0, mavlink.MAV_RESULT_IN_PROGRESS)
+            return []
         if call.request.method == "Arm":
             self._acknowledge(call.source, call.command or 0, mavlink.MAV_RESULT_IN_PROGRESS)
         self._in_progress[call.key] = _InProgress(call, now + IN_PROGRESS_S)
-        return call
+        return [call]
 
     def _set_mode(self, mode: int, command: int, name: str, source: Source, now: float) -> list[Call]:
         vehicle = self._vehicle
@@ -282,7 +286,7 @@ class Session:
                 return []
             if vehicle.flying_mode in DESCENTS and vehicle.armed:
                 stop = Request("Hover", mobility_pb2.HoverRequest(), mavlink.COPTER_MODE_GUIDED)
-                return [self._begin(Call(stop, name, source, command), now)]
+                return self._begin(Call(stop, name, source, command), now)
             vehicle.flying_mode = mavlink.COPTER_MODE_GUIDED
             self._acknowledge(source, command, mavlink.MAV_RESULT_ACCEPTED)
             return []
@@ -297,7 +301,7 @@ class Session:
             self._acknowledge(source, command, mavlink.MAV_RESULT_DENIED)
             self._refuse(name, f"mode {title} is not available; use GUIDED, BRAKE, RTL or LAND", now)
             return []
-        return [self._begin(Call(request, name, source, command), now)]
+        return self._begin(Call(request, name, source, command), now)
 
     def _guided_item(self, message: Message, source: Source, now: float) -> list[Call]:
         """Return the call for a MISSION_ITEM with `current` 2 (target) or 3 (altitude)."""
@@ -347,7 +351,9 @@ class Session:
             text: Sentence with the reason of a refusal or a correction; empty for none.
             now: Monotonic time in seconds.
         """
-        self._in_progress.pop(call.key, None)
+        progress = self._in_progress.get(call.key)
+        if progress is not None and progress.call is call:
+            del self._in_progress[call.key]
         accepted = result == mavlink.MAV_RESULT_ACCEPTED
         if call.command is not None:
             self._acknowledge(call.source, call.command, result)
@@ -420,12 +426,11 @@ class Session:
             )
 
     def _refuse(self, name: str, reason: str, now: float, *, audited: bool = True) -> None:
-        """Report a refused message, at most once in `TEXT_INTERVAL_S` for each name."""
-        if now - self._text_at.get(name, -math.inf) < TEXT_INTERVAL_S:
+        """Report a refused message, at most once in `TEXT_INTERVAL_S` for each name, and for all unknown commands."""
+        kind = "unknown command" if name.isdecimal() else name
+        if now - self._text_at.get(kind, -math.inf) < TEXT_INTERVAL_S:
             return
-        self._text_at[name] = now
-        if len(self._text_at) > len(DECISIONS.received):
-            self._text_at = {name: now}
+        self._text_at[kind] = now
         if audited:
             self.refusals.append(Refusal(name, reason))
         self.send_text(mavlink.MAV_SEVERITY_WARNING, f"{name}: {reason}", now)

@@ -31,6 +31,7 @@ class Service:
         self.closed = asyncio.Event()
         self.calls: list[str] = []
         self.streams = 0
+        self.grants = True
         self.events: asyncio.Queue[Any] = asyncio.Queue()
         self.verdict = asyncio.Event()
         self.verdict.set()
@@ -47,9 +48,11 @@ class Service:
         if method == "GetControl":
             self.streams += 1
             try:
-                yield ControlEvent(state=ControlEvent.STATE_GRANTED)
-                while True:
-                    yield await self.events.get()
+                if self.grants:
+                    yield ControlEvent(state=ControlEvent.STATE_GRANTED)
+                while (event := await self.events.get()) is not None:
+                    yield event
+                return
             finally:
                 self.streams -= 1
         if method == "SubscribeVehicle":
@@ -255,5 +258,57 @@ def test_waiting_target_is_dropped_when_the_program_stops_or_lands_later(
         service.verdict.set()
         await asyncio.sleep(0.05)
         assert service.calls.count("Goto") == 1
+
+    run(monkeypatch, scenario)
+
+
+def test_calls_that_wait_for_control_are_rejected_when_the_mobility_service_ends(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    async def scenario(instance: Instance, service: Service) -> None:
+        service.grants = False
+        program = Program(instance)
+        await until(lambda: "SubscribeVehicle" in service.calls)
+        await asyncio.sleep(0.05)
+        program.command(400, 1)
+        program.send("PARAM_SET", param_id=b"WPNAV_SPEED", param_value=500.0, param_type=9)
+        program.send("PARAM_SET", param_id=b"WPNAV_SPEED", param_value=600.0, param_type=9)
+        service.closed.set()
+        await until(lambda: (400, TEMPORARILY_REJECTED) in program.results())
+        assert instance.parameters.values["WPNAV_SPEED"] == 1000.0
+
+    run(monkeypatch, scenario)
+
+
+def test_new_program_gets_control_after_a_mission_of_the_instance_has_ended(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def scenario(instance: Instance, service: Service) -> None:
+        idle = Program(instance)
+        idle.beat()
+        await until(lambda: instance.vehicle.granted)
+        instance.vehicle.flown = True
+        service.events.put_nowait(ControlEvent(state=ControlEvent.STATE_COMPLETE))
+        await until(lambda: not instance.vehicle.granted)
+        assert not instance.vehicle.flown
+        service.events.put_nowait(None)
+        await until(lambda: not service.controlled)
+        await asyncio.sleep(0.05)
+        assert not service.controlled
+        program = Program(instance)
+        program.beat()
+        await until(lambda: instance.vehicle.granted)
+
+    run(monkeypatch, scenario)
+
+
+def test_control_continues_when_one_confirmation_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def scenario(instance: Instance, service: Service) -> None:
+        program = Program(instance)
+        program.beat()
+        await until(lambda: instance.vehicle.granted)
+        service.events.put_nowait(ControlEvent(state=ControlEvent.STATE_PING))
+        await until(lambda: "ConfirmAlive" in service.calls)
+        await asyncio.sleep(0.05)
+        assert service.calls.count("GetControl") == 1
+        assert instance.vehicle.granted
 
     run(monkeypatch, scenario)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Mapping
-from contextlib import aclosing
+from contextlib import aclosing, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -55,6 +55,9 @@ _REPLIES: Mapping[str, type[ProtobufMessage]] = {
 }
 _MOTIONS = frozenset({"Takeoff", "Land", "Goto", "ReturnToLaunch"})
 """Methods whose call lasts until the motion is complete."""
+
+_TIMEOUTS_S = {"Arm": ARM_TIMEOUT_S, **dict.fromkeys(_MOTIONS, 0.0)}
+"""Timeouts other than `CALL_TIMEOUT_S`; 0 for none."""
 
 _STEERING = _MOTIONS | {"Hover", "SetVelocity"}
 """Methods that move or stop the drone. Each ends the motion of the method before."""
@@ -149,6 +152,9 @@ class Instance:
         await self._end_control(client)
         self._client = None
         self._report("the connection to the mobility service was closed")
+        for setpoint in self._setpoints.values():
+            setpoint.pending = None
+        await asyncio.sleep(0.0)  # a call that has just been created begins, so that it ends with a result
         calls = list(self._calls)
         for call in calls:
             call.cancel()
@@ -165,6 +171,7 @@ class Instance:
             request = mobility_pb2.ReturnControlRequest()
             try:
                 await client.call("ReturnControl", request, mobility_pb2.ReturnControlResponse, RETURN_TIMEOUT_S)
+                self.vehicle.flown = False
             except CallRefused as refusal:
                 log.info("gateway: control not returned (instance=%s reason=%s)", self.identity, refusal.reason)
         self._control.cancel()
@@ -255,7 +262,8 @@ class Instance:
     async def _take_event(self, client: MobilityClient, event: mobility_pb2.ControlEvent) -> None:
         if event.state == mobility_pb2.ControlEvent.STATE_PING:
             request = mobility_pb2.ConfirmAliveRequest(ping=event.ping)
-            await client.call("ConfirmAlive", request, mobility_pb2.ConfirmAliveResponse, CALL_TIMEOUT_S)
+            with suppress(CallRefused):  # the next request decides; control ends if none is answered in time
+                await client.call("ConfirmAlive", request, mobility_pb2.ConfirmAliveResponse, CALL_TIMEOUT_S)
         elif event.state == mobility_pb2.ControlEvent.STATE_GRANTED:
             self.vehicle.granted = True
             self.vehicle.flying_mode = mavlink.COPTER_MODE_GUIDED
@@ -265,6 +273,7 @@ class Instance:
             self._report("control granted")
         elif event.state in _FINAL:
             self._ended = True
+            self.vehicle.flown = False
             self._lose_control()
             self._report(f"control ended: {event.reason}")
         else:
@@ -313,11 +322,7 @@ class Instance:
         judged = False
         try:
             await self._wait_for_control(call)
-            timeout_s = CALL_TIMEOUT_S
-            if method in _MOTIONS:
-                timeout_s = 0.0
-            elif method == "Arm":
-                timeout_s = ARM_TIMEOUT_S
+            timeout_s = _TIMEOUTS_S.get(method, CALL_TIMEOUT_S)
             stream = client.stream(method, call.request.message, _REPLIES[method], timeout_s)
             async with aclosing(stream) as replies:
                 async for reply in replies:
@@ -325,6 +330,11 @@ class Instance:
                         judged = True
                         self._accept(session, call, reply)
                         self._free(setpoint, call.request.message if method == "Goto" else None)
+        except asyncio.CancelledError:
+            if not judged:
+                reason = "the connection to the mobility service was closed"
+                session.finish(call, mavlink.MAV_RESULT_TEMPORARILY_REJECTED, reason, self._loop.time())
+            raise
         except CallRefused as refusal:
             result = _RESULTS.get(refusal.status, mavlink.MAV_RESULT_FAILED)
             if not judged:

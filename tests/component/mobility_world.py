@@ -23,6 +23,7 @@ from fractus_runtime.mavlink_codec import Message, message
 from fractus_services.errors import Refused
 from fractus_services.grant_files import ActiveGrant
 from fractus_services.mobility.authority.contact import LastContactFile
+from fractus_services.mobility.authority.flown_grant import FlownGrantFile
 from fractus_services.mobility.authority.journal import Journal
 from fractus_services.mobility.autopilot import VELOCITY_HISTORY_S, FailsafeStatus
 from fractus_services.mobility.flight.service import Progress
@@ -330,6 +331,7 @@ class World:
         initialised: bool = True,
         step_s: float = STEP_S,
         contact_file: LastContactFile | None = None,
+        flown_grant: FlownGrantFile | None = None,
     ) -> None:
         self.plane = after.plane if after is not None else Plane(step_s)
         if retraces:
@@ -343,7 +345,7 @@ class World:
         facts = self.plane.vehicle
         parts = MobilityComponents(
             self.plane, MavlinkFailsafes(self.plane), self.fence, RtlParameters(self.plane, directory), journal=self.journal, grants=self.grants,  # type: ignore[arg-type]
-            audit=self.audit, clock=lambda: 1_790_000_000.0 + self.plane.now, grace_s=grace_s, boarding_s=boarding_s, contact_file=contact_file,  # type: ignore[arg-type]
+            audit=self.audit, clock=lambda: 1_790_000_000.0 + self.plane.now, grace_s=grace_s, boarding_s=boarding_s, contact_file=contact_file, flown_grant=flown_grant,  # type: ignore[arg-type]
             state=ControlState(decided=initialised, armed_seen=facts.armed if initialised else None, expected_mode=GUIDED),
         )  # fmt: skip
         self.control = parts.control

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from fractus_services.mobility.authority.flown_grant import FlownGrantFile
 from mobility_world import GUIDED, LOITER, World, area, at, clearance_m, end, goto, refusal, spec, touring, zone
 from virtual_time import fly
 
@@ -201,5 +202,83 @@ def test_landing_place_may_be_inside_the_corridor(tmp_path: Path) -> None:
             await end(world.service.goto(grant, goto(0, 40), 0))
             await refusal(end_of(world, grant))
             assert math.dist(await landed(world), (30, -60)) < 1.5
+
+    fly(flight)
+
+
+async def until_stored(file: Path, *, exists: bool = True) -> None:
+    """Wait for a write in a thread, which takes no virtual time."""
+    for _ in range(1000):
+        if await asyncio.to_thread(file.exists) is exists:
+            return
+        await asyncio.sleep(0.01)
+    raise AssertionError("the flown Grant was not stored or not removed")
+
+
+BARRIER = (-30.0, 40.0, 30.0, 50.0)
+FAR_WALL = (-40.0, 160.0, 40.0, 180.0)
+
+
+async def abort_behind_barrier(world: World, place: tuple[float, float] | None = None) -> None:
+    """Fly around the barrier, cause an abort, and remove the Grant while the drone returns."""
+    grant = world.grants.put(spec(aborting(box=FAR_WALL, place=place), zone("barrier", "ignore", *BARRIER)))
+    await world.up(grant)
+    for x, y in ((60, 20), (60, 80), (0, 100)):
+        await end(world.service.goto(grant, goto(x, y), 0))
+
+    async def enter() -> Any:
+        return await end(world.service.goto(grant, goto(0, 170), 0))
+
+    assert (await refusal(enter())).verdict.takeover == "abort"
+    world.grants.remove(grant)
+    await asyncio.sleep(1)
+
+
+@pytest.mark.parametrize("place", [None, PLACE])
+def test_restarted_service_flies_around_zones_of_removed_grant(
+    tmp_path: Path, place: tuple[float, float] | None
+) -> None:
+    file = tmp_path / "flown-grant.json"
+
+    async def flight() -> None:
+        world = World(tmp_path, retraces=True, flown_grant=FlownGrantFile(file))
+        async with world:
+            await abort_behind_barrier(world, place)
+            await until_stored(file)
+        async with World(
+            tmp_path, after=world, initialised=False, retraces=True, flown_grant=FlownGrantFile(file)
+        ) as restarted:
+            await asyncio.sleep(3)
+            assert file.exists(), "the vehicle was not found yet"
+            restarted.observer.found()
+            assert math.dist(await landed(restarted), place or (0.0, 0.0)) < 1.5
+            assert clearance_m(restarted, *BARRIER) > 0
+            await until_stored(file, exists=False)
+
+    fly(flight)
+
+
+@pytest.mark.parametrize(("path_lost", "mode"), [(False, "SMART_RTL"), (True, "RTL")])
+@pytest.mark.parametrize("content", [None, "", "[]", '{"key": "m1", "name": "a", "flat_terrain": false, "spec": {}}'])
+def test_restarted_service_returns_on_the_flown_path_if_the_grant_is_unknown(
+    tmp_path: Path, path_lost: bool, mode: str, content: str | None
+) -> None:
+    file = tmp_path / "flown-grant.json"
+
+    async def flight() -> None:
+        world = World(tmp_path, retraces=True)
+        async with world:
+            await abort_behind_barrier(world)
+        if content is not None:
+            file.write_text(content)
+        async with World(
+            tmp_path, after=world, initialised=False, retraces=True, flown_grant=FlownGrantFile(file)
+        ) as restarted:
+            restarted.control.failsafe_status = None  # verified only after the vehicle is found
+            restarted.plane.vehicle.path_lost = path_lost
+            restarted.observer.found()
+            await restarted.until(lambda: restarted.plane.vehicle.mode.comes_down, 5)
+            assert restarted.plane.vehicle.mode.name == mode
+            assert restarted.kinds("control")[-1]["code"] == "NoLegalWay"
 
     fly(flight)

@@ -303,6 +303,9 @@ class MobilitySettings:
     It is longer than the 4 s after which the gRPC server disconnects a client that does not reply to pings.
     """
 
+    failsafe_status_timeout_s: float = 10.0
+    """Longest time for which a drone hovers in the air until it is known if the autopilot records its path."""
+
     silent_driver_s: float = 30.0
     """Time without a motion call, and without a motion in progress, after which a second process may replace a driver.
 

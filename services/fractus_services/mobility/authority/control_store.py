@@ -53,6 +53,7 @@ from fractus_services.errors import AutopilotError, PreconditionFailed, Unavaila
 from fractus_services.grant_files import ActiveGrant, GrantFiles
 from fractus_services.mobility.authority.contact import Contact
 from fractus_services.mobility.authority.effects import ChangeSignal, EffectRunner, FlightConstraints, Lease, Motion
+from fractus_services.mobility.authority.flown_grant import FlownGrantFile
 from fractus_services.mobility.authority.journal import Journal, record_of
 from fractus_services.mobility.authority.mode_controller import ModeController
 from fractus_services.mobility.autopilot import BEING_SET, Approach, Autopilot, FailsafeStatus, Permit, always
@@ -72,6 +73,7 @@ class ControlStore:
         approach: Return flight up to the final descent.
         grace_s: Seconds within which a lost driver may come back.
         contact: Contact of the node with the API server.
+        flown_grant: Grant of the flight in progress on disk; None if it is not stored.
         state: Initial state; by default only what the journal contains.
 
     Attributes:
@@ -94,6 +96,7 @@ class ControlStore:
         approach: Approach,
         grace_s: float,
         contact: Contact,
+        flown_grant: FlownGrantFile | None = None,
         state: ControlState | None = None,
     ) -> None:
         self.autopilot = autopilot
@@ -107,11 +110,15 @@ class ControlStore:
         self.tasks = self.effects.tasks
         self._journal = journal
         self._grants = grants
+        self._flown_grant = flown_grant
+        stored = flown_grant.grant if flown_grant is not None else None
+        self._removed = stored if stored is not None and stored.key == journal.record.active else None
         self._state = replace(
             state or ControlState(),
             grace_s=grace_s,
             missions=journal.record.missions,
             active=journal.record.active,
+            removed=self._removed.key if self._removed is not None else None,
             armed_by_others=journal.record.armed_by_others,
             grants=frozenset(grant.key for grant in grants.active.values()),
         )
@@ -120,7 +127,6 @@ class ControlStore:
         self.failsafe_status: FailsafeStatus | None = None
         self.stopping = False
         self._constraints: FlightConstraints | None = None
-        self._removed: ActiveGrant | None = None
         self._transit: tuple[ActiveGrant, CompiledGrant] | None = None
         self._update_contact_demand()
         grants.listen(self._grant_changed)
@@ -241,7 +247,7 @@ class ControlStore:
 
     @property
     def last_grant(self) -> ActiveGrant | None:
-        """Grant of the mission, even if it was removed in flight. Its constraints apply to the return flight."""
+        """Grant of the mission, even if it was removed in flight or before a restart. Its constraints apply to the return flight."""
         return self.mission_grant or (self._removed if self._state.removed is not None else None)
 
     @property
@@ -607,6 +613,16 @@ class ControlStore:
 
     def _update_contact_demand(self) -> None:
         self.contact.demand(grant.spec.contact_lost for grant in self._grants.active.values())
+
+    def store_flown_grant(self) -> None:
+        """Store the Grant of the flight in progress for a service that restarts. Remove it when the motors stop."""
+        # Before the vehicle is found, it is unknown whether its motors run.
+        if self._flown_grant is None or not self._state.decided:
+            return
+        if not self.autopilot.vehicle.armed:
+            self._flown_grant.keep(None)
+        elif self.last_grant is not None:
+            self._flown_grant.keep(self.last_grant)
 
     def brake(self, verdict: Verdict) -> None:
         """Stop the current motion. The driver keeps control."""

@@ -92,6 +92,7 @@ class MotionMonitor:
                     self._control.brake(Verdict("deny", None, "InternalError", reason, (), "hover"))
             try:
                 self._control.check_contact()
+                self._control.store_flown_grant()
                 self._supervisor.tick()
             except Exception:
                 # A failing supervisor stops the heartbeats: within seconds the autopilot brings the drone home.

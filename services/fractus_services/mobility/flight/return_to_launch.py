@@ -100,7 +100,7 @@ class ReturnFlight:
             return stack.return_retracing
         grant = control.last_grant  # Not earlier: the Grant may have changed while the drone waited.
         if grant is None or not vehicle.in_air or vehicle.mode.comes_down or self._blind():
-            return stack.return_straight
+            return await self._return_unplanned(is_current, attempts)
         place = control.landing_place if kind is TaskKind.LAND_AT and attempts < SETTINGS.max_route_attempts else None
         if place is not None and await self._fly_to_landing(grant, is_current, place):
             return stack.land
@@ -109,7 +109,6 @@ class ReturnFlight:
     async def _return_home(self, grant: ActiveGrant, is_current: Callable[[], bool], attempts: int) -> FlightMode:
         """Fly home, and return the mode for the rest of the return, as `approach` does."""
         control = self._control
-        stack = control.autopilot.stack
         try:
             if attempts < SETTINGS.max_route_attempts:
                 problem = await self._fly_back(grant, is_current)
@@ -124,6 +123,30 @@ class ReturnFlight:
             problem = "the route planner failed"
         if not problem:
             return self.descent(grant)
+        return self._return_without_route(problem, attempts)
+
+    async def _return_unplanned(self, is_current: Callable[[], bool], attempts: int) -> FlightMode:
+        """Return the mode of the autopilot's own return, because no route can be planned.
+
+        If the Grant of a mission is missing, zones may be in the way. The drone then hovers, at most
+        `failsafe_status_timeout_s`, until it is known if the autopilot records its path.
+        """
+        control = self._control
+        autopilot = control.autopilot
+        vehicle = autopilot.vehicle
+        if control.state.mission is None or not vehicle.in_air or vehicle.mode.comes_down or self._blind():
+            return autopilot.stack.return_straight
+        deadline = autopilot.now + SETTINGS.failsafe_status_timeout_s
+        while control.failsafe_status is None and is_current() and autopilot.now < deadline:
+            if autopilot.vehicle.mode.commanded:
+                autopilot.stop()
+            await autopilot.update(SETTINGS.brake_resend_s / autopilot.pace)
+        return self._return_without_route("the Grant of the flight is missing", attempts)
+
+    def _return_without_route(self, problem: str, attempts: int) -> FlightMode:
+        """Record that no legal route home is known, and return the mode of the autopilot's own return."""
+        control = self._control
+        stack = control.autopilot.stack
         retraces = control.retraces and attempts <= SETTINGS.max_route_attempts
         path = "on the path it flew" if retraces else "straight"
         control.note(

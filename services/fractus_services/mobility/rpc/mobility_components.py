@@ -13,6 +13,7 @@ from fractus_services.grant_files import ActiveGrant, GrantFiles
 from fractus_services.mobility.authority.arming import Arming
 from fractus_services.mobility.authority.contact import Contact, LastContactFile
 from fractus_services.mobility.authority.control_store import ControlStore
+from fractus_services.mobility.authority.flown_grant import FlownGrantFile
 from fractus_services.mobility.authority.journal import Journal
 from fractus_services.mobility.authority.supervisor import Supervisor
 from fractus_services.mobility.authority.vehicle_observer import VehicleObserver
@@ -42,6 +43,7 @@ class MobilityComponents:
         grace_s: Seconds within which a lost driver may come back.
         boarding_s: Seconds for which a mission over points of interest waits for its passengers.
         contact_file: Last contact with the API server on disk; None if it is not stored.
+        flown_grant: Grant of the flight in progress on disk; None if it is not stored.
         state: Initial control state; by default only what the journal contains.
     """
 
@@ -59,6 +61,7 @@ class MobilityComponents:
         grace_s: float,
         boarding_s: float,
         contact_file: LastContactFile | None = None,
+        flown_grant: FlownGrantFile | None = None,
         state: ControlState | None = None,
     ) -> None:
         # The control store starts return flights, which need the control store. So this function refers to the return
@@ -74,6 +77,7 @@ class MobilityComponents:
             approach=approach,
             grace_s=grace_s,
             contact=Contact(lambda: autopilot.now, contact_file),
+            flown_grant=flown_grant,
             state=state,
         )
         gate = PolicyGate(control, clock, audit)

@@ -21,6 +21,7 @@ from fractus_services.grant_files import GrantFiles
 from fractus_services.grant_verifier import GrantVerifier
 from fractus_services.grpc_server import run_until, serve_grpc
 from fractus_services.mobility.authority.contact import CONTACT_FILE, LastContactFile
+from fractus_services.mobility.authority.flown_grant import FLOWN_GRANT_FILE, FlownGrantFile
 from fractus_services.mobility.authority.journal import Journal
 from fractus_services.mobility.authority.supervisor import Supervisor
 from fractus_services.mobility.mavlink.ardupilot import ARDUCOPTER
@@ -130,6 +131,7 @@ def _connect(
         grace_s=options.driver_grace,
         boarding_s=options.boarding,
         contact_file=LastContactFile(options.state / CONTACT_FILE),
+        flown_grant=FlownGrantFile(options.state / FLOWN_GRANT_FILE),
     )
     return autopilot, components
 

@@ -162,9 +162,7 @@ def test_late_report_does_not_set_the_contact_back(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("method", ["land", "return_to_launch"])
 @pytest.mark.parametrize("lost", [HOVER, ABORT])
-def test_descent_is_completed_or_replaced_by_landing_elsewhere(
-    tmp_path: Path, method: str, lost: dict[str, Any]
-) -> None:
+def test_descent_of_the_driver_is_completed_without_contact(tmp_path: Path, method: str, lost: dict[str, Any]) -> None:
     async def flight() -> None:
         async with World(tmp_path) as world:
             agent = Agent(world)
@@ -173,12 +171,26 @@ def test_descent_is_completed_or_replaced_by_landing_elsewhere(
             await leg(world, 0, 30)
             agent.in_contact = False
             await asyncio.sleep(8)
-            call = asyncio.ensure_future(end(getattr(world.service, method)(grant)))
-            await world.until(lambda: not world.plane.vehicle.armed)
-            if lost is HOVER:
-                assert (await call).step.complete
-            else:
-                await asyncio.gather(call, return_exceptions=True)
+            assert (await end(getattr(world.service, method)(grant))).step.complete
+            assert contact_entries(world) == ["contactLost"]
+            place = (0.0, 30.0) if method == "land" else (0.0, 0.0)
+            assert math.dist(world.plane.xy, place) < 1.5
+
+    fly(flight)
+
+
+def test_takeoff_is_completed_without_contact(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            agent = Agent(world)
+            grant = world.grants.put(spec(contactLost=HOVER))
+            await world.drive(grant)
+            await world.service.arm(grant)
+            agent.in_contact = False
+            await asyncio.sleep(8)
+            await end(world.service.take_off(grant, TakeoffArgs(20)))
+            assert world.control.state.contact_lost
+            assert world.plane.height > 18
 
     fly(flight)
 
@@ -282,6 +294,59 @@ def test_tour_waits_for_contact_and_continues(tmp_path: Path) -> None:
             agent.in_contact = True
             await world.until(world.outcome, 120)
             assert world.outcome() == "complete"
+
+    fly(flight)
+
+
+async def complete_tour(world: World, agent: Agent) -> None:
+    """Check that a tour hovers without contact for longer than the grace period, and is completed afterwards."""
+    await asyncio.sleep(40)
+    assert (world.control.state.contact_lost, at_rest(world), world.outcome()) == (True, True, "")
+    agent.in_contact = True
+    await world.until(world.outcome, 120)
+    assert world.outcome() == "complete"
+
+
+def test_tour_waits_for_contact_after_restart_of_the_service(tmp_path: Path) -> None:
+    file = tmp_path / "contact.json"
+
+    async def flight() -> None:
+        grant = touring(tour=((0, 40), (0, 120)), contactLost=HOVER)
+        world = World(tmp_path, contact_file=LastContactFile(file))
+        async with world:
+            agent = Agent(world)
+            world.grants.put(grant)
+            await world.until(lambda: world.plane.xy[1] > 10)
+            agent.in_contact = False
+            await world.until(lambda: world.control.state.contact_lost)
+            await asyncio.sleep(5)
+            await until_stored(file)
+        async with World(
+            tmp_path, after=world, initialised=False, grace_s=15.0, contact_file=LastContactFile(file)
+        ) as restarted:
+            agent = Agent(restarted)
+            agent.in_contact = False
+            agent._contact_at = -math.inf
+            restarted.grants.put(grant)
+            restarted.observer.found()
+            await complete_tour(restarted, agent)
+
+    fly(flight)
+
+
+def test_tour_waits_for_contact_after_a_pilot_hands_the_drone_back(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path, grace_s=15.0) as world:
+            agent = Agent(world)
+            world.grants.put(touring(tour=((0, 40), (0, 120)), contactLost=HOVER))
+            await world.until(lambda: world.plane.xy[1] > 10)
+            world.plane.set_to(LOITER)
+            world.observer.heartbeat()
+            agent.in_contact = False
+            await asyncio.sleep(20)
+            world.plane.set_to(GUIDED)
+            world.observer.heartbeat()
+            await complete_tour(world, agent)
 
     fly(flight)
 

@@ -56,7 +56,7 @@ EVENTS: tuple[events.Event, ...] = (
     events.TakeoverDemanded("returnToLaunch", "X", "x"), events.TakeoverDemanded("revoke", "X", "x"),
     events.TakeoverDemanded("abort", "X", "x"), events.TakeoverDemanded("abort", "X", "x", land_at=(39.0, 22.0)),
     events.BrakeDemanded("X", "x"), events.PositionLost("x"), events.PositionFound(),
-    events.ContactLost("hover", "x"), events.ContactLost("abort", "x", (39.0, 22.0)), events.ContactRestored(),
+    events.ContactLost("hover", "x"), events.ContactLost("hover", "x", tour=True), events.ContactLost("abort", "x", (39.0, 22.0)), events.ContactRestored(),
     events.GrantChanged(None, DRIVER), events.GrantChanged(DRIVER, None), events.GrantChanged(DRIVER, DRIVER),
     events.GrantChanged(None, TOUR), events.GrantChanged(TOUR, None),
     *(events.VehicleObserved(facts) for facts in FACTS),

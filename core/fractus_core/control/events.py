@@ -203,11 +203,13 @@ class ContactLost:
         action: `hover` until contact returns, or `abort` the mission.
         reason: Reason in plain text.
         land_at: Latitude and longitude of the landing place for `abort`; None: home.
+        tour: True if the mission has no driver.
     """
 
     action: Literal["hover", "abort"]
     reason: str
     land_at: tuple[float, float] | None = None
+    tour: bool = False
 
 
 @dataclass(frozen=True, slots=True)

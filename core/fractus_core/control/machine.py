@@ -130,6 +130,9 @@ SECOND_STREAM = "another process of this component has the control stream; end t
 DESCENTS = frozenset({"Land", "ReturnToLaunch"})
 """Motions that end on the ground."""
 
+TAKEOFF = "Takeoff"
+"""Kind of the motion that climbs from the ground."""
+
 CORRECTION = "Correction"
 """Kind of the motions with which the monitor flies a driver's drone back into its limits."""
 
@@ -518,7 +521,8 @@ def _lose_position(update: StateUpdate, reason: str) -> None:
 def _lose_contact(update: StateUpdate, event: ContactLost) -> None:
     """Hover until contact with the API server returns, or end the mission.
 
-    Neither a descent nor a pilot is interrupted. On the ground, the mission waits for contact.
+    Neither a descent nor a pilot is interrupted. A takeoff is completed, because the drone must not hover close to the
+    ground. On the ground, the mission waits for contact.
     """
     state = update.state
     if not state.contact_lost:
@@ -529,11 +533,17 @@ def _lose_contact(update: StateUpdate, event: ContactLost) -> None:
     ends = mission is None or mission.outcome is not None
     if ends or not state.vehicle.in_air or state.authority is Authority.PILOT or state.returning:
         return
+    grace = state.grace
+    if event.tour and grace is not None and grace.code == DRIVER_LOST_CODE:
+        # A tour has no driver that could reconnect. It continues by itself when contact returns.
+        update.set(grace=replace(grace, reason=event.reason, code=CONTACT_LOST))
     motion = state.motion
+    if motion is not None and motion.kind in DESCENTS:
+        return
     if event.action == "abort":
         kind = update.plan_landing(mission, event.land_at)
         update.seize(kind, CONTACT_LOST, event.reason, (), OutcomeKind.FAILED)
-    elif motion is not None and motion.kind not in DESCENTS | {CORRECTION}:
+    elif motion is not None and motion.kind not in {TAKEOFF, CORRECTION}:
         update.stop_motion(StopKind.PASSING, CONTACT_LOST, event.reason)
         update.act(Brake())
 

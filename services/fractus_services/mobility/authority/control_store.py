@@ -609,7 +609,7 @@ class ControlStore:
             return
         place = (demand.land_at.lat, demand.land_at.lon) if demand.land_at is not None else None
         reason = f"no contact with the API server for {self.contact.age_s:.0f} s"
-        self.dispatch(ContactLost(demand.action, reason, place))
+        self.dispatch(ContactLost(demand.action, reason, place, tour=grant is not None and bool(grant.spec.tour)))
 
     def _update_contact_demand(self) -> None:
         self.contact.demand(grant.spec.contact_lost for grant in self._grants.active.values())

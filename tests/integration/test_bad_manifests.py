@@ -128,6 +128,7 @@ BAD: list[tuple[str, Body, str]] = [
     ("method of the camera", app(DRIVER | {"services": [MOBILITY | {"methods": ["CaptureImage"]}]}), "the methods of the mobility service are Arm, Disarm"),
     ("two components of one name", app(CLOUD, CLOUD), "duplicate entries for key"),
     ("volume without a source", volume(), "give exactly one of emptyDir, configMap, secret and claim"),
+    ("volume of -1 bytes", volume(emptyDir={"sizeLimit": -1}), "should be greater than or equal to 0"),
     ("volume with two sources", volume(claim="c", secret="s"), "give exactly one of emptyDir, configMap, secret and claim"),
     ("volume of a certificate Secret", volume(secret="viewer-tls"), "Secrets with names ending in -tls are reserved for component certificates"),
     ("zone with two shapes", zone(area=DISC | {"polygon": RING}), "give either polygon or circle, and only one of them"),

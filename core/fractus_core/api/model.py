@@ -53,6 +53,7 @@ Quantity = Annotated[
     WithJsonSchema(
         {
             "anyOf": [{"type": "integer"}, {"type": "string"}],
+            "minimum": 0,  # of whole numbers, to which the pattern does not apply
             "pattern": _QUANTITY,
             "maxLength": _QUANTITY_LENGTH,
         }

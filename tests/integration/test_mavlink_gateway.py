@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 import os
 import signal
 import sys
@@ -39,7 +40,9 @@ def _fly_guided(address: str) -> None:
     def arrived(message: Any) -> bool:
         if message.get_type() != "GLOBAL_POSITION_INT":
             return False
-        return FRAME.xy(message.lat / 1e7, message.lon / 1e7)[1] > 19.0
+        # A landing that begins before the leg ends would end the mission without a flown leg.
+        stopped = math.hypot(message.vx, message.vy) < 10.0  # cm/s
+        return stopped and FRAME.xy(message.lat / 1e7, message.lon / 1e7)[1] > 19.0
 
     client.wait(arrived, 40.0)
     assert acknowledged(client, 21) == ACCEPTED, client.texts

@@ -216,8 +216,8 @@ def _gps(message: mobility_pb2.Telemetry, error_m: float | None) -> Gps | None:
 class Watch:
     """Changes of one part of the drone's state: `async for gps in drone.watch.gps()`.
 
-    Each iteration but `status_texts` starts with the current value, and continues after a restart of the service. The component needs the
-    method GetPosition.
+    Iterations start with the current value, and continue after a restart of the service. `status_texts` has no current value:
+    it starts with the next text. The component needs the method GetPosition.
     """
 
     def __init__(self, telemetry: Callable[[float], AsyncGenerator[Telemetry, None]]) -> None:

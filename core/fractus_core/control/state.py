@@ -466,8 +466,7 @@ class ControlState:
     def waits_for_contact(self) -> bool:
         """True if the drone hovers for a mission that continues as soon as contact with the API server returns.
 
-        The grace period does not expire meanwhile, except that of a driver that does not wait for control, or of an unknown
-        position.
+        Only the grace period of a driver that waits for control, or of a tour, is stopped.
         """
         if not self.contact_lost or self.grace is None:
             return False

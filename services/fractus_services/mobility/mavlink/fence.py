@@ -320,8 +320,9 @@ class MissionFence:
     async def _restore(self, owned: OwnerFence) -> None:
         """Restore the owner's fence. The owner's enabled fence is not disabled before everything else is restored.
 
-        If the service ends meanwhile, the vehicle therefore keeps an enabled fence: that of the mission, or that of the owner.
-        The next start of the service continues, because the owner's fence stays on disk until the end.
+        If a parameter was restored, the fence is then disabled and enabled again. If the service ends between the two, the
+        fence stays disabled until the next start of the service. That start continues to restore the owner's fence, because
+        the owner's fence stays on disk until the end.
         """
         self._raised_bounds = None
         if self._autopilot.vehicle.armed:

@@ -76,7 +76,7 @@ def _read(path: Path) -> ActiveGrant | None:
         return ActiveGrant(str(content["key"]), str(content["name"]), spec, compiled)
     except FileNotFoundError:
         return None
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        # The return flight is then not planned, but follows the recorded path.
-        log.critical("grants: cannot read the flown Grant (path=%s error=%s)", path, error)
+    except Exception:
+        # No content may prevent the start of the service in flight. The drone then returns on the path it flew.
+        log.exception("grants: cannot read the flown Grant (path=%s)", path)
         return None

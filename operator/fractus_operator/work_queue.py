@@ -211,12 +211,14 @@ class Subscriptions:
                 self._full_nodes.pop(label, None)
 
     def set_placed(self, key: Key, *, placed: bool, full: Collection[str] = frozenset()) -> None:
-        """Record if an Application has a suitable plan, and therefore waits only for free capacity.
+        """Record which released resources wake an Application.
+
+        Without a suitable plan, all of them do. With a suitable plan, only free capacity on the nodes `full` does.
 
         Args:
             key: The Application.
             placed: True if it has a suitable plan.
-            full: Nodes that it would use if they had free capacity.
+            full: Full nodes on which it would run instances if they had free capacity.
         """
         label = label_key(key)
         if placed:

@@ -18,7 +18,7 @@ MAX_LINES = 2000
 """Largest number of lines. A smaller spacing is probably a mistake in the unit."""
 
 _TOLERANCE_M = 1e-3
-"""Distance by which a leg may leave the region, because rotations round the coordinates."""
+"""Distance by which a leg may leave the region. It covers the rounding errors of rotated coordinates."""
 
 
 def survey(

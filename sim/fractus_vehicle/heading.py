@@ -10,7 +10,8 @@ from fractus_vehicle.shaping import clamp, wrap_pi
 
 # Share of the speed limit below which the vehicle keeps its heading instead of following the course.
 COURSE_SHARE = 0.05
-# If the heading is within this angle of the target, a commanded direction does not cause a full turn.
+# A commanded direction is ignored if the heading is this close to the target. Otherwise the vehicle would turn by almost 360
+# degrees for a tiny difference on the other side.
 ANGLE_REACHED_RAD = math.radians(0.5)
 
 

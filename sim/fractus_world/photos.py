@@ -136,7 +136,7 @@ def _angle(parts: Any, reference: Any, negative: str) -> float:
 
 
 def resized(photo: Photo, width: int, height: int) -> Picture:
-    """Return a photograph in a size, shape (height, width, 3), cropped to the aspect ratio.
+    """Crop a photograph to the aspect ratio of width and height, and scale it to this size: shape (height, width, 3).
 
     Raises:
         PhotoError: The file cannot be read, or is too large.

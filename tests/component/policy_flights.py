@@ -77,7 +77,7 @@ STILL = (0.0, 0.0, 0.0)
 MINUTE_S = 60
 DAY_MIN = 1440
 DOUBT_MIN = 2 * DAY_MIN
-"""Greatest difference between the time of the flights, NOW, and a reading of a clock in doubt, in minutes."""
+"""Maximum error of an uncertain clock in minutes: difference between its readings and NOW, the time of the flights."""
 DAYS = ("Mon", "Tue", "Wed", "Thu", "Fri", "Sat", "Sun")
 NOW_DAY = 0
 """Index of the weekday of NOW."""

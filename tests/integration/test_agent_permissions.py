@@ -207,7 +207,7 @@ def _rules(node: str, *more: Body, **changed: Any) -> Body:
 
 
 PODS = {"apiGroups": [""], "resources": ["pods"], "verbs": ["get"]}
-"""A permission that the operator has. Without it, the API server would refuse the role before admission runs."""
+"""Additional permission for the role. The operator has it, because the API server refuses to grant what the requester lacks."""
 
 
 @pytest.mark.parametrize(

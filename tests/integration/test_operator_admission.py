@@ -160,7 +160,7 @@ def test_corrected_application_is_deployed(world: World, operator: OperatorProce
 
 
 def test_pod_with_node_name_of_drone_is_refused(world: World, chart: None, namespace: str) -> None:
-    """A kubelet checks only NoExecute taints of a pod with a node name."""
+    """A pod with `nodeName` bypasses the scheduler, and a kubelet enforces only NoExecute taints of its node."""
     drone = "/api/v1/nodes/drone-1"
     pods = f"/api/v1/namespaces/{namespace}/pods?dryRun=All"
 

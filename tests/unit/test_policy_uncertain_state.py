@@ -114,7 +114,7 @@ def test_uncertain_time_applies_zones_active_at_any_time_between_the_readings(
 ) -> None:
     assert ask(compiled(_hours(body, active)), call, BETWEEN).action == "deny"
     assert ask(compiled(_hours(body, "18:30-05:30")), call, BETWEEN).action == "allow", (
-        "the zone is active at no reading"
+        "the zone is active neither at the two readings of the clock nor between them"
     )
     assert ask(compiled(_hours(body, "18:01-06:00")), call, BETWEEN).action == "allow", "the end is exclusive"
 

@@ -30,7 +30,7 @@ log = logging.getLogger(__name__)
 _FLIGHT_STATES = get_args(FlightState)
 _DEGREE_M = 111_320.0
 STARTUP_GRACE_S = 5.0
-"""Seconds after its start during which the agent writes no status before the first telemetry of a drone."""
+"""Seconds for which a started agent of a drone waits for the first telemetry before it writes a status without telemetry."""
 GPS_NOISE_M = 2.0
 """Movement up to this distance in metres is not reported, because a drone on the ground has GPS noise of this size."""
 

@@ -40,7 +40,7 @@ def next_free_node(
 def full_nodes(
     application: Application, inventory: Inventory, settings: Settings, current: DeploymentPlanSpec
 ) -> frozenset[str]:
-    """Return the nodes in underfilled locations that lack only free resources."""
+    """Return the nodes that could run another instance of an underfilled location if they had enough free resources."""
     checks = _check_candidates(application, inventory, settings, current)
     return frozenset(name for name, check in checks if check.reason == INSUFFICIENT)
 

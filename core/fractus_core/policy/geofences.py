@@ -262,10 +262,10 @@ def comes_level(
 
 
 def _leaves_height(zone: PolicyZone, leg: Leg, now: Situation, grant: CompiledGrant, height_margin_m: float) -> bool:
-    """Return True if a drone that is too close below or above a zone sinks or climbs on the spot far enough.
+    """Return True if a leg takes a drone that is too close below or above a zone away from it, until the height margin is kept.
 
-    A leg to another place does not count. The autopilot controls the axes independently, so a drone beside a zone could
-    come over or under the zone before it reaches the altitude of the target.
+    The leg must be vertical. The autopilot controls the axes independently, so during a leg to another place, a drone beside
+    a zone could come over or under the zone before it reaches the altitude of the target.
     """
     west, south, east, north = shapely.bounds(leg.ground)
     if max(east - west, north - south) > STATIONARY_LEG_M:

@@ -286,7 +286,10 @@ class _Search:
         return self._clear[key]
 
     def _test(self, begin: int, end: int) -> bool:
-        """Return True if a leg is legal. Otherwise add the obstacles that block the leg."""
+        """Return True if a leg and, where required, the return flight from its end are legal.
+
+        Obstacles that block the leg are added to the search.
+        """
         a, b = (self._ends[n] if n <= _TARGET else self._position(n) for n in (begin, end))
         space = self._leaving if begin == _START else self._space
         blockers = space.blockers(shapely.linestrings((a, b)))

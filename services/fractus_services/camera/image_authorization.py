@@ -88,9 +88,9 @@ class ImageAuthorizer:
     def plan_filters(
         self, call: Call, grant: ActiveGrant, verdict: Verdict, seen: Situation, *, face_px: float, recorded: Verdict
     ) -> tuple[FilterPlan, Verdict]:
-        """Return the filters that a verdict requires of an image, and the verdict with a note about fallbacks.
+        """Return the filters to apply to an image, and the verdict. If a fallback filter is used, its reason is added to the verdict.
 
-        The verdict is recorded if it differs from the verdict in the audit log.
+        The verdict is recorded if its filters or policies differ from those in `recorded`.
 
         Args:
             call: Method and arguments.
@@ -98,7 +98,7 @@ class ImageAuthorizer:
             verdict: Verdict with the required filters.
             seen: Situation in which the image was taken.
             face_px: Width of the smallest face that the image may show, in pixels, or 0 if it is unknown.
-            recorded: Verdict on the call that the audit log contains.
+            recorded: Verdict on this call that the audit log already contains.
 
         Raises:
             Refused: Faces cannot be detected reliably, and a policy then permits no image.

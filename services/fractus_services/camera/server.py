@@ -95,7 +95,7 @@ async def run(settings: CameraSettings, stop: asyncio.Event) -> None:
     Raises:
         CannotServe: A setting is wrong. It may be within an ExceptionGroup.
     """
-    # The audit log needs the clock, which reports its steps to the audit log.
+    # The clock and the audit log need each other. The lambda uses `audit` only when the clock is stepped, after `audit` is set.
     clock = Clock(lambda step_s, trusted: audit.clock_stepped(step_s, trusted))  # noqa: PLW0108
     description = NodeDescription(settings.node, settings.node_object, settings.description, Drone, EdgeNode)
     name = description.value.name if description.value is not None else socket.gethostname()

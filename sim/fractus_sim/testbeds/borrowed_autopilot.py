@@ -74,7 +74,9 @@ class BorrowedAutopilot:
         return self._owner is not None
 
     def take(self) -> None:
-        """Read and store the settings of the owner. Settings that are stored already stay, because they are not restored yet.
+        """Read and store the settings of the owner.
+
+        Settings that an interrupted experiment has stored are kept, because they must be restored first.
 
         Raises:
             ExperimentError: The autopilot does not answer.

@@ -226,9 +226,9 @@ class MavlinkFailsafes:
         return replace(status, problem=problem, airframe=replace(status.airframe, return_altitude_m=height_m))
 
     def _chosen(self, settings: _Settings, before: FailsafeStatus | None) -> bool:
-        """Return True if the return along the path was chosen for this flight.
+        """Return True if failsafes of this flight return along the flown path (SmartRTL), and not in a straight line (RTL).
 
-        After a restart of the service, the choice is read from the vehicle's parameter.
+        After a restart of the service, the vehicle's parameter decides.
         """
         if before is not None:
             return before.airframe.retraces

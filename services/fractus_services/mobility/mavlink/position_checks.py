@@ -261,13 +261,13 @@ class PositionChecks:
         self._see("the autopilot has switched to another estimator (EKF lane)", now)
 
     def take_position(self, reported: ReportedPosition, error_m: float, now: float, *, moves: bool) -> bool:
-        """Compare a position with the previous one. Return True if the vehicle has restarted between the two.
+        """Look for a jump since the previous position. Return True if the vehicle has restarted between the two.
 
         Args:
             reported: The position.
             error_m: Position error, 1 sigma.
             now: Time of the position.
-            moves: True if the motors run. On the ground, the estimator corrects its position and altitude by resets.
+            moves: True if the motors run. Jumps on the ground are ignored, because the estimator then corrects itself by resets.
         """
         error_m = min(error_m, MAX_TOLERATED_ERROR_M)
         restarted = False

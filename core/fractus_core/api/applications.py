@@ -74,7 +74,6 @@ class ApplicationSpec(Model):
     policy_actions: tuple[PolicyAction, ...] = Field(
         default=(),
         max_length=100,
-        json_schema_extra=keyed("policy"),
         description="Repair actions that the application selects for policies with choices. For other policies, their own"
         " action applies.",
     )

@@ -344,7 +344,7 @@ def _problem(finding: ErrorDetails) -> str:
 
 
 def _misspelt(findings: Sequence[ErrorDetails]) -> ErrorDetails | None:
-    """Return the unknown field whose name resembles the first problem, a missing field beside it."""
+    """Return an unknown field that is probably the misspelt form of a missing field, if the first problem is that field."""
     first = findings[0]
     if first["type"] != "missing":
         return None

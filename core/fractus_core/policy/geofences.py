@@ -262,9 +262,9 @@ def comes_level(
 
 
 def _leaves_height(zone: PolicyZone, leg: Leg, now: Situation, grant: CompiledGrant, height_margin_m: float) -> bool:
-    """Return True if a leg takes a drone that is too close below or above a zone away from it, until the height margin is kept.
+    """Return True if a vertical leg of a drone that is too close below or above a zone restores the height margin.
 
-    The leg must be vertical. The autopilot controls the axes independently, so during a leg to another place, a drone beside
+    A leg to another place does not count. The autopilot controls the axes independently, so during that leg, a drone beside
     a zone could come over or under the zone before it reaches the altitude of the target.
     """
     west, south, east, north = shapely.bounds(leg.ground)

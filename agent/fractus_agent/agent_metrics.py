@@ -19,7 +19,7 @@ class AgentMetrics:
         report_age_s: Seconds since the last successful status write, infinite before the first.
         telemetry_age_s: Seconds since the last telemetry, None on a node without a mobility service.
         grants: Number of Grants by state: stored, unverified, unusable, unstored.
-        checkpoints: Number and hash of the last signed entry by audit log.
+        checkpoints: Number and hash of the last signed entry of each audit log, by the name of the log.
     """
 
     expires_s: float | None

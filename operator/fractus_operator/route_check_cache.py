@@ -121,7 +121,7 @@ class RouteCheckCache:
                 log.exception("route checks: check failed (application=%s/%s)", *key)
                 result = plan
         if self._checks.get(key) is not before:
-            return  # another plan was decided meanwhile
+            return  # the check of a newer plan was stored meanwhile
         self._checks[key] = _Check(plan, rules, self._clock(), result)
         if result is not plan:
             self._wake(key)

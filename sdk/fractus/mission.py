@@ -83,7 +83,7 @@ class Mission:
         path = control.task.path if waypoints is None else waypoints
         self.waypoints = tuple(Waypoint(item) if isinstance(item, Position) else item for item in path)
         self.refused: dict[int, PolicyDenied] = {}
-        """Skipped legs by the number of their waypoint, from 1."""
+        """Refusals of the skipped legs, by the number of the leg's waypoint. The first waypoint has number 1."""
         self._fly = fly
         self._control = control
         self._skip_refused = skip_refused

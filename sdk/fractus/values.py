@@ -19,7 +19,7 @@ class AltitudeReference(enum.Enum):
 
 @dataclass(frozen=True, slots=True)
 class Position:
-    """Position: WGS 84 degrees, and metres above `reference`. The altitude is NaN if a path contains none."""
+    """Position: WGS 84 degrees, and metres above `reference`. The altitude is NaN in waypoints without an altitude."""
 
     lat: float
     lon: float

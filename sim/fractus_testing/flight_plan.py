@@ -1,4 +1,4 @@
-"""Flight plans and restrictions of virtual drones, and the manifests that they stand for."""
+"""Flight plans and restrictions of virtual drones, and the manifests that are created from them."""
 
 from __future__ import annotations
 

@@ -530,7 +530,7 @@ class Scene:
         self._began = True
 
     def programs(self, drone: VirtualDrone) -> list[Program]:
-        """Return the programs of a drone in the experiment."""
+        """Return the programs that the experiment runs for a drone."""
         names = {f"{drone.node}-{number}" for number in range(len(drone.apps))}
         return [program for program in self.run.experiment.programs if program.name in names]
 

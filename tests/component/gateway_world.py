@@ -70,7 +70,7 @@ class Program:
         self.received: list[Message] = []
         self.latest: dict[str, Message] = {}
         self.beats = True
-        """False for a program that sends no heartbeats any more."""
+        """True while the program sends heartbeats."""
         self._parser = Parser()
         self._tasks = [asyncio.ensure_future(self._read()), asyncio.ensure_future(self._beat())]
 

@@ -339,7 +339,7 @@ class Fleet:
         )
         self.gust = np.column_stack((_disc(rng, count, TRACKING_M), rng.uniform(-TRACKING_M, TRACKING_M, count)))
         self.settled = np.zeros((count, 3))
-        """Displacement of each drone by wind when its current course began."""
+        """Displacement of each drone by wind, at the time when its current course began."""
         self.beat = rng.uniform(0.05, 0.4, count)
         self.phase = rng.uniform(0, 2 * math.pi, count)
         self.latency = rng.uniform(*LATENCY_S, count)

@@ -19,7 +19,7 @@ IN_PROGRESS = 5
 GUIDED = 4
 
 START_S = 60.0
-"""Maximum time in which a process starts on a busy machine."""
+"""Maximum time until a process has started on a busy machine."""
 
 
 def mavlink_grant(*policies: dict[str, Any], **changes: Any) -> dict[str, Any]:
@@ -56,7 +56,7 @@ class GatewayRig:
         return directory
 
     async def connect(self) -> str:
-        """Start gateway and sidecar, and return the address for a program when the mobility service serves."""
+        """Wait for the mobility service, start gateway and sidecar, and return the address for a program."""
         gateway = GatewayOptions(
             tls=self.rig.tls,
             mobility=self.socket,

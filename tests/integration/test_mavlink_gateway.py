@@ -62,7 +62,7 @@ async def test_pymavlink_program_flies_guided_over_tls(gateway: GatewayRig):
 @pytest.mark.slow
 @pytest.mark.timeout(300)
 async def test_dronekit_program_flies_guided(gateway: GatewayRig):
-    """`test_pymavlink_program_flies_guided_over_tls` is the faster form."""
+    """Slow: `test_pymavlink_program_flies_guided_over_tls` tests the same with a smaller client."""
     gateway.start_services()
     gateway.rig.write_grant(mavlink_grant())
     program = await asyncio.create_subprocess_exec(
@@ -84,9 +84,7 @@ async def test_gateway_and_sidecar_processes_serve_until_stopped(rig: Rig, gatew
         "sidecar", "-m", "fractus_cli", "gateway", "connect", "--gateway", gateway.address, "--node", NODE,
         "--tls", str(gateway.write_identity()), "--tcp", str(gateway.port), "--udp", str(gateway.port + 1),
     )  # fmt: skip
-    await rig.until_logged(
-        "gateway", "application connected (instance=spiffe://fractus.dev/ns/default/app/app", START_S
-    )
+    await rig.until_logged("gateway", "program connected (instance=spiffe://fractus.dev/ns/default/app/app", START_S)
     for name in ("sidecar", "gateway"):
         rig.send_signal(name, signal.SIGTERM)
         assert await rig.ended(name) == 0, rig.log(name)

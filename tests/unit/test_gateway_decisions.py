@@ -68,7 +68,7 @@ def test_table_with_an_unknown_entry_is_rejected(line: str, problem: str) -> Non
 
 
 def test_table_with_an_unknown_decision_is_rejected() -> None:
-    with pytest.raises(BadDecisions, match="HEARTBEAT: forward is no decision"):
+    with pytest.raises(BadDecisions, match="HEARTBEAT: forward is not a decision"):
         read_decisions(TABLE.replace("HEARTBEAT\tconsume", "HEARTBEAT\tforward", 1))
 
 

@@ -25,7 +25,7 @@ TEMPORARILY_REJECTED = mavlink.MAV_RESULT_TEMPORARILY_REJECTED
 
 
 class Service:
-    """A mobility service that grants control and accepts every call whose method is not held."""
+    """A mobility service that grants control and accepts all calls, except calls that the test delays."""
 
     def __init__(self) -> None:
         self.closed = asyncio.Event()

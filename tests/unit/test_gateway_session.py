@@ -21,7 +21,7 @@ ACCEPTED = mavlink.MAV_RESULT_ACCEPTED
 
 
 class World:
-    """A session of an application that has control of a flying drone 20 m above home, with its nose to the east."""
+    """A session of a program that has control. The drone flies 20 m above home, with its nose to the east."""
 
     def __init__(self, *, granted: bool = True) -> None:
         self.vehicle = VirtualVehicle(granted=granted)
@@ -52,7 +52,7 @@ class World:
             self.vehicle.take(message, self.now)
 
     def send(self, name: str, **values: Any) -> list[Call]:
-        """Send a message of the application, and return the calls."""
+        """Send a message of the program, and return the calls."""
         return self.session.receive(self.program.encode(name, values), self.now)
 
     def command(self, number: int, *params: float) -> list[Call]:
@@ -61,7 +61,7 @@ class World:
         return self.send("COMMAND_LONG", command=number, target_system=1, target_component=1, **values)
 
     def sent(self) -> list[Message]:
-        """Return the messages for the application."""
+        """Return the messages for the program."""
         self.session.step(self.now)
         return Parser().feed(self.session.take())
 
@@ -121,9 +121,9 @@ def test_velocity_in_the_body_frame_is_rotated_and_held() -> None:
 @pytest.mark.parametrize(
     ("values", "reason"),
     [
-        ({"type_mask": 0b110111111100}, "neither a whole position nor a whole velocity"),
-        ({"type_mask": 0b110111011111}, "neither a whole position nor a whole velocity"),
-        ({"type_mask": 0b110000111111}, "neither a whole position nor a whole velocity"),
+        ({"type_mask": 0b110111111100}, "neither a complete position nor a complete velocity"),
+        ({"type_mask": 0b110111011111}, "neither a complete position nor a complete velocity"),
+        ({"type_mask": 0b110000111111}, "neither a complete position nor a complete velocity"),
         ({"coordinate_frame": 20}, "is not supported"),
         ({"x": math.nan}, "not a number"),
         ({"z": math.inf}, "not a number"),

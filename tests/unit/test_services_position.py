@@ -77,7 +77,7 @@ def test_position_is_trusted_again_only_when_a_new_position_arrives() -> None:
     assert "GPS glitch" in vehicle.position_problem
     for second in range(2, 9):
         estimator(HEALTHY, float(second))
-    assert vehicle.position_problem, "the known position is still that from before the glitch"
+    assert vehicle.position_problem, "the latest known position is older than the glitch"
     vehicle.take(message("GPS_RAW_INT", fix_type=3, h_acc=600), 9.0)
     estimator(HEALTHY, 9.0)
     report_position(vehicle, 39.0, 9.1)

@@ -69,8 +69,11 @@ def test_kml_imports_all_holes_and_polygons_of_a_multigeometry():
             kml("<Polygon>EDGE</Polygon>", "<NetworkLink><name>n</name></NetworkLink>"),
             "n: a NetworkLink refers to another file",
         ),
-        (kml("<Polygon>EDGEEDGE</Polygon>"), "Polygon[0].outerBoundaryIs: a polygon has exactly one"),
-        (kml("<Polygon/>"), "Polygon[0].outerBoundaryIs: a polygon has exactly one"),
+        (
+            kml("<Polygon>EDGEEDGE</Polygon>"),
+            "Polygon[0].outerBoundaryIs: a polygon must have exactly one outer boundary",
+        ),
+        (kml("<Polygon/>"), "Polygon[0].outerBoundaryIs: a polygon must have exactly one outer boundary"),
     ],
 )
 def test_kml_rejects_placemarks_a_zone_cannot_represent(text, sentence):

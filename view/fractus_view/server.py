@@ -252,7 +252,10 @@ def _cookie(request: web.Request) -> str:
 
 
 def _uses_tls(request: web.Request) -> bool:
-    """Return True if the browser uses TLS, directly or to a proxy. A client that forges the header only breaks its own cookie."""
+    """Return True if the browser uses TLS, to this server or to a proxy before it.
+
+    The header of the proxy is not authenticated. A client that forges the header only makes its own cookie unusable.
+    """
     return request.secure or request.headers.get("X-Forwarded-Proto", "").lower() == "https"
 
 

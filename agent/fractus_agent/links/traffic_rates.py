@@ -12,7 +12,10 @@ from dataclasses import dataclass
 from fractus_agent.redirector.nft_maps import Endpoint
 
 WINDOW_S = 0.1
-"""Length of a window in seconds. Pictures arrive in bursts, so a longer window would show less than the link can carry."""
+"""Length of a window in seconds.
+
+Pictures are sent in bursts. A longer window would include pauses between them, so its rate would be below the bandwidth.
+"""
 WINDOWS = 30
 """Number of windows that are kept."""
 CONFIRMING_SHARE = 0.8

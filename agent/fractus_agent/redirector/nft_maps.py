@@ -86,7 +86,7 @@ class Endpoint:
     protocol: int = socket.IPPROTO_TCP
 
     def __hash__(self) -> int:
-        # Endpoints are looked up often, and the hash of an IPv4Address formats it as text first.
+        # Endpoints are looked up often, and the hash of IPv4Address is slow because it formats the address as text.
         return hash((int(self.address), self.port, self.protocol))
 
 

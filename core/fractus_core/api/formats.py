@@ -18,7 +18,7 @@ CLOCK_TIME = r"^([01][0-9]|2[0-3]):[0-5][0-9]$"
 
 FORMATS = {
     IMAGE: "an image with a lowercase name, such as registry.example/team/survey:1.0",
-    VARIABLE: "letters, digits and underscores, without a digit first",
+    VARIABLE: "letters, digits and underscores, not beginning with a digit",
     MOUNT_PATH: "an absolute path without a slash at the end, such as /data",
     DEVICE: "the name of a network device, such as wlan0",
     SSID: "printable ASCII characters",

@@ -517,7 +517,7 @@ def zone_crossings(zones: tuple[ValidatedZone, ...], at_most: int) -> int:
 
 
 def check_united(policy: Policy, zones: Sequence[ValidatedZone]) -> None:
-    """Refuse an inclusion policy whose enforcement would take too long to compute the union of its zones.
+    """Refuse an inclusion policy if computing the union of its zones would take too long.
 
     Args:
         policy: Policy to enforce.

@@ -1,7 +1,7 @@
 """Signatures of Grants: signing and verification.
 
-A Grant carries its signature and the signer's certificate as annotations. It is verified for its time of issue, not for
-the present time, so that an expiring certificate does not take the grant from a drone in flight.
+A Grant contains its signature and the signer's certificate as annotations. The certificate must be valid at the Grant's
+time of issue, not at the present time. Otherwise, an expired certificate would end the Grant of a drone in flight.
 """
 
 from __future__ import annotations

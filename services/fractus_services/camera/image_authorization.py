@@ -139,7 +139,12 @@ class ImageAuthorizer:
 
 
 def situation_of(poses: Iterable[Pose], now: Situation) -> Situation:
-    """Return the situation of stored poses with the current time, so that current policies apply to an old image."""
+    """Return the situation in which an image was taken, at the current time, so that current policies apply.
+
+    Args:
+        poses: Stored poses of the exposure.
+        now: Current situation.
+    """
     exposure = tuple(pose.apply_to(now) for pose in poses)
     return replace(exposure[-1], exposure=exposure)
 

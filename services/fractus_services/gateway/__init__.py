@@ -1,1 +1,1 @@
-"""Policy gateway for MAVLink applications: decodes each frame, decides, and calls the mobility service."""
+"""Policy gateway for MAVLink programs: decodes each frame, decides, and calls the mobility service."""

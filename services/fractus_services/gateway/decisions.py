@@ -11,16 +11,16 @@ from typing import Literal, get_args
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 Received = Literal["translate", "respond", "consume", "refuse"]
-"""Handling of a message from an application.
+"""Handling of a message from a program.
 
 translate: The gateway calls the mobility service, or refuses the contents of the message.
 respond: The gateway replies from its own state.
 consume: The message has no effect.
-refuse: The message has no effect, and the application receives the reason.
+refuse: The message has no effect, and the program receives the reason.
 """
 
 Sent = Literal["deliver", "replace", "withhold"]
-"""Handling of a message for the application.
+"""Handling of a message for the program.
 
 deliver: The gateway encodes the content of the vehicle's message again.
 replace: The gateway creates the message. The vehicle's message is not delivered.
@@ -36,12 +36,12 @@ class BadDecisions(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Decisions:
-    """Decisions by name. A name without an entry is refused and withheld.
+    """Decisions by name. A message or command without an entry is refused, and not sent to programs.
 
     Attributes:
-        received: Handling of messages from applications.
-        sent: Handling of messages for applications.
-        commands: Handling of commands from applications, by the name of the MAV_CMD without its prefix.
+        received: Handling of messages from programs.
+        sent: Handling of messages for programs.
+        commands: Handling of commands from programs, by the name of the MAV_CMD without its prefix.
     """
 
     received: Mapping[str, Received]
@@ -50,7 +50,7 @@ class Decisions:
 
     @property
     def delivered(self) -> tuple[str, ...]:
-        """Names of the messages of the vehicle that applications receive."""
+        """Names of the messages of the vehicle that programs receive."""
         return tuple(name for name, decision in self.sent.items() if decision == "deliver")
 
 
@@ -76,14 +76,14 @@ def read_decisions(text: str) -> Decisions:
         missing.remove((kind, int(number), name))
         decision = next((value for value in get_args(Received) if value == incoming), None)
         if decision is None:
-            raise BadDecisions(f"{name}: {incoming} is no decision; use {', '.join(get_args(Received))}")
+            raise BadDecisions(f"{name}: {incoming} is not a decision; use {', '.join(get_args(Received))}")
         if kind == "command":
             commands[name] = decision
             continue
         received[name] = decision
         telemetry = next((value for value in get_args(Sent) if value == outgoing), None)
         if telemetry is None:
-            raise BadDecisions(f"{name}: {outgoing} is no decision; use {', '.join(get_args(Sent))}")
+            raise BadDecisions(f"{name}: {outgoing} is not a decision; use {', '.join(get_args(Sent))}")
         sent[name] = telemetry
     if missing:
         raise BadDecisions(f"no decision for {', '.join(sorted(name for _, _, name in missing))}")

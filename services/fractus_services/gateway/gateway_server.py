@@ -1,4 +1,4 @@
-"""Process of the gateway: TLS connections of applications, one session for each connection."""
+"""Process of the gateway: TLS connections of programs, one session for each connection."""
 
 from __future__ import annotations
 
@@ -28,17 +28,17 @@ from fractus_services.recording.segment_directory import segments_in
 log = logging.getLogger(__name__)
 
 READ_BYTES = 512
-"""Number of bytes that are parsed at once. Each may begin a damaged frame, and other connections wait meanwhile."""
+"""Number of bytes that are parsed at once. Other connections wait while bytes, perhaps of damaged frames, are parsed."""
 
 MAX_UNSENT_BYTES = 64 * 1024
-"""Size of unsent data from which messages for an application are dropped, because it does not read."""
+"""Maximum size of unsent data. Further messages for a program that does not read are dropped."""
 
 TICK_S = 0.02
 """Interval at which due messages are sent."""
 
 AUDITED_PER_S = 2.0
 AUDITED_BURST = 50.0
-"""Rate and burst of audit entries about refused messages of an instance. Further refusals are not entered."""
+"""Rate and burst of audit entries about refused messages of an instance. Further refusals are not logged."""
 
 MAX_CONNECTIONS = 64
 MAX_CONNECTIONS_PER_INSTANCE = 4
@@ -62,7 +62,7 @@ class GatewayOptions:
 
 
 class Gateway:
-    """Accepts connections of applications.
+    """Accepts connections of programs.
 
     Args:
         socket: Unix socket of the mobility service.
@@ -104,8 +104,8 @@ class Gateway:
         Args:
             identity: SPIFFE ID.
             certificate: PEM certificate of the instance.
-            reader: Bytes from the application.
-            writer: Bytes for the application.
+            reader: Bytes from the program.
+            writer: Bytes for the program.
         """
         instance = self._attach(identity, certificate)
         if instance is None:
@@ -119,7 +119,7 @@ class Gateway:
         instance.sessions.add(session)
         self._writers[writer] = identity
         self._ended.clear()
-        log.info("gateway: application connected (instance=%s)", identity)
+        log.info("gateway: program connected (instance=%s)", identity)
         sending = asyncio.get_running_loop().create_task(self._send(session, writer, recorder))
         try:
             await self._receive(instance, session, reader)
@@ -129,7 +129,7 @@ class Gateway:
             sending.cancel()
             instance.sessions.discard(session)
             writer.close()
-            log.info("gateway: application disconnected (instance=%s)", identity)
+            log.info("gateway: program disconnected (instance=%s)", identity)
             if not instance.sessions:
                 await self._detach(identity)
             del self._writers[writer]
@@ -226,7 +226,7 @@ async def run(options: GatewayOptions, stop: asyncio.Event) -> None:
         )
     except OSError as error:
         raise CannotServe(
-            f"--listen {options.listen}, --tls {options.tls}: cannot serve there ({error.strerror or error})"
+            f"--listen {options.listen}, --tls {options.tls}: cannot serve ({error.strerror or error})"
         ) from None
     audit.append("started", {"listen": options.listen})
     log.info("gateway: serving (address=%s)", options.listen)

@@ -24,7 +24,7 @@ from fractus_services.gateway.virtual_vehicle import VirtualVehicle
 log = logging.getLogger(__name__)
 
 RETRY_S = 1.0
-"""Delay before the mobility service is called again after a failure."""
+"""Delay before the gateway calls the mobility service again after a failure."""
 
 CALL_TIMEOUT_S = 10.0
 ARM_TIMEOUT_S = 20.0
@@ -35,7 +35,7 @@ CONTROL_WAIT_S = 15.0
 """Time for which arming waits for control. Programs arm as soon as the telemetry looks ready."""
 
 RESPONSE_TIMEOUT_S = 5.0
-"""Time within which the gateway answers liveness requests. A gateway that hangs loses control for its instances."""
+"""Time within which the gateway answers liveness requests. If it hangs for longer, its instances lose control."""
 
 SUPERVISE_S = 0.25
 MAX_CALLS = 16
@@ -57,10 +57,10 @@ _MOTIONS = frozenset({"Takeoff", "Land", "Goto", "ReturnToLaunch"})
 """Methods whose call lasts until the motion is complete."""
 
 _TIMEOUTS_S = {"Arm": ARM_TIMEOUT_S, **dict.fromkeys(_MOTIONS, 0.0)}
-"""Timeouts other than `CALL_TIMEOUT_S`; 0 for none."""
+"""Timeouts other than `CALL_TIMEOUT_S`. 0: no timeout."""
 
 _STEERING = _MOTIONS | {"Hover", "SetVelocity"}
-"""Methods that move or stop the drone. Each ends the motion of the method before."""
+"""Methods that move or stop the drone. A call of one of them ends the previous motion."""
 
 _RESULTS = {
     code_pb2.PERMISSION_DENIED: mavlink.MAV_RESULT_DENIED,
@@ -69,19 +69,19 @@ _RESULTS = {
     code_pb2.RESOURCE_EXHAUSTED: mavlink.MAV_RESULT_TEMPORARILY_REJECTED,
 }
 _PASSING = frozenset({code_pb2.UNAVAILABLE, code_pb2.RESOURCE_EXHAUSTED, code_pb2.DEADLINE_EXCEEDED})
-"""Status codes after which the control stream is opened again without a request of the application."""
+"""Status codes after which the control stream is opened again without a request of the program."""
 
 _FINAL = frozenset({mobility_pb2.ControlEvent.STATE_LOST, mobility_pb2.ControlEvent.STATE_COMPLETE})
 
 
 @dataclass(slots=True)
 class _Setpoint:
-    """Messages without a response: only the latest one is kept while a call waits for its verdict.
+    """Messages of one kind without a response. While a call waits for its verdict, only the latest message is kept.
 
     Attributes:
         busy: True while a call waits for its verdict.
         pending: The latest message that arrived meanwhile.
-        flying: Request of the leg that is being flown. The same target again has no effect.
+        flying: Request of the leg that is being flown. A repeated request has no effect.
     """
 
     busy: bool = False
@@ -114,10 +114,10 @@ class Instance:
         self._client: MobilityClient | None = None
         self._control: asyncio.Task[None] | None = None
         self._ended = False
-        self._known: set[Session] = set()  # sessions that have received a valid frame
-        self._steering: set[Session] = (
-            set()
-        )  # sessions that have moved the drone; control ends when one of them is lost
+        # Sessions that have received a valid frame.
+        self._known: set[Session] = set()
+        # Sessions that have moved the drone. Control ends when one of them is lost.
+        self._steering: set[Session] = set()
         self._granted = asyncio.Event()
         self._calls: set[asyncio.Task[None]] = set()
         self._setpoints = {"motion": _Setpoint(), "gimbal": _Setpoint(), "speed": _Setpoint()}
@@ -154,7 +154,7 @@ class Instance:
         self._report("the connection to the mobility service was closed")
         for setpoint in self._setpoints.values():
             setpoint.pending = None
-        await asyncio.sleep(0.0)  # a call that has just been created begins, so that it ends with a result
+        await asyncio.sleep(0.0)  # let new calls begin, so that each of them ends with a result
         calls = list(self._calls)
         for call in calls:
             call.cancel()
@@ -163,7 +163,7 @@ class Instance:
         self._ended = False
 
     async def _end_control(self, client: MobilityClient) -> None:
-        """Close the control stream. If the drone has landed, control is returned before, so that the mission is complete."""
+        """Close the control stream. If the drone has landed, first return control, so that the mission is complete."""
         if self._control is None:
             return
         landed = self.vehicle.flown and not self.vehicle.armed
@@ -179,7 +179,7 @@ class Instance:
         self._control = None
 
     async def _follow_vehicle(self, client: MobilityClient) -> None:
-        """Store the vehicle's messages. If the Grant does not permit to read the position, there are none."""
+        """Store the vehicle's messages. None arrive if the Grant does not include GetPosition."""
         parser = Parser()
         request = gateway_pb2.VehicleFrames()
         while True:
@@ -208,7 +208,7 @@ class Instance:
             await asyncio.sleep(RETRY_S)
 
     def _report(self, sentence: str) -> None:
-        """Send a sentence to all sessions, once until the reason changes."""
+        """Set the reason for waiting, and send it to all sessions if it has changed."""
         if sentence == self.vehicle.waiting_reason:
             return
         self.vehicle.waiting_reason = sentence
@@ -218,14 +218,14 @@ class Instance:
     # Control
 
     async def _supervise(self, client: MobilityClient) -> None:
-        """Hold a control stream while an application is alive, and all sessions that have moved the drone are."""
+        """Hold a control stream while a session is alive, and no session that has moved the drone is lost."""
         was_alive = False
         while True:
             now = self._loop.time()
             known = {session for session in self.sessions if session.frames}
             alive = {session for session in known if not session.silent(now)}
             if self._control is not None and (not alive or self._steering - alive):
-                log.info("gateway: the application is lost, control stream closed (instance=%s)", self.identity)
+                log.info("gateway: program lost, control stream closed (instance=%s)", self.identity)
                 await self._end_control(client)
             requested = bool(known - self._known) or any(session.reopen for session in self.sessions)
             if requested:
@@ -262,7 +262,7 @@ class Instance:
     async def _take_event(self, client: MobilityClient, event: mobility_pb2.ControlEvent) -> None:
         if event.state == mobility_pb2.ControlEvent.STATE_PING:
             request = mobility_pb2.ConfirmAliveRequest(ping=event.ping)
-            with suppress(CallRefused):  # the next request decides; control ends if none is answered in time
+            with suppress(CallRefused):  # control ends only if all confirmations fail until the response timeout
                 await client.call("ConfirmAlive", request, mobility_pb2.ConfirmAliveResponse, CALL_TIMEOUT_S)
         elif event.state == mobility_pb2.ControlEvent.STATE_GRANTED:
             self.vehicle.granted = True
@@ -287,7 +287,7 @@ class Instance:
     # Calls
 
     def start(self, session: Session, call: Call) -> None:
-        """Start a call of a session. A later setpoint replaces one that still waits for its verdict."""
+        """Start a call of a session. A setpoint waits for the verdict of the previous one, and replaces a waiting one."""
         steers = call.request.method in _STEERING
         if steers and self.vehicle.granted:
             self._steering.add(session)
@@ -351,7 +351,7 @@ class Instance:
                 setpoint.flying = None
 
     async def _wait_for_control(self, call: Call) -> None:
-        """Wait before arming, and before a speed is set. Other calls are judged at once."""
+        """Wait for control if the call arms the drone or sets a parameter. Other calls do not wait."""
         if call.request.method != "Arm" and not call.parameter:
             return
         try:
@@ -361,7 +361,7 @@ class Instance:
             raise CallRefused(code_pb2.UNAVAILABLE, self.vehicle.waiting_reason) from None
 
     def _accept(self, session: Session, call: Call, reply: Any) -> None:
-        """Answer a call that the mobility service has accepted."""
+        """Send the result of a call that the mobility service has accepted."""
         vehicle = self.vehicle
         if call.request.mode is not None and vehicle.granted:
             vehicle.flying_mode = call.request.mode
@@ -382,7 +382,7 @@ class Instance:
         session.finish(call, mavlink.MAV_RESULT_ACCEPTED, text, self._loop.time())
 
     def _free(self, setpoint: _Setpoint | None, flying: ProtobufMessage | None) -> None:
-        """Send the message that waited for a verdict."""
+        """Mark that no call waits for its verdict, and start the call of the pending message."""
         if setpoint is None:
             return
         setpoint.busy = False

@@ -14,7 +14,7 @@ from google.protobuf.message import Message as ProtobufMessage
 from google.rpc import code_pb2, status_pb2
 
 MAX_MESSAGE_BYTES = 4 * 1024 * 1024
-"""Maximum size of a message of the mobility service. A parameter list has about 40 kB."""
+"""Maximum size of a message from the mobility service. A list of parameters has about 40 kB."""
 
 _LENGTH = struct.Struct(">I")
 
@@ -22,11 +22,11 @@ _Reply = TypeVar("_Reply", bound=ProtobufMessage)
 
 
 class CallRefused(Exception):
-    """The mobility service refused a call, or ended it before its end.
+    """The mobility service refused a call, or ended it early.
 
     Attributes:
         code: CamelCase code of the decision; empty if there is none.
-        reason: Sentence for people.
+        reason: Sentence for the program and its user.
         status: google.rpc.Code.
     """
 

@@ -1,4 +1,4 @@
-"""Parameters as an application sees them: one dense list, of which few entries may be written."""
+"""Parameters as a program sees them: one list with consecutive indices. Only WPNAV_SPEED may be written."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ SPEED_PARAMETER = "WPNAV_SPEED"
 """Horizontal speed of legs in cm/s. A write sets the speed of the mobility service."""
 
 DEFAULT_SPEED_CMS = 1000.0
-"""Value of WPNAV_SPEED in a view whose vehicle has not reported it."""
+"""Value of WPNAV_SPEED until the vehicle has reported it."""
 
 
 @dataclass(slots=True)
@@ -23,9 +23,9 @@ class ParameterView:
     """Parameters of one instance.
 
     Attributes:
-        values: Values by name, in the order of the indices that the application sees.
-        loaded: True if the vehicle's parameters are known. Requests wait for them, because an application trusts the
-            number of parameters in the first PARAM_VALUE.
+        values: Values by name, in the order of the indices that the program sees.
+        loaded: True if the vehicle's parameters are known. Until then, a request for the list waits, because programs
+            rely on the number of parameters in the first PARAM_VALUE.
     """
 
     values: dict[str, float] = field(default_factory=lambda: {SPEED_PARAMETER: DEFAULT_SPEED_CMS})
@@ -66,5 +66,5 @@ class ParameterView:
         if present is not None and math.isclose(present, value, rel_tol=1e-6):
             return None
         if name != SPEED_PARAMETER:
-            raise Untranslatable(f"{name} may not be written by an application; only {SPEED_PARAMETER} may")
+            raise Untranslatable(f"{name} may not be written by a program; only {SPEED_PARAMETER} may")
         return set_speed(value / 100.0)

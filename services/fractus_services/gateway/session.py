@@ -1,4 +1,4 @@
-"""State of one connection of a MAVLink application: frames in, calls and frames out. It does no I/O and reads no clock."""
+"""State of one connection of a MAVLink program: frames in, calls and frames out. It does no I/O and reads no clock."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from fractus_services.mavlink_server.stream_groups import ALL_GROUPS, GROUPS
 
 MAX_FRAMES_PER_S = 1000.0
 MAX_BYTES_PER_S = 100_000.0
-"""Rates above which the gateway delays reading. Damaged frames count too. Faster applications are slowed down by TCP."""
+"""Rates above which the gateway delays reading, so that TCP slows the program down. Damaged frames count too."""
 
 MAX_INTERVAL_HZ = 50.0
 """Maximum rate of a message, in Hz."""
 
 HEARTBEAT_SILENCE_S = 5.0
-"""Time without a HEARTBEAT after which an application that sends heartbeats counts as silent."""
+"""Time without a HEARTBEAT after which a program that sends heartbeats counts as silent."""
 
 IN_PROGRESS_S = 1.0
 """Interval at which a command in progress is reported."""
@@ -38,12 +38,12 @@ TEXT_INTERVAL_S = 5.0
 
 MAX_TEXTS = 20.0
 TEXTS_PER_S = 2.0
-"""Burst and rate of sentences. Further sentences are dropped."""
+"""Burst and rate of texts. Further texts are dropped."""
 
 FIRST_HOLD_S = 1.5
 MAX_HOLD_S = 2.0
 HOLD_PERIODS = 1.5
-"""Hold time of a velocity: the first hold, the maximum, and the number of observed periods between velocities."""
+"""Time for which a velocity is held: for the first velocity, at most, and in observed periods between velocities."""
 
 TEXT_BYTES = 50
 VERSION = 0x040603FF
@@ -69,7 +69,7 @@ Source = tuple[int, int]
 
 @dataclass(frozen=True, slots=True)
 class Call:
-    """A request of an application to the mobility service.
+    """A request of a program to the mobility service.
 
     Attributes:
         request: Method and request message.
@@ -116,7 +116,7 @@ class _InProgress:
 
 @dataclass(slots=True)
 class _VelocityRate:
-    """Observed period between velocities of the application."""
+    """Observed period between velocities of the program."""
 
     at: float = -math.inf
 
@@ -146,11 +146,11 @@ class Session:
     Args:
         vehicle: Vehicle as the instance sees it, shared by the sessions of the instance.
         parameters: Parameters of the instance.
-        record: Callback that receives each valid frame of the application.
+        record: Callback that receives each valid frame of the program.
 
     Attributes:
         refusals: Refusals since the last call of `take_refusals`.
-        reopen: True if the application requests control again after it lost control.
+        reopen: True if the program requests control again after it lost control.
         frames: Number of valid frames that were received.
     """
 
@@ -202,7 +202,7 @@ class Session:
         return max(self._busy_until - now, 0.0)
 
     def silent(self, now: float) -> bool:
-        """Return True if the application has sent heartbeats and has stopped to send them."""
+        """Return True if the program has sent heartbeats before, but none for `HEARTBEAT_SILENCE_S`."""
         return math.isfinite(self._heartbeat_at) and now - self._heartbeat_at > HEARTBEAT_SILENCE_S
 
     def _handle(self, message: Message, now: float) -> list[Call]:
@@ -217,7 +217,7 @@ class Session:
         if decision == "refuse":
             if message.name == "FILE_TRANSFER_PROTOCOL":
                 self._refuse_file_transfer(message)
-            raise Untranslatable("applications may not send this message")
+            raise Untranslatable("programs may not send this message")
         return self._translate(message, now)
 
     def _translate(self, message: Message, now: float) -> list[Call]:
@@ -250,12 +250,12 @@ class Session:
             self._acknowledge(source, fields.number, _COMMAND_RESPONSES[name](self, fields, now))
             return []
         if name != "DO_SET_MODE" and (source, fields.number) in self._in_progress:
-            # The application repeats a command whose acknowledgement it has not received yet.
+            # The program repeats a command whose acknowledgement it has not received yet.
             self._acknowledge(source, fields.number, mavlink.MAV_RESULT_IN_PROGRESS)
             return []
         try:
             if decision == "refuse":
-                raise Untranslatable("applications may not send this command")
+                raise Untranslatable("programs may not send this command")
             if name == "DO_SET_MODE":
                 return self._set_mode(_mode_number(fields), fields.number, name, source, now)
             request = _COMMANDS[name](self, fields, now)
@@ -268,7 +268,7 @@ class Session:
     def _begin(self, call: Call, now: float) -> list[Call]:
         progress = self._in_progress.get(call.key)
         if progress is not None and progress.call.request == call.request:
-            # The application repeats a mode. Another mode would be a new call.
+            # The program repeats a mode. Another mode would be a new call.
             self._acknowledge(call.source, call.command or 0, mavlink.MAV_RESULT_IN_PROGRESS)
             return []
         if call.request.method == "Arm":
@@ -326,7 +326,7 @@ class Session:
         return [Call(request, message.name, source, mission_ack=True)]
 
     def _set_parameter(self, message: Message, source: Source, now: float) -> list[Call]:
-        """Return the call for a write. The new value is reported at once, because clients do not wait for a verdict."""
+        """Return the call for a write. Report the new value at once, because clients do not wait for a verdict."""
         name = message.text("param_id")
         value = message.real("param_value")
         before = self._parameters.values.get(name, 0.0)
@@ -343,12 +343,12 @@ class Session:
     # Results of calls
 
     def finish(self, call: Call, result: int, text: str, now: float) -> None:
-        """Answer a call.
+        """Send the result of a call to the program.
 
         Args:
             call: The call.
             result: MAV_RESULT.
-            text: Sentence with the reason of a refusal or a correction; empty for none.
+            text: Sentence with the reason of a refusal or a correction; empty for other calls.
             now: Monotonic time in seconds.
         """
         progress = self._in_progress.get(call.key)
@@ -397,7 +397,7 @@ class Session:
                 self._channel.send("PARAM_VALUE", self._parameters.report(index))
 
     def take(self) -> bytes:
-        """Remove and return the bytes for the application."""
+        """Remove and return the bytes for the program."""
         return self._channel.take()
 
     def take_refusals(self) -> list[Refusal]:
@@ -426,7 +426,7 @@ class Session:
             )
 
     def _refuse(self, name: str, reason: str, now: float, *, audited: bool = True) -> None:
-        """Report a refused message, at most once in `TEXT_INTERVAL_S` for each name, and for all unknown commands."""
+        """Report a refused message, at most once in `TEXT_INTERVAL_S` for each name. Unknown commands share a name."""
         kind = "unknown command" if name.isdecimal() else name
         if now - self._text_at.get(kind, -math.inf) < TEXT_INTERVAL_S:
             return
@@ -580,14 +580,16 @@ class Session:
 
     def _take_off(self, fields: _CommandFields, _now: float) -> Request:
         if fields.frame is not None and fields.frame not in RELATIVE_FRAMES:
-            raise Untranslatable("the altitude of a takeoff is above home; use MAV_FRAME_GLOBAL_RELATIVE_ALT")
+            raise Untranslatable(
+                "the altitude of a takeoff must be relative to home; use MAV_FRAME_GLOBAL_RELATIVE_ALT"
+            )
         if not math.isfinite(fields.z):
             raise Untranslatable("the altitude is not a number")
         return Request("Takeoff", mobility_pb2.TakeoffRequest(altitude_m=fields.z), mavlink.COPTER_MODE_GUIDED)
 
     def _arm(self, fields: _CommandFields, _now: float) -> Request:
         if fields.params[1] in {translate.FORCE_MAGIC, translate.FORCE_ARM_MAGIC}:
-            raise Untranslatable("arming or disarming by force is not available to applications")
+            raise Untranslatable("programs may not arm or disarm by force")
         if fields.params[0] not in {0.0, 1.0}:
             raise Untranslatable("the first parameter must be 1 (arm) or 0 (disarm)")
         if fields.params[0]:
@@ -596,7 +598,7 @@ class Session:
 
     def _reposition(self, fields: _CommandFields, _now: float) -> Request:
         if fields.frame is None:
-            raise Untranslatable("send DO_REPOSITION as COMMAND_INT, because floats hold no accurate position")
+            raise Untranslatable("send DO_REPOSITION as COMMAND_INT, because COMMAND_LONG holds no accurate position")
         request = translate.place_target(fields.frame, int(fields.x), int(fields.y), fields.z)
         if math.isfinite(fields.params[0]) and fields.params[0] > 0.0:
             request.message.speed_mps = fields.params[0]
@@ -652,7 +654,7 @@ def _mode_number(fields: _CommandFields) -> int:
 
 
 def _message_name(number: float) -> str | None:
-    """Return the name of a message that applications may receive; None for other numbers."""
+    """Return the name of a message that programs may receive; None for other numbers."""
     if not math.isfinite(number) or number < 0.0:
         return None
     kind = mavlink.mavlink_map.get(int(number))

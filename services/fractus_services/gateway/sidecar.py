@@ -80,7 +80,7 @@ class Sidecar:
         await self._ended.wait()
 
     async def serve_udp(self, port: int) -> None:
-        """Send the gateway's messages to a UDP port of this machine, and return the datagrams of the program there."""
+        """Send the gateway's messages to a local UDP port, and the datagrams from this port to the gateway."""
         loop = asyncio.get_running_loop()
         logged = False
         while True:
@@ -109,7 +109,7 @@ class Sidecar:
 
 
 class _Datagrams(asyncio.DatagramProtocol):
-    """Writes received datagrams to the gateway. A refused datagram means that no program listens yet."""
+    """Writes received datagrams to the gateway. Errors are ignored, because no program may listen on the port yet."""
 
     def __init__(self, writer: asyncio.StreamWriter) -> None:
         self._writer = writer
@@ -147,7 +147,7 @@ async def run(options: SidecarOptions, stop: asyncio.Event) -> None:
     try:
         await stop.wait()
     finally:
-        # Since Python 3.12, `Server.wait_closed` waits for connections, also for one that waits for the gateway.
+        # Do not call `Server.wait_closed`: since Python 3.12 it waits for connections, which may wait for the gateway.
         server.close()
         for task in tasks:
             task.cancel()

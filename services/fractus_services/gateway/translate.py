@@ -31,7 +31,7 @@ HOVER_MODES = frozenset({mavlink.COPTER_MODE_BRAKE, mavlink.COPTER_MODE_LOITER, 
 
 
 class Untranslatable(Exception):
-    """The contents of a message cannot become a call. The text is one sentence for the application."""
+    """The contents of a message cannot be translated to a call. The text is one sentence for the program."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -185,9 +185,9 @@ def gimbal(pitch_deg: float, yaw_deg: float) -> Request:
 
 def _velocity(message: Message, mask: int, heading_deg: float, yaw_deg: float | None, hold_s: float) -> Request:
     if mask & _VELOCITY:
-        raise Untranslatable("the type_mask selects neither a whole position nor a whole velocity")
+        raise Untranslatable("the type_mask selects neither a complete position nor a complete velocity")
     if mask & _POSITION != _POSITION:
-        raise Untranslatable("the type_mask selects a part of a position; select x, y and z, or none")
+        raise Untranslatable("the type_mask selects only a part of a position; select x, y and z, or none of them")
     north, east = _rotated(message.real("vx"), message.real("vy"), heading_deg)
     down = message.real("vz")
     if not all(map(math.isfinite, (north, east, down))):

@@ -1,4 +1,4 @@
-"""The vehicle as an application sees it: virtual mode, and the latest messages of the real vehicle."""
+"""The vehicle as a program sees it: virtual mode, and the latest messages of the real vehicle."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from fractus_runtime.mavlink_codec import Message, Value
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 SILENT_S = 3.0
-"""Age of the vehicle's last HEARTBEAT from which the application receives no heartbeats."""
+"""Age of the vehicle's last HEARTBEAT above which programs receive no heartbeats."""
 
 MAX_POSITION_AGE_S = 1.0
-"""Age from which a position is unknown."""
+"""Age above which a position counts as unknown."""
 
 DESCENTS = frozenset({mavlink.COPTER_MODE_RTL, mavlink.COPTER_MODE_LAND})
 """Virtual modes that end when the vehicle has landed."""
@@ -74,7 +74,7 @@ class VirtualVehicle:
 
     @property
     def mode(self) -> int:
-        """Custom mode that the application sees. It is never GUIDED while the instance has no control."""
+        """Custom mode that the program sees. It is never GUIDED while the instance has no control."""
         if self.granted:
             return self.flying_mode
         heartbeat = self.latest.get("HEARTBEAT")
@@ -82,7 +82,7 @@ class VirtualVehicle:
         return mavlink.COPTER_MODE_BRAKE if real == mavlink.COPTER_MODE_GUIDED else real
 
     def heartbeat(self) -> Mapping[str, Value]:
-        """Return the fields of the HEARTBEAT for applications."""
+        """Return the fields of the HEARTBEAT for programs."""
         heartbeat = self.latest.get("HEARTBEAT")
         status = heartbeat.integer("system_status") if heartbeat is not None else mavlink.MAV_STATE_BOOT
         base = mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED | mavlink.MAV_MODE_FLAG_STABILIZE_ENABLED

@@ -168,7 +168,7 @@ def _spec(builder: ZoneBuilder, title: str, polygon: ElementTree.Element, field:
     exterior = _rings(builder, title, polygon, "outerBoundaryIs", field)
     holes = _rings(builder, title, polygon, "innerBoundaryIs", field)
     if len(exterior) != 1:
-        raise InvalidObject(f"{field}.outerBoundaryIs", "a polygon has exactly one")
+        raise InvalidObject(f"{field}.outerBoundaryIs", "a polygon must have exactly one outer boundary")
     for mode in (e.text or "" for e in polygon if _tag(e) == "altitudeMode"):
         if mode.strip() not in {"", "clampToGround"}:
             raise InvalidObject(

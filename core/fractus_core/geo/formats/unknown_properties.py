@@ -1,7 +1,7 @@
-"""Unknown properties of foreign files: decide if one may state the size, altitude or time of a zone.
+"""Unknown properties of imported files: decide if a property may state the size, altitude or time of a zone.
 
 Files of authorities and of mapping programs use any names and languages. Therefore a property is judged by its name and
-by its value. In doubt it may state a limit, because an import that omits a limit makes a zone too small or too large.
+by its value. In doubt, the answer is yes, because an import that omits a limit makes a zone too small or too large.
 """
 
 from __future__ import annotations

@@ -673,6 +673,6 @@ def _reference(grant: ActiveGrant | None) -> GrantRef | None:
 
 
 def _is_elsewhere(home: Home, origin: tuple[float, float, float]) -> bool:
-    """Return True if home is not at the origin (latitude, longitude, altitude above mean sea level)."""
+    """Return True if home is farther than `home_moved_m` from the origin (latitude, longitude, metres above mean sea level)."""
     lat, lon, amsl_m = origin
     return math.hypot(*LocalFrame(lat, lon).xy(home.lat, home.lon), home.amsl_m - amsl_m) > SETTINGS.home_moved_m

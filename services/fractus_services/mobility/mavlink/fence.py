@@ -93,7 +93,10 @@ def fence_bounds(spec: GrantSpec, vertices: int = MAX_VERTICES[0]) -> FenceBound
 
 
 def _outline(whole: shapely.Geometry, vertices: int) -> shapely.Polygon:
-    """Return the smallest of several polygons with a limited number of vertices around a geometry and its margin."""
+    """Return a polygon with at most `vertices` vertices that contains a geometry and its margin.
+
+    Several simplified outlines are computed. The outline with the smallest area is returned.
+    """
     outlines: list[shapely.Geometry] = []
     for simpler_m in _SIMPLER_M:
         # Simplification may shrink the shape by about its tolerance, so it is enlarged by the tolerance first.

@@ -84,7 +84,7 @@ async def upload(
                 if answer.integer("type") == mavlink.MAV_MISSION_ERROR and last_sent > 1:
                     return  # The answer to the last item was lost. Reading the list back shows if it is complete.
                 if answer.integer("type") != mavlink.MAV_MISSION_ACCEPTED:
-                    await asyncio.sleep(TEXT_TIMEOUT_S)  # The texts with the reason may follow the answer.
+                    await asyncio.sleep(TEXT_TIMEOUT_S)  # STATUSTEXTs with the reason may follow the MISSION_ACK.
                 _check(answer.integer("type"), [texts.get_nowait().text("text") for _ in range(texts.qsize())])
                 return
             # The vehicle requests its next item. It repeats the request if the request or the item was lost.

@@ -50,10 +50,10 @@ IN_FLIGHT_ALTITUDE_M = 3.0
 """Altitude above home above which a drone whose motors stop has not landed near home."""
 
 STARTED_S = 5.0
-"""Time after the start of its motors for which a drone counts as flying, because it may be about to take off.
+"""Time for which a drone counts as flying after its motors have started, because it may be about to take off.
 
-It is also the gap between heartbeats after which a report of stopped motors is accepted at once, because the drone may
-have landed.
+After a gap of this length between heartbeats, a report of stopped motors is accepted at once, because the drone may have
+landed during the gap.
 """
 
 TRUSTED_AGAIN_S = 30.0

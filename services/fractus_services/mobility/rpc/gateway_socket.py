@@ -36,7 +36,7 @@ MAX_MESSAGE_BYTES = 64 * 1024
 
 MAX_QUEUED_BYTES = 256 * 1024
 MAX_UNSENT_BYTES = 1024 * 1024
-"""Sizes of unsent data from which vehicle messages are dropped, and the connection is closed."""
+"""Sizes of unsent data above which vehicle messages are dropped, and above which the connection is closed."""
 
 MAX_CALLS = 64
 """Maximum number of open calls of one connection."""
@@ -73,7 +73,7 @@ class VehicleMessages(Protocol):
         """Return the parameters of the vehicle, as far as they are known."""
 
     def request_gateway_messages(self) -> None:
-        """Request the messages that applications expect and the service itself does not need."""
+        """Request the messages that MAVLink programs expect and the service itself does not need."""
 
 
 class CallEnded(Exception):
@@ -147,13 +147,13 @@ class GatewaySocket:
         """
         try:
             self._path.parent.mkdir(parents=True, exist_ok=True)
-            if self._path.is_socket():  # of an earlier process
+            if self._path.is_socket():  # left by an earlier process
                 self._path.unlink()
             server = await asyncio.start_unix_server(self._serve, self._path)
             self._path.chmod(0o600)
         except OSError as error:
             raise CannotServe(
-                f"--gateway-socket {self._path}: cannot listen there ({error.strerror}); name a file that does not exist"
+                f"--gateway-socket {self._path}: cannot listen ({error.strerror}); name a file that does not exist, in an existing directory"
             ) from None
         log.info("gateway: serving (socket=%s)", self._path)
         try:
@@ -169,18 +169,20 @@ class GatewaySocket:
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         task = asyncio.current_task()
-        assert task is not None  # a coroutine runs in a task
+        assert task is not None  # every coroutine runs in a task
         self._connections.add(task)
         try:
             uid = _peer_uid(writer)
             if uid not in {0, os.getuid()}:
-                log.warning("gateway: connection refused, the socket is for this service's user only (uid=%d)", uid)
+                log.warning(
+                    "gateway: connection refused, only the user of this service may use the socket (uid=%d)", uid
+                )
                 return
             await _Connection(reader, writer, self._handlers, self._vehicle, self._delivered).run()
         except (asyncio.IncompleteReadError, ConnectionError, DecodeError) as error:
             log.info("gateway: connection ended (reason=%s)", type(error).__name__)
         except asyncio.CancelledError:
-            log.info("gateway: connection closed, the service stops")  # Python 3.11 logs a cancelled task as an error
+            log.info("gateway: connection closed, the service stops")  # not raised, because asyncio would log an error
         finally:
             self._connections.discard(task)
             writer.close()
@@ -253,7 +255,7 @@ class _Connection:
             reason = f"{call.method} took more than {call.timeout_s:.0f} s"
             status = status_pb2.Status(code=code_pb2.DEADLINE_EXCEEDED, message=reason).SerializeToString()
         except (DecodeError, KeyError):
-            reason = f"{call.method} is no method of the gateway, or its request is malformed"
+            reason = f"{call.method} is not a method that the gateway may call, or its request is malformed"
             status = status_pb2.Status(code=code_pb2.INVALID_ARGUMENT, message=reason).SerializeToString()
         except asyncio.CancelledError:
             status = status_pb2.Status(code=code_pb2.CANCELLED, message="cancelled").SerializeToString()

@@ -30,7 +30,7 @@ BEACON_STEPS = 10
 """Interval of beacons, about one second."""
 
 AHEAD_M = 20.0
-"""Distance from the drone to the point ahead of it to which the rule of the thesis selects the nearest peer."""
+"""Look-ahead distance of the rule of the thesis: it selects the peer nearest to a point this far ahead of the drone."""
 
 INGRESS = find_heuristic("max", "ingress-bandwidth")
 SETTINGS = LinkSettings()

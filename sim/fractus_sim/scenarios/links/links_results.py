@@ -29,7 +29,7 @@ ABRUPT_GAP_S = 2.5
 """Maximum time between two receptions at the loss of a link."""
 
 MIN_SHARE = 0.95
-"""Minimum share of the maximum possible gain."""
+"""Minimum gain of Fractus over the cloud path, as a share of the maximum possible gain."""
 
 MIN_ALTITUDE_M = 15.0
 """Minimum altitude of the evaluated part of the flight."""

@@ -70,7 +70,7 @@ class Agent:
             wall=_now,
             monotonic=time.monotonic,
         )
-        self._audit_heads = BackgroundReader(partial(read_audit_heads, settings.audit))
+        self._audit_heads = BackgroundReader(partial(read_audit_heads, settings.audit, settings.gateway_audit))
         self._supervisor = Supervisor()
         self._supervisor.add("watchdog", run_watchdog)
         self._supervisor.add("grants", self._grants.follow)
@@ -189,7 +189,7 @@ class Agent:
             telemetry_problem=telemetry_problem,
             described=self._registration.description_problem,
             camera_described=self._object_file.condition,
-            audit_heads=read_audit_heads(self._settings.audit),
+            audit_heads=read_audit_heads(self._settings.audit, self._settings.gateway_audit),
             recording_problems=read_recording_problems(self._settings.state),
         )
 

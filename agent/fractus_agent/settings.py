@@ -63,6 +63,11 @@ class Settings:
         return self.state / "audit"
 
     @property
+    def gateway_audit(self) -> Path:
+        """Directory of the audit log of the gateway, which runs as another user."""
+        return self.state / "gateway" / "audit"
+
+    @property
     def links(self) -> Path:
         """Directory of the stored DirectLinks."""
         return self.state / "links"

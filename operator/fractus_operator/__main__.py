@@ -76,7 +76,9 @@ async def run(settings: Settings, stop: asyncio.Event | None = None) -> None:
         authority = await open_authority(store, settings.namespace)
         cache = ClusterCache(store, settings.namespace)
         source = _metrics_source(lease, cache, authority)
-        applications = ApplicationController(store, cache, authority, _now, settings.planning)
+        applications = ApplicationController(
+            store, cache, authority, _now, settings.planning, gateway_image=settings.gateway_image
+        )
         conditions = NodeConditionWriter(store, cache, _now)
         csr = CsrController(store, cache.signing_requests.get, authority, settings.agent_users, _now)
         # The Lease detects an unreachable API server sooner than a watch.

@@ -114,6 +114,8 @@ class ApplicationController:
         authority: Authority,
         clock: Callable[[], datetime],
         settings: Settings | None = None,
+        *,
+        gateway_image: str = "",
     ) -> None:
         self._cache = cache
         self._clock = clock
@@ -122,7 +124,7 @@ class ApplicationController:
         self._objects = ChildObjects(store, cache.children, signer)
         self._grants = ApplicationGrants(cache, self._objects, signer, self._settings)
         self._finished_pods = FinishedPods(store, cache, self._objects, clock)
-        self._rollout = Rollout(self._objects, cache, authority, clock)
+        self._rollout = Rollout(self._objects, cache, authority, clock, gateway_image)
         self._reporter = StatusReporter(store, cache.applications, clock)
         self._route_checks = RouteCheckCache(cache.subscriptions.wake, clock)
         self._states: dict[Key, _ApplicationState] = {}

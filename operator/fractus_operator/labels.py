@@ -24,6 +24,9 @@ SLICE_LABEL = "endpointslice.kubernetes.io/managed-by"
 SLICES_BY = "operator.fractus.dev"
 """Label value of EndpointSlices that the operator manages. Kubernetes ignores slices with a value other than its own."""
 
+SIDECAR = "fractus-mavlink"
+"""Name of the sidecar container that connects a MAVLink program to the gateway of its drone."""
+
 DIGEST_ANNOTATION = f"{GROUP}/applied"
 """Annotation with the digest of the object as last applied, so that an unchanged object is not written again."""
 

@@ -20,6 +20,7 @@ from fractus_operator.labels import (
     INSTANCE_LABEL,
     MANAGED_BY,
     MANAGED_LABEL,
+    SIDECAR,
 )
 
 _MAX_LOG = 400
@@ -209,11 +210,20 @@ def _failure(status: Body) -> str:
         if ended and ended.get("exitCode"):
             output = _last_line_first(str(ended.get("message") or ended.get("reason") or ""))
             return f"exit code {ended['exitCode']}" + (f": {output}" if output else "")
-        waiting = (container.get("state") or {}).get("waiting") or {}
-        if waiting.get("reason") in _CANNOT_START:
-            problem = f"{waiting['reason']}: {waiting.get('message', '')}".rstrip(": ")
-            return f"{problem}; {_LOAD_IMAGE}" if waiting["reason"] in _NO_IMAGE else problem
-    return ""
+        if problem := _start_problem(container):
+            return problem
+    # The sidecar of a MAVLink program is an init container. If it ends, it is restarted.
+    problems = (_start_problem(container) for container in status.get("initContainerStatuses") or ())
+    return next((f"{SIDECAR}: {problem}" for problem in problems if problem), "")
+
+
+def _start_problem(container: Body) -> str:
+    """Return why a container cannot be started, or an empty string."""
+    waiting = (container.get("state") or {}).get("waiting") or {}
+    if waiting.get("reason") not in _CANNOT_START:
+        return ""
+    problem = f"{waiting['reason']}: {waiting.get('message', '')}".rstrip(": ")
+    return f"{problem}; {_LOAD_IMAGE}" if waiting["reason"] in _NO_IMAGE else problem
 
 
 def _last_line_first(output: str) -> str:

@@ -65,8 +65,9 @@ def choose_plan(
         InvalidObject: The Application contradicts itself.
     """
     if in_flight is not None:
-        # The services check every call of an Application in flight. A policy conflict must not take its drone away.
-        settings = replace(settings, policy_conflicts="warn")
+        # The services check every call of an Application in flight. Neither a policy conflict nor a gateway that will be removed
+        # after the landing must take its drone away.
+        settings = replace(settings, policy_conflicts="warn", gateway=True)
     reason = replan_reason(application, previous, inventory, stuck, in_flight)
     if reason is None and settings.policy_conflicts == "forbid" and _conflict(previous) is not None:
         reason = "PolicyConflict"

@@ -50,14 +50,27 @@ class Rollout:
     so that a webhook that does not respond to other kinds does not delay a revocation. The Secret of a new Deployment comes before
     it, because its pod could not mount a missing Secret.
 
+    Args:
+        objects: Writes the child objects.
+        cache: Observed objects.
+        authority: Signs the certificates of instances.
+        clock: Returns the current time.
+        gateway_image: Image of the sidecar of MAVLink programs.
+
     Attributes:
         in_progress: Number of Applications that are being rolled out.
     """
 
     def __init__(
-        self, objects: ChildObjects, cache: ClusterCache, authority: Authority, clock: Callable[[], datetime]
+        self,
+        objects: ChildObjects,
+        cache: ClusterCache,
+        authority: Authority,
+        clock: Callable[[], datetime],
+        gateway_image: str,
     ) -> None:
         self._objects = objects
+        self._gateway_image = gateway_image
         self._cache = cache
         self._certificates = Certificates(authority, clock)
         self.in_progress = 0
@@ -86,7 +99,7 @@ class Rollout:
             NameTaken: An object of another owner has the name of a child object.
             KubeError: The API server refused an object, or could not be reached.
         """
-        desired = children(application, plan, grants, pods, self._cache.drone)
+        desired = children(application, plan, grants, pods, self._cache.drone, gateway_image=self._gateway_image)
         desired[kinds.DIRECT_LINK] = self._links(application, plan, pods)
         certificates = self._certificates_of(application, plan, pods)
         for body in desired[kinds.DEPLOYMENT]:

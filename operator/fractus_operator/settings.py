@@ -29,6 +29,7 @@ _TEXTS = {
     "agent_account": "FRACTUS_AGENT_ACCOUNT",
     "identity": "FRACTUS_IDENTITY",
     "health": "FRACTUS_HEALTH",
+    "gateway_image": "FRACTUS_GATEWAY_IMAGE",
 }
 """Environment variables of the settings that are strings."""
 
@@ -58,6 +59,8 @@ class Settings:
         log_level: Minimum level of log lines.
         log_format: Format of log lines, text or json.
         planning: Settings of planning.
+        gateway_image: Image of the sidecar that connects a MAVLink program to the gateway of its drone. Empty if the drones
+            have no gateway.
     """
 
     namespace: str = "fractus-system"
@@ -69,6 +72,7 @@ class Settings:
     log_level: int = logging.INFO
     log_format: str = "text"
     planning: PlanningSettings = field(default_factory=PlanningSettings)
+    gateway_image: str = ""
 
     @property
     def agent_users(self) -> frozenset[str]:
@@ -78,7 +82,7 @@ class Settings:
 
     @classmethod
     def from_environment(cls, environment: Mapping[str, str]) -> Settings:
-        """Read FRACTUS_SYSTEM_NAMESPACE, FRACTUS_AGENT_ACCOUNT, FRACTUS_HEALTH, FRACTUS_IDENTITY, FRACTUS_LEASE, FRACTUS_METRICS_PORT, FRACTUS_LOG_LEVEL, FRACTUS_LOG_FORMAT and the FRACTUS_PLANNING_*.
+        """Read FRACTUS_SYSTEM_NAMESPACE, FRACTUS_AGENT_ACCOUNT, FRACTUS_HEALTH, FRACTUS_IDENTITY, FRACTUS_LEASE, FRACTUS_GATEWAY_IMAGE, FRACTUS_METRICS_PORT, FRACTUS_LOG_LEVEL, FRACTUS_LOG_FORMAT and the FRACTUS_PLANNING_*.
 
         Raises:
             BadSetting: A variable is invalid. The message names it.
@@ -94,6 +98,7 @@ class Settings:
             cover=_plugin(environment, "FRACTUS_PLANNING_COVERING"),
             policy_conflicts=_policy_conflicts(environment, "FRACTUS_PLANNING_POLICY_CONFLICTS"),
             flat_terrain=environment.get("FRACTUS_PLANNING_FLAT_TERRAIN") == "true",
+            gateway=bool(environment.get("FRACTUS_GATEWAY_IMAGE")),
         )
         for name, variable in _PLANNING.items():
             change: dict[str, Any] = {name: _number(environment, variable, getattr(planning, name))}

@@ -206,15 +206,19 @@ def remove_file(path: Path) -> bool:
 def write_set(directory: Path, files: Mapping[str, bytes], mode: int = 0o600) -> None:
     """Replace a set of files atomically.
 
-    Each name is a symbolic link through `..data`. Replacing that link changes all files at once.
+    Each name is a symbolic link through `..data`. Replacing that link changes all files at once. If the directory has the
+    set-group-ID bit, its owner shares the files with its group, so the group may read them.
 
     Raises:
         OSError: The disk is full, read-only or missing. The old set is unchanged.
     """
     directory.mkdir(parents=True, exist_ok=True)
+    shared = bool(directory.stat().st_mode & stat.S_ISGID)
+    if shared:
+        mode |= stat.S_IRGRP
     fresh = directory / f"..{uuid.uuid4().hex}"
     try:
-        fresh.mkdir(mode=0o700)
+        fresh.mkdir(mode=0o750 if shared else 0o700)
         for name, content in files.items():
             _write_new(fresh / name, content, mode)
         _sync_directory(fresh)

@@ -219,6 +219,12 @@ def mobility() -> None:
     type=FILE,
     help="Unix socket for `fractus gateway serve` (docs/mavlink-gateway.md). Without it there is no MAVLink interface.",
 )
+@click.option(
+    "--gateway-user",
+    type=click.IntRange(min=1),
+    help="Id of the user that runs the gateway, if it is another user. The directory of the socket must belong to a group of"
+    " this user and have the set-group-ID bit.",
+)
 @click.option("--verbose", "-v", is_flag=True, help="Log more.")
 def serve_mobility(verbose: bool, **options: Any) -> None:
     """Serve until stopped. Waits for certificates and for the autopilot."""

@@ -64,3 +64,4 @@ class MobilityOptions(ServiceOptions):
     boarding: float
     flat_terrain: bool
     gateway_socket: Path | None = None
+    gateway_user: int | None = None

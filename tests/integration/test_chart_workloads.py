@@ -230,3 +230,21 @@ def test_operator_network_policy_opens_exactly_its_ports() -> None:
     (rule,) = policy["spec"]["ingress"]
     (container,) = pod["spec"]["containers"]
     assert {port["port"] for port in rule["ports"]} == {port["name"] for port in container["ports"]}
+
+
+def test_gateway_has_neither_root_nor_the_files_and_devices_of_the_mobility_service() -> None:
+    assert "initContainers" not in templates()["mobility"]["spec"]
+    template = templates("--set=gateway.enabled=true,mobility.privileged=true")["mobility"]["spec"]
+    mobility, gateway = template["containers"]
+    assert (mobility["name"], gateway["name"]) == ("mobility", "gateway")
+    security = gateway["securityContext"]
+    assert security["runAsNonRoot"]
+    assert security["readOnlyRootFilesystem"]
+    assert security["capabilities"] == {"drop": ["ALL"]}
+    paths = {mount["mountPath"]: mount.get("readOnly", False) for mount in gateway["volumeMounts"]}
+    state = "/var/lib/fractus"
+    assert paths == {"/run/fractus": False, "/tmp": False, f"{state}/tls": True, f"{state}/gateway": False}
+    options = dict(zip(mobility["args"], mobility["args"][1:], strict=False))
+    assert options["--gateway-socket"] == "/run/fractus/gateway.sock"
+    assert options["--gateway-user"] == str(security["runAsUser"])
+    assert template["securityContext"]["fsGroup"] == security["runAsGroup"]

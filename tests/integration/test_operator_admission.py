@@ -348,6 +348,23 @@ _MADE = {
 }
 
 
+_RESTRICTED = {"allowPrivilegeEscalation": False, "capabilities": {"drop": ["ALL"]}, "readOnlyRootFilesystem": True}
+_COMMAND = {"exec": {"command": ["true"]}}
+_SIDECAR: dict[str, Any] = {
+    "name": "fractus-mavlink",
+    "image": "registry.test/mobility:1",
+    "restartPolicy": "Always",
+    "startupProbe": _COMMAND,
+    "securityContext": _RESTRICTED,
+}
+_PRIVILEGED_SIDECARS: tuple[dict[str, Any], ...] = (
+    _SIDECAR | {"name": "first"},
+    {"name": "fractus-mavlink", "image": "registry.test/mobility:1", "securityContext": _RESTRICTED},
+    _SIDECAR | {"securityContext": {}},
+    _SIDECAR | {"ports": [{"containerPort": 1, "hostPort": 1}]},
+)
+
+
 def test_operator_token_cannot_escalate_with_pods_or_secrets(
     control_plane: ControlPlane, world: World, chart: None, namespace: str
 ) -> None:
@@ -355,7 +372,7 @@ def test_operator_token_cannot_escalate_with_pods_or_secrets(
     client = control_plane.with_token(operator_token(world))
     mine = {"app.kubernetes.io/managed-by": "fractus"}
 
-    restricted = {"allowPrivilegeEscalation": False, "capabilities": {"drop": ["ALL"]}, "readOnlyRootFilesystem": True}
+    restricted = _RESTRICTED
 
     def deployment(place: str = namespace, container: dict[str, Any] | None = None, **pod: Any) -> Callable[[], object]:
         main = {"name": "main", "image": "registry.test/theirs:1", "securityContext": restricted} | (container or {})
@@ -407,8 +424,11 @@ def test_operator_token_cannot_escalate_with_pods_or_secrets(
             {"volumes": [token]},
         ):
             denied(deployment(**pod), "do not share resources of the node")
-        for pod in ({"securityContext": root}, {"initContainers": [{"name": "first", "image": "x"}]}):
+        deployment(initContainers=[_SIDECAR])()
+        for pod in ({"securityContext": root}, *({"initContainers": [s]} for s in _PRIVILEGED_SIDECARS)):
             denied(deployment(**pod), "one unprivileged container")
+        for probe in ({"startupProbe": {"tcpSocket": {"port": 1}}}, {"lifecycle": {"postStart": _COMMAND}}):
+            denied(deployment(initContainers=[_SIDECAR | probe]), "without probes and hooks")
         for spec_change in (
             {"privileged": True},
             {"allowPrivilegeEscalation": False},

@@ -161,6 +161,11 @@ async def test_checkpoint_of_a_node_status_is_accepted(tmp_path: Path, tls: Path
     (path.parent / "odd.checkpoint").write_bytes(b"{")
     (path.parent / "other.checkpoint").write_text(json.dumps({"log": "a b", "seq": 1, "hash": "0" * 64}))
     assert read_audit_heads(path.parent) == [head]
+    await filled(tmp_path / "gateway" / "gateway.jsonl", 2, tls=tls)
+    assert [h.split(":")[:2] for h in read_audit_heads(path.parent, tmp_path / "gateway")] == [
+        ["audit", "4"],
+        ["gateway", "2"],
+    ]
     code, output = verified(path, "--since", head)
     assert (code, "complete since entry 4" in output, "signed" in output) == (0, True, False)
     path.write_bytes(b"".join(read(path)[:3]))

@@ -104,3 +104,10 @@ def test_write_set_leaves_no_copy_of_a_key_on_a_full_disk(
     assert read_set(tmp_path, names) == dict.fromkeys(names, b"new")
     assert len([path for path in tmp_path.iterdir() if path.is_dir() and not path.is_symlink()]) == 1
     assert (tmp_path / "tls.key").stat().st_mode & 0o777 == 0o600
+
+
+def test_write_set_lets_the_group_of_a_shared_directory_read(tmp_path: Path) -> None:
+    tmp_path.chmod(0o2755)
+    write_set(tmp_path, {"tls.key": b"key"})
+    assert (tmp_path / "tls.key").stat().st_mode & 0o777 == 0o640
+    assert (tmp_path / "tls.key").resolve().parent.stat().st_mode & 0o777 == 0o750

@@ -563,6 +563,9 @@ def test_only_no_execute_taint_guards_node(key: str, effect: str, guarded: bool)
 def test_settings_come_from_the_environment() -> None:
     settings = Settings.from_environment({"FRACTUS_PLANNING_SAFETY_RADIUS": "9.5", "FRACTUS_LOG_LEVEL": "debug"})
     assert (settings.planning.safety_radius_m, settings.log_level) == (9.5, 10)
+    assert (settings.gateway_image, settings.planning.gateway) == ("", False)
+    settings = Settings.from_environment({"FRACTUS_GATEWAY_IMAGE": "registry.test/mobility:1"})
+    assert (settings.gateway_image, settings.planning.gateway) == ("registry.test/mobility:1", True)
     assert settings.agent_users == {f"system:serviceaccount:fractus-system:fractus-{n}" for n in ("agent", "node")}
 
 

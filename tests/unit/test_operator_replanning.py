@@ -38,6 +38,20 @@ def plan() -> DeploymentPlanSpec:
     return first.plan
 
 
+def test_mavlink_component_needs_a_gateway_unless_its_drone_is_in_flight() -> None:
+    over_mavlink = navigator(PATH)
+    over_mavlink["services"] = [s | {"interfaces": ["mavlink"]} for s in over_mavlink["services"]]
+    program = application(over_mavlink)
+    with_gateway = Settings()
+    without_gateway = Settings(gateway=False)
+    with pytest.raises(Infeasible, match=r"Navigator uses the interface mavlink.*set gateway\.enabled=true") as raised:
+        choose_plan(program, None, TWO, without_gateway, stuck={}, in_flight=None)
+    assert raised.value.reason == "NoGateway"
+    flown = choose_plan(program, None, TWO, with_gateway, stuck={}, in_flight=None).plan
+    choose_plan(program, flown, without("two"), without_gateway, stuck={}, in_flight="one")
+    assert choose_plan(APPLICATION, None, TWO, without_gateway, stuck={}, in_flight=None).plan.drone is not None
+
+
 def without(name: str) -> Inventory:
     hosts = {other: value for other, value in TWO.hosts.items() if other != name}
     drones = {other: value for other, value in TWO.drones.items() if other != name}

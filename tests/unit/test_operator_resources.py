@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import os
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ from fractus_core.api import Application, Drone
 from fractus_core.api.grants import ApplicationReference, GrantSpec
 from fractus_core.api.plans import DeploymentPlanSpec
 from fractus_operator import kinds
-from fractus_operator.pods import PodView
+from fractus_operator.pods import PodView, parse_pod
 from fractus_operator.resources.children import children, deployment_plan
 from fractus_operator.resources.deployment import deployment
 from fractus_operator.resources.grant import grant
@@ -24,6 +25,18 @@ INPUT = yaml.safe_load((GOLDEN / "input.yaml").read_text())
 APPLICATION = Application.from_body(INPUT["application"])
 PLAN = DeploymentPlanSpec.model_validate(INPUT["plan"])
 DRONE = Drone.from_body(INPUT["drone"])
+
+
+def _over_mavlink() -> Application:
+    """Return the Application with a Navigator that is a MAVLink program."""
+    body = copy.deepcopy(INPUT["application"])
+    navigator = next(c for c in body["spec"]["components"] if c["name"] == "Navigator")
+    used = next(s for s in navigator["services"] if s["service"] == "mobility")
+    used["interfaces"] = ["mavlink"]
+    return Application.from_body(body)
+
+
+MAVLINK = _over_mavlink()
 
 
 def pod(name: str, ip: str | None, *, ready: bool = True, terminating: bool = False) -> PodView:
@@ -47,6 +60,7 @@ def built() -> dict[str, Any]:
         for name, p in placed.items()
     }
     return objects | {
+        "deployment-mavlink": deployment(MAVLINK, placed["traffic-navigator"], DRONE, "registry.test/mobility:1"),
         "plan": deployment_plan(APPLICATION, PLAN),
         "grant": grant(APPLICATION, spec),
         "secret": tls_secret(APPLICATION, placed["traffic-navigator"], data),
@@ -117,3 +131,15 @@ def test_disruption_budget_protects_all_instances_on_drone_without_their_control
     assert budget["spec"]["minAvailable"] == len(on_drone) > 0
     # Kubernetes looks up controllers, which kept pods do not have, for maxUnavailable and for percentages.
     assert "maxUnavailable" not in budget["spec"]
+
+
+def test_only_components_with_the_interface_mavlink_get_a_sidecar() -> None:
+    for placed in PLAN.placements:
+        pod_spec = deployment(MAVLINK, placed, None, "registry.test/mobility:1")["spec"]["template"]["spec"]
+        assert ("initContainers" in pod_spec) == (placed.component == "Navigator")
+
+
+def test_sidecar_that_cannot_start_is_the_problem_of_its_pod() -> None:
+    waiting = {"state": {"waiting": {"reason": "ErrImagePull", "message": "not found"}}}
+    body = {"metadata": {"namespace": "city", "name": "a"}, "spec": {}, "status": {"initContainerStatuses": [waiting]}}
+    assert parse_pod(body).failure.startswith("fractus-mavlink: ErrImagePull: not found; push the image")

@@ -13,10 +13,10 @@ MAX_PROBLEM_BYTES = 500
 _MAX_BYTES = 64 * 1024
 
 
-def read_audit_heads(directory: Path) -> list[str]:
+def read_audit_heads(*directories: Path) -> list[str]:
     """Return LOG:NUMBER:HASH of each log's latest checkpoint, for `fractus audit verify --since`. Skip invalid files."""
     heads = []
-    for path in sorted(directory.glob("*.checkpoint")):
+    for path in sorted(path for directory in directories for path in directory.glob("*.checkpoint")):
         try:
             checkpoint = read_json(path, _MAX_BYTES)
             head = f"{checkpoint['log']}:{checkpoint['seq']}:{checkpoint['hash']}"

@@ -109,6 +109,17 @@ seccompProfile: {type: RuntimeDefault}
 {{- end }}
 {{- end }}
 
+{{/* Security context of the gateway's user. */}}
+{{- define "fractus.gatewaySecurity" -}}
+runAsUser: 10002
+runAsGroup: 10002
+runAsNonRoot: true
+allowPrivilegeEscalation: false
+readOnlyRootFilesystem: true
+capabilities: {drop: [ALL]}
+seccompProfile: {type: RuntimeDefault}
+{{- end }}
+
 {{/* CEL: true if a pod may run on drones and edge nodes. Argument: name of the variable that holds the pod. */}}
 {{- define "fractus.tolerates" -}}
 {{ . }}.spec.?tolerations.orValue([]).exists(t, t.?key.orValue("") in ["", "fractus.dev/class"])

@@ -632,5 +632,10 @@ class Component(Model):
     def _driver_moves(self) -> Violation:
         return "services" if self.class_ == "driver" and not self._uses("mobility") else None
 
+    @property
+    def uses_mavlink(self) -> bool:
+        """True if the component calls a service over MAVLink, through the gateway of its drone."""
+        return any("mavlink" in service.interfaces for service in self.services)
+
     def _uses(self, service: Service) -> bool:
         return any(s.service == service for s in self.services)

@@ -147,6 +147,7 @@ class Settings:
         policy_conflicts: Handling of a mission whose route the policies allow for no drone: `warn` plans it with a warning,
             `forbid` does not plan it.
         flat_terrain: True to assume terrain level with home everywhere, as in the mobility service.
+        gateway: False if the drones have no gateway for MAVLink programs.
         score_drone: Replacement for the ranking of drones.
         cover: Replacement for the selection of nodes that cover the operation area.
     """
@@ -164,6 +165,7 @@ class Settings:
     time_s: float | None = None
     policy_conflicts: PolicyConflicts = "warn"
     flat_terrain: bool = False
+    gateway: bool = True
     score_drone: DroneScore | None = None
     cover: CoverStrategy | None = None
 

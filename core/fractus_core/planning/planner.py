@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator
+from collections.abc import Generator, Iterable
 from typing import assert_never
 
 from fractus_core.api.applications import Application
@@ -90,6 +90,8 @@ def plan_in_steps(
 def _plan_once(builder: PlanBuilder) -> Generator[str, None, DeploymentPlanSpec]:
     application = builder.application
     inventory = builder.inventory
+    if not builder.settings.gateway:
+        _check_gateway_not_needed(builder.spec.components)
     area = operation_area(builder.spec, inventory.depots, builder.settings.safety_radius_m)
     yield "area"
     choice: DroneChoice | None = None
@@ -130,6 +132,21 @@ def _plan_once(builder: PlanBuilder) -> Generator[str, None, DeploymentPlanSpec]
     )
     yield "report"
     return result
+
+
+def _check_gateway_not_needed(components: Iterable[Component]) -> None:
+    """Check that no component needs a gateway.
+
+    Raises:
+        Infeasible: A component uses the interface mavlink.
+    """
+    for component in components:
+        if component.uses_mavlink:
+            message = (
+                f"{component.name} uses the interface mavlink, but the drones have no gateway;"
+                " set gateway.enabled=true in the values of the chart fractus"
+            )
+            raise Infeasible(component.name, "NoGateway", message)
 
 
 def _place_hybrid(

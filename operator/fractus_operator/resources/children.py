@@ -24,6 +24,8 @@ def children(
     grants: Iterable[GrantSpec],
     pods: Sequence[PodView],
     drone: Callable[[str], Drone | None],
+    *,
+    gateway_image: str = "",
 ) -> dict[Kind, list[Body]]:
     """Return the desired child objects by kind, except DirectLinks and Secrets.
 
@@ -35,6 +37,7 @@ def children(
         grants: Grants of its instances.
         pods: Its current pods.
         drone: Returns the Drone of a name, or None.
+        gateway_image: Image of the sidecar of MAVLink programs.
     """
     desired: dict[Kind, list[Body]] = {kind: [] for kind in kinds.CHILDREN}
     desired[kinds.DEPLOYMENT_PLAN] = [deployment_plan(application, plan)]
@@ -55,7 +58,7 @@ def children(
         desired[kinds.DISRUPTION_BUDGET] = [owned_object(kinds.DISRUPTION_BUDGET, application, name, {}, spec=budget)]
     for placed in plan.placements:
         node = drone(placed.node) if placed.node is not None else None
-        desired[kinds.DEPLOYMENT].append(deployment(application, placed, node))
+        desired[kinds.DEPLOYMENT].append(deployment(application, placed, node, gateway_image))
     return desired
 
 

@@ -20,7 +20,13 @@ MOBILITY_PORT = 50051
 CAMERA_PORT = 50052
 
 
-def deployment(application: Application, placed: PlannedInstance, drone: Drone | None = None) -> Body:
+GATEWAY_PORT = 50053
+_MAVLINK_PORT = 5760
+
+
+def deployment(
+    application: Application, placed: PlannedInstance, drone: Drone | None = None, gateway_image: str = ""
+) -> Body:
     """Return the Deployment of a planned instance. A required node affinity binds its pods to the planned node.
 
     Args:
@@ -28,6 +34,7 @@ def deployment(application: Application, placed: PlannedInstance, drone: Drone |
         placed: The planned instance.
         drone: Drone of the planned node, if the node is a drone. Its spec.autonomy is the time for which pods tolerate
             a lost link to the node.
+        gateway_image: Image of the sidecar, for a component that uses the interface mavlink.
     """
     component = application.spec.component(placed.component)
     identity = {labels.APPLICATION_LABEL: label_value(application.name), labels.INSTANCE_LABEL: placed.instance}
@@ -47,7 +54,7 @@ def deployment(application: Application, placed: PlannedInstance, drone: Drone |
                 "labels": {**application_labels(application), **instance_labels},
                 "annotations": {"kubectl.kubernetes.io/default-container": component.slug},
             },
-            "spec": _pod_spec(application, component, placed, drone),
+            "spec": _pod_spec(application, component, placed, drone, gateway_image),
         },
     }
     body = owned_object(kinds.DEPLOYMENT, application, placed.instance, instance_labels, spec=spec)
@@ -63,7 +70,9 @@ def deployment(application: Application, placed: PlannedInstance, drone: Drone |
     return body
 
 
-def _pod_spec(application: Application, component: Component, placed: PlannedInstance, drone: Drone | None) -> Body:
+def _pod_spec(
+    application: Application, component: Component, placed: PlannedInstance, drone: Drone | None, gateway_image: str
+) -> Body:
     container = component.container
     spec: Body = {
         "automountServiceAccountToken": False,
@@ -89,13 +98,9 @@ def _pod_spec(application: Application, component: Component, placed: PlannedIns
                 "env": _environment(application, component, placed),
                 "resources": container.resources.to_dict(),
                 "terminationMessagePolicy": "FallbackToLogsOnError",
-                "securityContext": {
-                    "allowPrivilegeEscalation": False,
-                    "capabilities": {"drop": ["ALL"]},
-                    "readOnlyRootFilesystem": True,
-                },
+                "securityContext": _restricted(),
                 "volumeMounts": [
-                    {"name": "tls", "mountPath": TLS_DIR, "readOnly": True},
+                    _tls_mount(),
                     {"name": "tmp", "mountPath": TMP_DIR},
                     *(volume.mount() for volume in container.volumes),
                 ],
@@ -109,14 +114,48 @@ def _pod_spec(application: Application, component: Component, placed: PlannedIns
         main["args"] = list(container.args)
     if container.ports:
         main["ports"] = [{"name": p.label, "containerPort": p.port, "protocol": p.protocol} for p in container.ports]
+    if component.uses_mavlink and gateway_image:
+        spec["initContainers"] = [_sidecar(gateway_image)]
     return spec
+
+
+def _sidecar(image: str) -> Body:
+    """Return the sidecar of a MAVLink program. The program starts when the sidecar listens on its ports."""
+    connect = f"import socket; socket.create_connection(('127.0.0.1', {_MAVLINK_PORT}))"
+    return {
+        "name": labels.SIDECAR,
+        "image": image,
+        "restartPolicy": "Always",
+        "command": ["fractus", "gateway", "connect", "--gateway", f"$(FRACTUS_HOST_IP):{GATEWAY_PORT}"],
+        "env": [*_node_environment(), {"name": "FRACTUS_TLS_DIR", "value": TLS_DIR}],
+        "resources": {"requests": {"cpu": "10m", "memory": "32Mi"}, "limits": {"memory": "128Mi"}},
+        # A probe of the type tcpSocket would connect to the address of the pod, but the sidecar listens on the loopback interface.
+        "startupProbe": {"exec": {"command": ["python3", "-c", connect]}, "periodSeconds": 1, "failureThreshold": 60},
+        "terminationMessagePolicy": "FallbackToLogsOnError",
+        "securityContext": _restricted(),
+        "volumeMounts": [_tls_mount()],
+    }
+
+
+def _restricted() -> Body:
+    return {"allowPrivilegeEscalation": False, "capabilities": {"drop": ["ALL"]}, "readOnlyRootFilesystem": True}
+
+
+def _tls_mount() -> Body:
+    return {"name": "tls", "mountPath": TLS_DIR, "readOnly": True}
+
+
+def _node_environment() -> list[Body]:
+    return [
+        {"name": "FRACTUS_NODE", "valueFrom": {"fieldRef": {"apiVersion": "v1", "fieldPath": "spec.nodeName"}}},
+        {"name": "FRACTUS_HOST_IP", "valueFrom": {"fieldRef": {"apiVersion": "v1", "fieldPath": "status.hostIP"}}},
+    ]
 
 
 def _environment(application: Application, component: Component, placed: PlannedInstance) -> list[Body]:
     namespace, name = application.key
     env: list[Body] = [
-        {"name": "FRACTUS_NODE", "valueFrom": {"fieldRef": {"apiVersion": "v1", "fieldPath": "spec.nodeName"}}},
-        {"name": "FRACTUS_HOST_IP", "valueFrom": {"fieldRef": {"apiVersion": "v1", "fieldPath": "status.hostIP"}}},
+        *_node_environment(),
         {"name": "FRACTUS_NAMESPACE", "value": namespace},
         {"name": "FRACTUS_APPLICATION", "value": name},
         {"name": "FRACTUS_COMPONENT", "value": component.name},

@@ -1,7 +1,7 @@
 """Unix socket for the MAVLink gateway: a second transport of the handlers, without gRPC.
 
 The gateway authenticates instances by TLS and sends the certificate of each instance. This process trusts the gateway
-to do so. It accepts only connections of its own user or root.
+to do so. It accepts only connections of its own user, root, and the user of the gateway.
 """
 
 from __future__ import annotations
@@ -128,12 +128,21 @@ class GatewaySocket:
         handlers: Handlers of the mobility service for the interface `mavlink`.
         vehicle: Messages and parameters of the vehicle.
         delivered: Names of the vehicle's messages that applications may receive.
+        user: Id of the gateway's user, if it is another one. The group of the socket's directory must be a group of this
+            user, and the directory must have the set-group-ID bit.
     """
 
     def __init__(
-        self, path: Path, handlers: MobilityHandlers, vehicle: VehicleMessages, delivered: tuple[str, ...]
+        self,
+        path: Path,
+        handlers: MobilityHandlers,
+        vehicle: VehicleMessages,
+        delivered: tuple[str, ...],
+        user: int | None = None,
     ) -> None:
         self._path = path
+        self._users = {0, os.getuid()} if user is None else {0, os.getuid(), user}
+        self._mode = 0o600 if user is None else 0o660
         self._handlers = handlers
         self._vehicle = vehicle
         self._delivered = delivered
@@ -150,7 +159,7 @@ class GatewaySocket:
             if self._path.is_socket():  # left by an earlier process
                 self._path.unlink()
             server = await asyncio.start_unix_server(self._serve, self._path)
-            self._path.chmod(0o600)
+            self._path.chmod(self._mode)
         except OSError as error:
             raise CannotServe(
                 f"--gateway-socket {self._path}: cannot listen ({error.strerror}); name a file that does not exist, in an existing directory"
@@ -173,10 +182,8 @@ class GatewaySocket:
         self._connections.add(task)
         try:
             uid = _peer_uid(writer)
-            if uid not in {0, os.getuid()}:
-                log.warning(
-                    "gateway: connection refused, only the user of this service may use the socket (uid=%d)", uid
-                )
+            if uid not in self._users:
+                log.warning("gateway: connection refused, this user may not use the socket (uid=%d)", uid)
                 return
             await _Connection(reader, writer, self._handlers, self._vehicle, self._delivered).run()
         except (asyncio.IncompleteReadError, ConnectionError, DecodeError) as error:

@@ -188,7 +188,11 @@ async def run(options: MobilityOptions, stop: asyncio.Event) -> None:
     running = [autopilot.run(), grants.run(), monitor.run(), monitor.record(), poi_missions.run(), calls]
     if options.gateway_socket is not None:
         gateway = GatewaySocket(
-            options.gateway_socket, create_handlers(interface="mavlink"), autopilot, DECISIONS.delivered
+            options.gateway_socket,
+            create_handlers(interface="mavlink"),
+            autopilot,
+            DECISIONS.delivered,
+            options.gateway_user,
         )
         running.append(gateway.run())
     running.append(_watch_description(description, url, identified, fixed_link=bool(options.autopilot)))

@@ -16,7 +16,7 @@ from fractus_core.api import KINDS, Application, Depot, EdgeNode, InvalidObject,
 from fractus_core.api.crd import crd
 from fractus_core.api.names import CLASS_LABEL as CLASS
 from fractus_core.api.names import CLOUD_LABEL
-from fractus_core.plausibility import edge_node_notes, policy_notes, zone_notes
+from fractus_core import plausibility
 
 from fractus_cli.cluster_reader import (
     EXIT_PROBLEM,
@@ -408,21 +408,17 @@ def _policies(cluster: ClusterReader) -> Iterator[Finding]:
                 yield Finding(
                     "error", "policies", f"{name}: {ready.get('message')}", f"correct it: kubectl edit {name}"
                 )
-    for note in _notes(cluster):
+    notes = plausibility.notes(
+        depots=list(_valid(cluster, Depot)),
+        zones=list(_valid(cluster, Zone)),
+        edge_nodes=_valid(cluster, EdgeNode),
+        policies=_valid(cluster, Policy),
+        applications=list(_valid(cluster, Application)),
+    )
+    for note in notes:
         yield Finding("warning", "policies", note, "correct the object if this is a mistake")
     if not cluster.list(f"{GROUP}/depots"):
         yield Finding("warning", "depots", "there is no Depot", "apply a Depot, the base of drones (see examples)")
-
-
-def _notes(cluster: ClusterReader) -> Iterator[str]:
-    depots = list(_valid(cluster, Depot))
-    applications = list(_valid(cluster, Application))
-    for zone in _valid(cluster, Zone):
-        yield from zone_notes(zone, depots)
-    for edge_node in _valid(cluster, EdgeNode):
-        yield from edge_node_notes(edge_node, depots)
-    for policy in _valid(cluster, Policy):
-        yield from policy_notes(policy, applications)
 
 
 def _valid(cluster: ClusterReader, kind: type[R]) -> Iterator[R]:

@@ -8,11 +8,16 @@ from typing import Any
 
 import click
 
+from fractus_core.api import InvalidObject, Policy
+from fractus_core.api.grants import ApplicationReference
+from fractus_core.policy.selectors import policy_applies
+
 from fractus_cli.cluster_reader import (
     EXIT_PROBLEM,
     GROUP,
     Body,
     ClusterReader,
+    conditions_of,
     get_application,
     kubeconfig_option,
     open_cluster,
@@ -59,6 +64,7 @@ def collect(cluster: ClusterReader, namespace: str, name: str) -> dict[str, Any]
         for grant in listed or ()
         if (grant["spec"]["application"]["namespace"], grant["spec"]["application"]["name"]) == (namespace, name)
     ]
+    policies = cluster.list_permitted(f"{GROUP}/policies")
     events = cluster.list(
         f"/api/v1/namespaces/{namespace}/events",
         fieldSelector=f"involvedObject.kind=Application,involvedObject.name={name}",
@@ -89,8 +95,9 @@ def collect(cluster: ClusterReader, namespace: str, name: str) -> dict[str, Any]
             ]
             for grant in sorted(grants, key=lambda grant: str(grant["instance"]))
         },
+        "notes": list(_notes(body, policies or ())),
         "contactLost": (body.get("spec") or {}).get("contactLost"),
-        "forbidden": ["grants"] if listed is None else [],
+        "forbidden": [kind for kind, known in (("grants", listed), ("policies", policies)) if known is None],
         "events": [
             {k: event.get(k) for k in ("lastTimestamp", "type", "reason", "message")}
             for event in sorted(events, key=lambda event: str(event.get("lastTimestamp")), reverse=True)
@@ -118,6 +125,7 @@ def lines(summary: dict[str, Any], limit: int | None) -> Iterator[str]:
         yield from _placement(placement)
     yield from _rejections(summary, limit)
     yield from _policies(summary["policies"])
+    yield from summary["notes"]
     if summary["contactLost"]:
         yield _contact_lost(summary["contactLost"])
     if summary["forbidden"]:
@@ -182,6 +190,24 @@ def _policies(policies: dict[str, Sequence[Body]]) -> Iterator[str]:
         yield f"Policies for {instance}: " + (
             "; ".join(f"{p['name']} ({p['type']}{_scope(p['zones'])}{_action(p)})" for p in granted) or "none"
         )
+
+
+def _notes(application: Body, policies: Sequence[Body]) -> Iterator[str]:
+    """Yield a sentence for each policy of an application whose zones are far from every depot."""
+    for policy in policies:
+        far = conditions_of(policy).get("FarFromDepots")
+        if far is not None and _selects(policy, application):
+            yield f"Policy {policy['metadata']['name']}: {far.get('message')}"
+
+
+def _selects(policy: Body, application: Body) -> bool:
+    metadata = application["metadata"]
+    owner = ApplicationReference(name=metadata["name"], namespace=metadata["namespace"], uid=metadata.get("uid", ""))
+    try:
+        spec = Policy.from_body(policy).spec
+    except InvalidObject:  # its condition Ready reports the problem
+        return False
+    return any(policy_applies(spec, owner, component["name"], {}) for component in application["spec"]["components"])
 
 
 def _action(policy: Body) -> str:

@@ -31,7 +31,7 @@ from fractus_core.api.nodes import DroneStatus
 from fractus_core.documents import MAX_BYTES, BadDocument, Documents, parse_documents
 from fractus_core.planning import Host, Inventory
 from fractus_core.planning.inventory import amount_of
-from fractus_core.plausibility import edge_node_notes, policy_notes, zone_notes
+from fractus_core import plausibility
 from fractus_core.validation import check_policy, check_zone
 from fractus_runtime import files
 
@@ -110,14 +110,13 @@ class Manifests:
 
     def notes(self) -> Iterator[str]:
         """Yield notes about valid objects that are probably mistakes."""
-        depots = self.of(Depot).values()
-        applications = self.applications()
-        for zone in self.of(Zone).values():
-            yield from zone_notes(zone, depots)
-        for edge_node in self.of(EdgeNode).values():
-            yield from edge_node_notes(edge_node, depots)
-        for policy in self.of(Policy).values():
-            yield from policy_notes(policy, applications)
+        return plausibility.notes(
+            depots=self.of(Depot).values(),
+            zones=self.of(Zone).values(),
+            edge_nodes=self.of(EdgeNode).values(),
+            policies=self.of(Policy).values(),
+            applications=self.applications(),
+        )
 
     def previous(self, application: Application) -> DeploymentPlan | None:
         """Return the current plan of an Application if the manifests contain it."""

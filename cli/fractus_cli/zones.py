@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import functools
 import pathlib
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Iterator
 
 import click
-from fractus_core.api import InvalidObject, Zone
+from fractus_core.api import Depot, InvalidObject, Zone
 from fractus_core.documents import BadDocument, dump_documents, parse_documents
-from fractus_core.geo import formats
+from fractus_core.geo import area_center, formats
+from fractus_core.plausibility import far_zones
 from fractus_core.validation import check_zone
 
 from fractus_cli.manifests import BadManifest, read_file, read_manifests
@@ -48,11 +49,23 @@ def zones() -> None:
 @click.option("--prefix", default="", help="Prefix for the names of all Zones.")
 @click.option("--leave-out", "without", multiple=True, metavar="NAME", help="Feature or Zone to skip. May be repeated.")
 @click.option("--drop", multiple=True, metavar="PROPERTY", help="Property to ignore. May be repeated.")
-def import_(file: pathlib.Path, source: str, prefix: str, without: tuple[str, ...], drop: tuple[str, ...]) -> None:
+@click.option(
+    "--depots", "depots", type=click.Path(exists=True, path_type=pathlib.Path), multiple=True,
+    help="File or directory with Depots: report zones that are far from all of them. May be repeated.",
+)
+def import_(
+    file: pathlib.Path,
+    source: str,
+    *,
+    prefix: str,
+    without: tuple[str, ...],
+    drop: tuple[str, ...],
+    depots: tuple[pathlib.Path, ...],
+) -> None:
     """Print a Zone manifest for each zone in a file.
 
     A feature is rejected if a Zone cannot represent its area, altitudes or schedule exactly. Correct it, or skip it with
-    --leave-out. Other properties that cannot be converted are listed on standard error. A property that may state a size,
+    --leave-out. The location of the zones is printed on standard error. Other properties that cannot be converted are listed on standard error. A property that may state a size,
     an altitude or a time is rejected unless it is ignored with --drop (all formats but qgc-plan).
     """
     read = _READERS[source]
@@ -84,7 +97,25 @@ def import_(file: pathlib.Path, source: str, prefix: str, without: tuple[str, ..
     _print_notes(imported.notes)
     if not zones:
         raise click.ClickException(f"{file}: the file contains no zone")
+    _print_notes(_places(zones, depots))
     click.echo(dump_documents(map(_manifest, zones)), nl=False)
+
+
+def _places(zones: Collection[Zone], depots: Iterable[pathlib.Path]) -> Iterator[str]:
+    """Yield where the zones are, and whether they are far from the depots of manifests."""
+    centers = [area_center(zone.spec.area) for zone in zones]
+    lats = [center.lat for center in centers]
+    lons = [center.lon for center in centers]
+    yield (
+        f"imported {len(zones)} {'zone' if len(zones) == 1 else 'zones'}, centers at latitude {min(lats):.4f} to {max(lats):.4f}"
+        f" and longitude {min(lons):.4f} to {max(lons):.4f}"
+    )
+    try:
+        bases = read_manifests(depots, (Depot,)).of(Depot).values()
+    except BadManifest as error:
+        raise click.ClickException(str(error)) from None
+    if far := far_zones(zones, bases):
+        yield f"note: {far}"
 
 
 def _located(file: pathlib.Path, content: bytes, problems: Iterable[InvalidObject]) -> list[str]:

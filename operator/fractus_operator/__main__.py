@@ -160,6 +160,10 @@ def work_queues(
         for policy in policies.policies_of(key[1]):
             policy_queue.add(policy)
 
+    def enqueue_policies_with_zones(_: Key) -> None:
+        for policy in policies.policies_with_zones():
+            policy_queue.add(policy)
+
     def enqueue_drone_of_grant(key: Key) -> None:
         drone = missions.grant_changed(key)
         if drone is not None:
@@ -177,6 +181,7 @@ def work_queues(
         (kinds.SIGNING_REQUEST, csr_queue.add),
         (kinds.ZONE, zone_queue.add),
         (kinds.ZONE, enqueue_policies_of_zone),
+        (kinds.DEPOT, enqueue_policies_with_zones),
         (kinds.POLICY, policy_queue.add),
         *((kind, queue.add) for kind, queue in orphan_queues.items()),
         (kinds.GRANT, enqueue_drone_of_grant),

@@ -1,13 +1,14 @@
-"""Controller of Zones and Policies: sets the Ready condition, which is True if the object can be enforced."""
+"""Controller of Zones and Policies: reports objects that cannot be enforced, and policies that are probably mistakes."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from datetime import datetime
 
 from fractus_core.api import Condition, InvalidObject, Policy, Zone
 from fractus_core.api.conditions import ConditionUpdate, merge_conditions
 from fractus_core.planning.grant_compiler import check_united, validated
+from fractus_core.plausibility import far_zones
 from fractus_core.validation import check_policy, check_zone
 
 from fractus_operator.cache import ClusterCache
@@ -18,7 +19,11 @@ from fractus_operator.store import Conflict, NotFound, Store
 
 
 class PolicyController:
-    """Writes the Ready condition of Zones and Policies."""
+    """Writes the conditions of Zones and Policies.
+
+    `Ready` is True if the object can be enforced. A Policy has `FarFromDepots` if its zones are far from every depot. Such
+    a policy is enforced.
+    """
 
     def __init__(self, store: Store, cache: ClusterCache, clock: Callable[[], datetime]) -> None:
         self._store = store
@@ -29,7 +34,7 @@ class PolicyController:
         """Check the rules of one Zone that its schema cannot express."""
         zone = self._cache.zones.get(key)
         if zone is not None:
-            await self._report(ZONE, zone, self._check_zone(zone))
+            await self._report(ZONE, zone, [self._check_zone(zone)])
 
     async def reconcile_policy(self, key: Key) -> None:
         """Check the rules of one Policy that its schema cannot express.
@@ -38,7 +43,7 @@ class PolicyController:
         """
         policy = self._cache.policies.get(key)
         if policy is not None:
-            await self._report(POLICY, policy, self._check_policy(policy))
+            await self._report(POLICY, policy, [self._check_policy(policy), *self._far_from_depots(policy)])
 
     def policies_of(self, zone: str) -> Sequence[Key]:
         """Return the Policies that select a Zone."""
@@ -46,6 +51,14 @@ class PolicyController:
             key
             for key, policy in self._cache.policies.items()
             if isinstance(policy, Policy) and zone in policy.spec.selector.zones
+        ]
+
+    def policies_with_zones(self) -> Sequence[Key]:
+        """Return the Policies that select a Zone, whose distance from a depot may have changed."""
+        return [
+            key
+            for key, policy in self._cache.policies.items()
+            if isinstance(policy, Policy) and policy.spec.selector.zones
         ]
 
     def _check_zone(self, zone: Zone | Unreadable) -> ConditionUpdate:
@@ -78,11 +91,21 @@ class PolicyController:
             return ConditionUpdate("Ready", "False", "ZoneInvalid", str(error))
         return ConditionUpdate("Ready", "True", "Valid", "the policy can be enforced")
 
-    async def _report(self, kind: Kind, resource: Zone | Policy | Unreadable, update: ConditionUpdate) -> None:
+    def _far_from_depots(self, policy: Policy | Unreadable) -> Iterator[ConditionUpdate]:
+        if isinstance(policy, Unreadable):
+            return
+        selected = (self._cache.zones.get(("", name)) for name in policy.spec.selector.zones)
+        zones = [zone for zone in selected if isinstance(zone, Zone)]
+        if far := far_zones(zones, self._cache.depots_by_name().values()):
+            yield ConditionUpdate("FarFromDepots", "True", "ZonesFar", f"spec.selector.zones: {far}", adverse=True)
+
+    async def _report(
+        self, kind: Kind, resource: Zone | Policy | Unreadable, updates: Sequence[ConditionUpdate]
+    ) -> None:
         now = self._clock()
         generation = resource.metadata.generation
         before = _conditions(resource)
-        conditions, transitions = merge_conditions(before, [update], generation, now)
+        conditions, transitions = merge_conditions(before, updates, generation, now)
         if conditions == before:
             return
         body = kind.header(resource.name, uid=resource.metadata.uid)

@@ -57,7 +57,7 @@ DRONE = named(
 APPLICATION = named(
     "traffic",
     "default",
-    spec={"contactLost": {"after": 20, "action": "hover"}},
+    spec={"contactLost": {"after": 20, "action": "hover"}, "components": [{"name": "Navigator"}]},
     status={"phase": "Flying", "drone": "drone-1", "pods": "3/3", "message": "drone-1 flies"},
 )
 
@@ -126,6 +126,13 @@ PLAN: Body = {
 }
 
 
+def distant(name: str, selector: Body) -> Body:
+    """Return a Policy whose zone is far from every depot."""
+    spec = {"type": "GeofenceControl", "kind": "exclusion", "selector": {"zones": ["yard"], **selector}}
+    far = {**condition("FarFromDepots", "True", "ZonesFar", "far: yard"), "lastTransitionTime": "2026-01-01T00:00:00Z"}
+    return named(name, spec=spec, status={"conditions": [far]})
+
+
 @pytest.fixture
 def explained(monkeypatch: pytest.MonkeyPatch) -> Body:
     owner = {"namespace": "default", "name": "traffic"}
@@ -138,6 +145,11 @@ def explained(monkeypatch: pytest.MonkeyPatch) -> Body:
         f"{V1}/namespaces/default/applications/traffic": APPLICATION,
         f"{V1}/namespaces/default/deploymentplans": [named("traffic", "default", spec=PLAN)],
         f"{V1}/grants": [grant],
+        f"{V1}/policies": [
+            distant("school", {}),
+            distant("other", {"applications": {"names": ["other"]}}),
+            named("near", spec=distant("near", {})["spec"]),
+        ],
         "/api/v1/namespaces/default/events": [event],
     }
     show(monkeypatch, explain, objects)
@@ -164,6 +176,7 @@ def test_explain_prints_placements_rejected_nodes_and_policies(run: Run, explain
         "Normal Planned: drone-1 flies",
     ):
         assert sentence in output
+    assert re.findall("Policy .*", output) == ["Policy school: far: yard"]
     assert "drone-9" not in output
     assert "drone-9" in run("explain", "traffic", "--all")[1]
     assert json.loads(run("explain", "traffic", "-o", "json")[1])["rejected"] == PLAN["rejected"]

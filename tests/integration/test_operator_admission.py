@@ -147,6 +147,26 @@ def test_policy_with_invalid_or_unknown_zone_is_not_ready(world: World, operator
     assert "cross more than 50000 times" in crossed["message"]
 
 
+def test_policy_whose_zone_is_far_from_depots_has_condition_until_a_depot_is_near(
+    world: World, operator: OperatorProcess
+) -> None:
+    world.put(fractus_object("Zone", "far", {"area": {"circle": {"center": {"lat": 22.9, "lon": 39.4}, "radius": 50}}}))
+    spec = {"type": "GeofenceControl", "kind": "exclusion", "selector": {"zones": ["far"]}}
+    world.put(fractus_object("Policy", "far", spec))
+
+    def conditions() -> dict[str, Body]:
+        status = (world.api.get(f"{FRACTUS}/policies/far") or {}).get("status") or {}
+        return {c["type"]: c for c in status.get("conditions") or ()}
+
+    far = wait_for(lambda: conditions().get("FarFromDepots"), "the condition of the policy")
+    assert "more than 100 km from every Depot: far; check latitude" in far["message"]
+    assert conditions()["Ready"]["status"] == "True"
+    events = f"/api/v1/namespaces/default/events?fieldSelector=involvedObject.name=far,reason={far['reason']}"
+    wait_for(lambda: (world.api.get(events) or {}).get("items"), "an Event")
+    world.put(fractus_object("Depot", "near-far", {"location": {"lat": 22.9, "lon": 39.4}, "radius": 30}))
+    wait_for(lambda: "FarFromDepots" not in conditions(), "the end of the condition")
+
+
 def test_corrected_application_is_deployed(world: World, operator: OperatorProcess, namespace: str) -> None:
     manifest = traffic(namespace, "traffic", navigator(), component("DataStore", "cloud"))
     manifest["spec"]["components"][0]["controlPoints"][0]["point"] = {"depot": "late"}

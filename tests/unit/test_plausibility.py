@@ -12,7 +12,7 @@ from click.testing import CliRunner
 from fractus_cli.plan import plan
 from fractus_core.api import Application, Depot, InvalidObject, Policy, Zone
 from fractus_core.api.geometry import Point
-from fractus_core.plausibility import exchanged_coordinates, policy_notes, zone_notes
+from fractus_core.plausibility import exchanged_coordinates, far_zones, notes, policy_notes, zone_notes
 from fractus_core.validation import check_application
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "traffic-monitoring"
@@ -51,6 +51,40 @@ def test_zone_with_exchanged_coordinates_has_note() -> None:
     assert list(zone_notes(Zone.from_body(body), DEPOTS.values())) == []
     (note,) = zone_notes(Zone.from_body(exchange(body)), DEPOTS.values())
     assert note.startswith(f"Zone {body['metadata']['name']}: spec.area: 4.6")
+
+
+def far(lat: float, lon: float, radius: float = 100, name: str = "far") -> Zone:
+    area = {"circle": {"center": {"lat": lat, "lon": lon}, "radius": radius}}
+    return Zone.from_body({"metadata": {"name": name}, "spec": {"area": area}})
+
+
+def test_zones_far_from_every_depot_have_note() -> None:
+    depot = DEPOTS["depot-1"].spec.location
+    near = far(depot.lat + 0.5, depot.lon)
+    large = far(depot.lat + 2, depot.lon, radius=200_000)
+    assert far_zones([near, large], DEPOTS.values()) == ""
+    assert far_zones([far(0, 0)], []) == ""
+    others = [far(depot.lat + 1.5, depot.lon, name=f"z{i}") for i in range(5)]
+    note = far_zones([near, *others], DEPOTS.values())
+    assert note.startswith("more than 100 km from every Depot: z0, z1, z2 and 2 more; check latitude and longitude")
+
+
+def test_policy_of_far_zone_has_one_note() -> None:
+    body = bodies("policies.yaml")[0]
+    policy = Policy.from_body(body)
+    depot = DEPOTS["depot-1"].spec.location
+    distant, exchanged = (
+        far(lat, lon, name=policy.spec.selector.zones[0]) for lat, lon in ((-33.8, 151.2), (depot.lon, depot.lat))
+    )
+
+    def found(zone: Zone) -> list[str]:
+        return list(notes(DEPOTS.values(), [zone], [], [policy], APPLICATIONS))
+
+    assert found(distant) == [
+        f"Policy {policy.name}: spec.selector.zones: more than 100 km from every Depot: {distant.name};"
+        " check latitude and longitude, which may be exchanged"
+    ]
+    assert [note.partition(":")[0] for note in found(exchanged)] == [f"Zone {exchanged.name}"]
 
 
 def test_application_with_exchanged_coordinates_is_refused() -> None:

@@ -112,6 +112,7 @@ CHANGED = [
     (IMAGE, f"{IMAGE}        pullPolicy: Never\n", "m.yaml:21: ", "pullPolicy: there is no such field; remove it"),
     ("lat: 50.8641, lon: 4.6785", "lat: 4.6785, lon: 50.8641", "m.yaml:14: ", "path[0]: ", EXCHANGED),
     ("{lat: 50.8637, lon: 4.6785}\n", "{lat: 4.6785, lon: 50.8637}\n", "m.yaml:14: ", EXCHANGED, "or in the Depot"),
+    (AREA, "exterior: [{lat: 5.87, lon: 4.68}, {lat: 5.87, lon: 4.69}, {lat: 5.88, lon: 4.69}]", "Policy no-school: spec.selector.zones: more than 100 km from every Depot: school; check"),
     (AREA, "exterior: [{lat: 4.68, lon: 50.87}, {lat: 4.69, lon: 50.87}, {lat: 4.69, lon: 50.88}]", "Zone school: spec.area: ", EXCHANGED),
     ("{lat: 50.8639, lon: 4.6785}", "{lat: 4.6785, lon: 50.8639}", "EdgeNode edge-1: spec.location: ", EXCHANGED),
     ("lat: 50.8641, lon: 4.6785", "lat: 50,8641, lon: 4.6785", "m.yaml:14: ", "write decimals with a point"),
@@ -196,6 +197,8 @@ FILES = {
     "line.geojson": '{"type":"Feature","properties":{"name":"a"},"geometry":{"type":"LineString","coordinates":[[4,50],[5,50]]}}',
     "swapped.geojson": '{"type":"Feature","properties":{"name":"a"},"geometry":{"type":"Polygon","coordinates":'
     "[[[50,170],[51,170],[51,171],[50,170]]]}}",
+    "exchanged.geojson": '{"type":"Feature","properties":{"name":"a"},"geometry":{"type":"Polygon","coordinates":'
+    "[[[50.87,4.68],[50.87,4.69],[50.88,4.69],[50.87,4.68]]]}}",
     "cut.kml": "<kml><Placemark>",
     "class.yaml": "name: a\nnodes:\n  - name: node-1\n    class: dron\n",
     "field.yaml": "name: a\nnodes:\n  - name: node-1\n    class: drone\n    hardware: {vehicel: {}}\n",
@@ -254,6 +257,7 @@ COMMANDS = [
     ("zones import cut.geojson --from geojson", "cut.geojson: line 1: invalid JSON", "correct or export the file again"),
     ("zones import line.geojson --from geojson", "a: a geometry of type LineString is not a zone; left out", "contains no zone"),
     ("zones import swapped.geojson --from geojson", "swapped.geojson:1: ", "the order is lon, lat (in a)"),
+    ("zones import exchanged.geojson --from geojson --depots m.yaml", "centers at latitude 4.6867 to 4.6867", "note: more than 100 km from every Depot: a-"),
     ("zones import cut.kml --from kml", "cut.kml: this is not XML", "line 1", "export the file again"),
     ("zones import m.yaml --from ed269", "m.yaml: line 1: invalid JSON"),
     ("zones export none.yaml --to kml", "Path 'none.yaml' does not exist"),

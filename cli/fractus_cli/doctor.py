@@ -12,11 +12,11 @@ from typing import Literal, TypeVar
 
 import click
 from cryptography import x509
+from fractus_core import plausibility
 from fractus_core.api import KINDS, Application, Depot, EdgeNode, InvalidObject, Policy, Resource, Zone
 from fractus_core.api.crd import crd
 from fractus_core.api.names import CLASS_LABEL as CLASS
 from fractus_core.api.names import CLOUD_LABEL
-from fractus_core import plausibility
 
 from fractus_cli.cluster_reader import (
     EXIT_PROBLEM,
@@ -39,6 +39,8 @@ POLICIES = (
     "fractus-agent",
     "fractus-agent-kind",
     "fractus-agent-token",
+    "fractus-drone-names",
+    "fractus-edge-names",
     "fractus-pods",
     "fractus-pod-nodes",
     "fractus-operator",
@@ -337,6 +339,9 @@ def _nodes(cluster: ClusterReader) -> Iterator[Finding]:
             kind = "drone" if node_class == "drone" else "edgenode"
             message = f"{kind} {name} has no node: the node was renamed or removed"
             yield Finding("warning", "nodes", message, f"if the node does not return: kubectl delete {kind} {name}")
+    for name in sorted(described["drone"].keys() & described["edge"].keys()):
+        message = f"{name} is the name of a Drone and of an EdgeNode, but a node is either a drone or an edge node"
+        yield Finding("error", "nodes", message, f"kubectl delete drone {name} (or edgenode {name})")
     for node in nodes:
         name = node["metadata"]["name"]
         labels = node["metadata"].get("labels") or {}

@@ -7,7 +7,6 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 import click
-
 from fractus_core.api import InvalidObject, Policy
 from fractus_core.api.grants import ApplicationReference
 from fractus_core.policy.selectors import policy_applies

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import Any, TypeVar
 
+from fractus_core import plausibility
 from fractus_core.api import (
     API_VERSION,
     GROUP,
@@ -31,7 +32,6 @@ from fractus_core.api.nodes import DroneStatus
 from fractus_core.documents import MAX_BYTES, BadDocument, Documents, parse_documents
 from fractus_core.planning import Host, Inventory
 from fractus_core.planning.inventory import amount_of
-from fractus_core import plausibility
 from fractus_core.validation import check_policy, check_zone
 from fractus_runtime import files
 
@@ -344,8 +344,9 @@ def _add(manifests: Manifests, loaded: LoadedObject) -> None:
 
 
 def _check(manifests: Manifests) -> None:
-    """Check rules of Zones and Policies that the schema cannot express."""
+    """Check rules of Zones, Policies and names of nodes that the schema cannot express."""
     zones = manifests.of(Zone)
+    drones = manifests.of(Drone)
     for loaded in manifests.objects.values():
         resource = loaded.resource
         try:
@@ -353,6 +354,12 @@ def _check(manifests: Manifests) -> None:
                 check_zone(resource)
             elif isinstance(resource, Policy):
                 check_policy(resource, zones)
+            elif isinstance(resource, EdgeNode) and resource.name in drones:
+                drone = manifests.objects[(Drone.KIND, "", resource.name)].manifest.where("metadata.name")
+                raise InvalidObject(
+                    "metadata.name",
+                    f"{drone} is the Drone {resource.name}, and a node is either a drone or an edge node; rename one of them",
+                )
         except InvalidObject as error:
             raise loaded.manifest.bad(error) from None
 

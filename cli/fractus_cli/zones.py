@@ -50,7 +50,10 @@ def zones() -> None:
 @click.option("--leave-out", "without", multiple=True, metavar="NAME", help="Feature or Zone to skip. May be repeated.")
 @click.option("--drop", multiple=True, metavar="PROPERTY", help="Property to ignore. May be repeated.")
 @click.option(
-    "--depots", "depots", type=click.Path(exists=True, path_type=pathlib.Path), multiple=True,
+    "--depots",
+    "depots",
+    type=click.Path(exists=True, path_type=pathlib.Path),
+    multiple=True,
     help="File or directory with Depots: report zones that are far from all of them. May be repeated.",
 )
 def import_(

@@ -324,6 +324,7 @@ PROBLEMS: list[tuple[str, Any, str, str]] = [
         "warning",
         "drone-1 is not ready",
     ),
+    (f"{V1}/edgenodes", [named("drone-1")], "error", "drone-1 is the name of a Drone and of an EdgeNode"),
     (f"{V1}/drones", [SILENT], "error", "drone-1: Ready: AgentSilent: last heard of"),
     (
         f"{V1}/policies",

@@ -73,6 +73,24 @@ def test_agent_writes_status_of_its_own_drone_only(world: World, agents: dict[st
     )
 
 
+@pytest.mark.parametrize(("kind", "other"), [("EdgeNode", "drone-1"), ("Drone", "edge-1")])
+def test_drone_and_edge_node_of_one_name_are_refused(
+    world: World, agents: dict[str, BlockingClient], kind: str, other: str
+) -> None:
+    path = f"{FRACTUS}/{kind.lower()}s?dryRun=All"
+    spec: Body = {"location": at(0, 0)} if kind == "EdgeNode" else {"services": {}}
+
+    def refused() -> bool:
+        try:
+            world.api.call("POST", path, fractus_object(kind, other, spec))
+        except KubeError as error:
+            return error.status == 422 and f" {other}, and a node is either a drone or an edge node" in str(error)
+        return False
+
+    wait_for(refused, "the refusal of the second object")
+    world.api.call("POST", path, fractus_object(kind, "another-name", spec))
+
+
 def test_agent_registers_its_own_node_only(world: World, agents: dict[str, BlockingClient]) -> None:
     body = copy.deepcopy(world.api.get(f"{FRACTUS}/edgenodes/edge-1"))
     assert body is not None
@@ -100,9 +118,15 @@ def test_agent_registers_only_the_kind_of_its_node_label(world: World, agents: d
 
     drone = fractus_object("Drone", "edge-1", {"services": {}})
     edge = fractus_object("EdgeNode", "drone-1", {"location": at(0, 0)})
+    registered = [f"{FRACTUS}/drones/drone-1", f"{FRACTUS}/edgenodes/edge-1"]
+    bodies = [world.api.get(path) or {} for path in registered]
+    for path in registered:
+        world.api.delete(path)
     wait_for(lambda: refused("edge-1", drone, "edge"), "the refusal of a Drone")
     wait_for(lambda: refused("drone-1", edge, "drone"), "the refusal of an EdgeNode")
     world.api.call("POST", f"{FRACTUS}/drones?dryRun=All", drone)
+    for body in bodies:
+        world.put(fractus_object(body["kind"], body["metadata"]["name"], body["spec"]))
 
 
 def _grant(world: World, node: str) -> str:

@@ -114,6 +114,7 @@ CHANGED = [
     ("{lat: 50.8637, lon: 4.6785}\n", "{lat: 4.6785, lon: 50.8637}\n", "m.yaml:14: ", EXCHANGED, "or in the Depot"),
     (AREA, "exterior: [{lat: 5.87, lon: 4.68}, {lat: 5.87, lon: 4.69}, {lat: 5.88, lon: 4.69}]", "Policy no-school: spec.selector.zones: more than 100 km from every Depot: school; check"),
     (AREA, "exterior: [{lat: 4.68, lon: 50.87}, {lat: 4.69, lon: 50.87}, {lat: 4.69, lon: 50.88}]", "Zone school: spec.area: ", EXCHANGED),
+    ("name: edge-1", "name: drone-1", "m.yaml:68: EdgeNode drone-1: metadata.name: m.yaml:35 is the Drone drone-1", "rename one"),
     ("{lat: 50.8639, lon: 4.6785}", "{lat: 4.6785, lon: 50.8639}", "EdgeNode edge-1: spec.location: ", EXCHANGED),
     ("lat: 50.8641, lon: 4.6785", "lat: 50,8641, lon: 4.6785", "m.yaml:14: ", "write decimals with a point"),
     ("lat: 50.8641, lon: 4.6785", "lat: 50°51, lon: 4.6785", "m.yaml:14: ", "path[0].lat: must be a number"),

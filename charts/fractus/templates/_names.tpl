@@ -45,6 +45,22 @@ has(request.userInfo.extra) && "authentication.kubernetes.io/node-name" in reque
 ? request.userInfo.extra["authentication.kubernetes.io/node-name"][0] : ""
 {{- end }}
 
+{{/* Binding of an admission policy that is evaluated for each object of its paramKind. Argument: (dict "root" $ "name" "fractus-flight-pods"). */}}
+{{- define "fractus.bindingForEach" }}
+---
+apiVersion: admissionregistration.k8s.io/v1
+kind: ValidatingAdmissionPolicyBinding
+metadata:
+  name: {{ .name }}
+  labels: {{- include "fractus.labels" (dict "root" .root "part" "admission") | nindent 4 }}
+spec:
+  policyName: {{ .name }}
+  paramRef:
+    selector: {}
+    parameterNotFoundAction: Allow
+  validationActions: [Deny]
+{{- end }}
+
 {{/* Namespace of the accounts and Grants of nodes. fractus_core.api.grants uses the same name. */}}
 {{- define "fractus.nodesNamespace" -}}fractus-nodes{{- end }}
 

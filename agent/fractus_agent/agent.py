@@ -18,7 +18,7 @@ from fractus_agent.agent_metrics import AgentMetrics
 from fractus_agent.grant_synchronizer import GrantDirectory, GrantSynchronizer, GrantVerifier
 from fractus_agent.identity import NodeIdentity
 from fractus_agent.links.link_manager import LinkManager
-from fractus_agent.registration.diagnostics import read_audit_heads, read_recording_problems
+from fractus_agent.registration.diagnostics import read_audit_heads, read_gateway_problem, read_recording_problems
 from fractus_agent.registration.node_object_file import NodeObjectFile
 from fractus_agent.registration.node_status import NodeObservation, StatusReporter
 from fractus_agent.registration.registration import Registration
@@ -191,6 +191,7 @@ class Agent:
             camera_described=self._object_file.condition,
             audit_heads=read_audit_heads(self._settings.audit, self._settings.gateway_audit),
             recording_problems=read_recording_problems(self._settings.state),
+            gateway_problem=read_gateway_problem(self._settings.state),
         )
 
     def _on_telemetry(self) -> None:

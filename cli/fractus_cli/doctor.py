@@ -53,6 +53,8 @@ POLICIES = (
     "fractus-flight-node-status",
     "fractus-flight-kinds",
 )
+SIDECAR = "fractus-mavlink"
+"""Container of the operator that connects a MAVLink program to the gateway of its drone."""
 EXPIRY = timedelta(days=30)
 _LISTED = 5
 _HELM = f"helm upgrade --install fractus charts/fractus -n {SYSTEM}"
@@ -111,6 +113,7 @@ def examine(cluster: ClusterReader, now: datetime) -> Iterator[Finding]:
     yield from _admission(cluster)
     yield from _foreign_pods(cluster)
     yield from _pods(cluster.list(f"/api/v1/namespaces/{SYSTEM}/pods"))
+    yield from _gateway(cluster)
     yield from _authority(cluster.get(f"/api/v1/namespaces/{SYSTEM}/configmaps/fractus-ca"), now)
     yield from _nodes(cluster)
     yield from _policies(cluster)
@@ -278,9 +281,10 @@ def _pods(pods: Sequence[Body]) -> Iterator[Finding]:
             yield Finding("error", "pods", message, _scheduling_remedy(pod))
         name = pod["metadata"]["name"]
         node = (pod.get("spec") or {}).get("nodeName", "no node")
-        for container in (pod.get("status") or {}).get("containerStatuses") or ():
+        status = pod.get("status") or {}
+        for container in (*(status.get("initContainerStatuses") or ()), *(status.get("containerStatuses") or ())):
             waiting = (container.get("state") or {}).get("waiting")
-            if waiting is None or waiting.get("reason") == "ContainerCreating":
+            if waiting is None or waiting.get("reason") in {"ContainerCreating", "PodInitializing"}:
                 continue
             reason = waiting.get("reason", "")
             message = f"{name} on {node}: {reason}: {waiting.get('message', '')}".rstrip(": ")
@@ -299,6 +303,44 @@ def _scheduling_remedy(pod: Body) -> str:
         f"add a node that is neither a drone nor an edge node, or label a node {CLOUD_LABEL}=true; if that node has taints, set"
         " operator.tolerations of the chart"
     )
+
+
+def _gateway(cluster: ClusterReader) -> Iterator[Finding]:
+    """Check the gateway for MAVLink programs and the sidecars of their pods."""
+    body = cluster.get(f"{_APPS}/daemonsets/fractus-mobility") or {}
+    template = ((body.get("spec") or {}).get("template") or {}).get("spec") or {}
+    installed = any(container.get("name") == "gateway" for container in template.get("containers") or ())
+    programs = [
+        f"{application.metadata.namespace}/{application.name}"
+        for application in _valid(cluster, Application)
+        if any(component.uses_mavlink for component in application.spec.components)
+    ]
+    if programs and not installed:
+        listed = ", ".join(sorted(programs)[:_LISTED])
+        remedy = f"{_HELM} --reuse-values --set gateway.enabled=true"
+        yield Finding("warning", "gateway", f"no gateway for the MAVLink programs of {listed}", remedy)
+    if not installed:
+        return
+    waiting = list(_waiting_sidecars(cluster))
+    yield from waiting
+    if not waiting:
+        yield Finding("ok", "gateway", "installed, and the sidecars of all MAVLink programs are ready")
+
+
+def _waiting_sidecars(cluster: ClusterReader) -> Iterator[Finding]:
+    for pod in cluster.list("/api/v1/pods", labelSelector="app.kubernetes.io/managed-by=fractus"):
+        status = pod.get("status") or {}
+        if status.get("phase") in {"Succeeded", "Failed"} or "deletionTimestamp" in pod["metadata"]:
+            continue
+        for container in status.get("initContainerStatuses") or ():
+            if container.get("name") != SIDECAR or container.get("ready"):
+                continue
+            name = pod["metadata"]["name"]
+            namespace = pod["metadata"]["namespace"]
+            state = (container.get("state") or {}).get("waiting") or {}
+            reason = ": ".join(filter(None, (state.get("reason"), state.get("message"))))
+            message = f"{namespace}/{name}: the sidecar {SIDECAR} is not ready" + (f": {reason}" if reason else "")
+            yield Finding("warning", "gateway", message, f"kubectl -n {namespace} logs {name} -c {SIDECAR}")
 
 
 def _authority(config_map: Body | None, now: datetime) -> Iterator[Finding]:

@@ -136,6 +136,15 @@ def _option(
     return click.option(name, type=kind, default=default, show_default=True, help=text, **more)
 
 
+_METRICS = click.option(
+    "--metrics",
+    envvar="FRACTUS_METRICS",
+    default="",
+    callback=metrics_address,
+    help="HOST:PORT that serves /metrics for Prometheus (docs/metrics.md). Without it there are no metrics.",
+)
+
+
 def _service_options(service: str, port: int, kinds: str, state: str, recorded: str) -> Callable[[Any], Any]:
     """Return a decorator that adds the options of both services."""
     options = (
@@ -168,13 +177,7 @@ def _service_options(service: str, port: int, kinds: str, state: str, recorded: 
             "Maximum size of the recordings in megabytes; the oldest are removed first. 0 disables recording.",
             click.IntRange(min=0),
         ),
-        click.option(
-            "--metrics",
-            envvar="FRACTUS_METRICS",
-            default="",
-            callback=metrics_address,
-            help="HOST:PORT that serves /metrics for Prometheus (docs/metrics.md). Without it there are no metrics.",
-        ),
+        _METRICS,
         click.option(
             "--node",
             envvar="FRACTUS_NODE",
@@ -314,6 +317,7 @@ def gateway() -> None:
     "Maximum size of the recordings of each instance in megabytes; the oldest are removed first.",
     click.IntRange(min=0),
 )
+@_METRICS
 def serve_gateway(mobility_socket: Path, **options: Any) -> None:
     """Serve until stopped. Waits for certificates and for the mobility service."""
     from fractus_services.gateway.gateway_server import GatewayOptions, run  # noqa: PLC0415 - keeps the command line fast

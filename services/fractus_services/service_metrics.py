@@ -97,6 +97,12 @@ def common_metrics(
     if expires_s is not None:
         yield gauge(CERTIFICATE_EXPIRY, "Expiry of the node's certificate in Unix time.", expires_s)
     yield gauge("fractus_grants", "Grants in force.", len(grants.active))
+    yield from audit_metrics(audit)
+    yield gauge("fractus_recording_failing", "1 while recording is enabled but fails.", bool(recording_problem()))
+
+
+def audit_metrics(audit: AuditLog) -> Iterator[Metric]:
+    """Yield the metrics of an audit log."""
     head = audit.head
     yield gauge(
         "fractus_audit_sequence",
@@ -111,4 +117,3 @@ def common_metrics(
     )
     yield gauge("fractus_audit_waiting", "Entries of the audit log not yet written to disk.", audit.waiting)
     yield gauge("fractus_audit_failing", "1 while the audit log cannot be written.", bool(audit.failure))
-    yield gauge("fractus_recording_failing", "1 while recording is enabled but fails.", bool(recording_problem()))

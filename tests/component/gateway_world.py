@@ -170,7 +170,10 @@ class GatewayWorld:
             drone.service, drone.control, drone.streams, grants=drone.grants, node="drone-1",  # type: ignore[arg-type]
             clock=time.time, interface="mavlink",  # type: ignore[arg-type]
         )  # fmt: skip
-        audit = SimpleNamespace(append=lambda _kind, content: self.refused.append(content))
+        audit = SimpleNamespace(
+            append=lambda _kind, content: self.refused.append(content),
+            head=SimpleNamespace(sequence=0, hash="0" * 64), waiting=0, failure=None,
+        )  # fmt: skip
         path = directory / "gateway.sock"
         self.socket = GatewaySocket(path, handlers, drone.autopilot, DECISIONS.delivered)
         self.recordings = directory / "recordings"
@@ -178,7 +181,7 @@ class GatewayWorld:
             tls=directory, mobility=path, listen="", state=directory, audit=directory, lock_timeout=0.0,
             recordings=self.recordings, recordings_mb=10,
         )  # fmt: skip
-        self.gateway = Gateway(path, Callers(time.time), audit, partial(open_recorder, options))  # type: ignore[arg-type]
+        self.gateway = Gateway(path, Callers(time.time), audit, partial(open_recorder, options), time.time)  # type: ignore[arg-type]
         self._programs = directory / "programs.sock"
         self._certificates: dict[str, bytes] = {}
         self._count = 0

@@ -10,12 +10,14 @@ import sky_drone
 from closed_loop import Sky
 from fractus_core.control import OutcomeKind
 from fractus_runtime.mavlink_codec import Parser
+from fractus_runtime.metrics import metrics_text
 from fractus_services.gateway.decisions import DECISIONS
 from fractus_services.gateway.mobility_client import MobilityClient
 from fractus_services.options import CannotServe
 from gateway_world import ACCEPTED, DENIED, GUIDED, Flight, GatewayWorld, flying, mavlink_spec
 from mobility_world import zone
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
+from scraping import assert_documented, values
 
 
 def fly(flight: Flight, directory: Path) -> None:
@@ -296,5 +298,27 @@ def test_unexpected_error_closes_the_connections_of_one_instance_only(
         assert await other.command(400, 1) == ACCEPTED
         for each in (program, other):
             await each.close()
+
+    fly(flight, tmp_path)
+
+
+def test_metrics_contain_verdicts_and_connections(tmp_path: Path) -> None:
+    async def flight(world):
+        grant = world.drone.grants.put(mavlink_spec(zone("pool", "ignore", -20, 40, 20, 60)))
+        program = await world.program(grant.identity)
+        await program.up()
+        program.target(0, 50)
+        program.send("SERIAL_CONTROL", device=0, flags=1)
+        await program.until(lambda: "pool" in program.texts)
+        text = metrics_text(world.gateway.metrics.collect()).decode()
+        assert_documented(text, "Gateway")
+        found = values(text)
+        assert found["fractus_gateway_messages_total", "deny"] == 1
+        assert found["fractus_gateway_messages_total", "refuse"] == 1
+        assert found["fractus_gateway_messages_total", "allow"] == 2
+        assert found["fractus_gateway_verdict_seconds_count",] == 2, "takeoff and target"
+        assert found["fractus_gateway_connections",] == 1
+        assert found["fractus_gateway_instances", "connected"] == 1
+        await program.close()
 
     fly(flight, tmp_path)

@@ -77,6 +77,8 @@ class Cluster:
         selector = selectors.get("fieldSelector", "")
         if selector == "spec.hostNetwork=true":
             return [body for body in bodies if body["spec"].get("hostNetwork")]
+        if "managed-by" in selectors.get("labelSelector", ""):
+            return bodies
         if "labelSelector" in selectors:
             return [b for b in bodies if b["metadata"]["labels"].get("fractus.dev/class") in {"drone", "edge"}]
         name = selector.partition("involvedObject.name=")[2]
@@ -183,6 +185,68 @@ def test_doctor_ignores_failed_deletion_of_operator_pods() -> None:
     assert {finding.level for finding in findings(cluster)} == {"ok"}
 
 
+def _with_gateway(cluster: Cluster) -> None:
+    containers = [{"name": "mobility"}, {"name": "gateway"}]
+    mobility = cluster.objects[f"/apis/apps/v1{SYSTEM}/daemonsets/fractus-mobility"]
+    mobility["spec"] = {"template": {"spec": {"containers": containers}}}
+
+
+def _program(cluster: Cluster) -> None:
+    services = [{"service": "mobility", "interfaces": ["mavlink"], "methods": ["Arm", "GetControl"]}]
+    component = {
+        "name": "Program",
+        "class": "driver",
+        "placement": "drone",
+        "services": services,
+        "container": {"image": "x:1"},
+    }
+    component["controlPoints"] = [
+        {"point": {"depot": "base"}, "navigation": "pathBased", "path": [{"lat": 1.0, "lon": 1.0, "alt": 10.0}]}
+    ]
+    application = {"apiVersion": "fractus.dev/v1alpha1", "kind": "Application", "spec": {"components": [component]}}
+    cluster.lists["/apis/fractus.dev/v1alpha1/applications"] = [
+        application | {"metadata": {"name": "survey", "namespace": "city"}}
+    ]
+
+
+def waiting_sidecar(cluster: Cluster) -> None:
+    _with_gateway(cluster)
+    _program(cluster)
+    state = {"waiting": {"reason": "ErrImagePull", "message": "not found"}}
+    program = pod("survey-program", "city")
+    program["status"] = {"initContainerStatuses": [{"name": "fractus-mavlink", "ready": False, "state": state}]}
+    ready = pod("other", "city")
+    ready["status"] = {"initContainerStatuses": [{"name": "fractus-mavlink", "ready": True}]}
+    cluster.lists["/api/v1/pods"] = [program, ready]
+
+
+def failed_access(cluster: Cluster) -> None:
+    _with_gateway(cluster)
+    service = pod("fractus-mobility-x", "fractus-system", nodeName="drone-1")
+    state = {"waiting": {"reason": "CrashLoopBackOff", "message": "back-off"}}
+    service["status"] = {"initContainerStatuses": [{"name": "gateway-access", "state": state}]}
+    cluster.lists[PODS] = [service]
+
+
+def gateway_without_socket(cluster: Cluster) -> None:
+    (drone,) = cluster.lists["/apis/fractus.dev/v1alpha1/drones"]
+    condition = {
+        "type": "MavlinkGateway",
+        "status": "False",
+        "reason": "NotServing",
+        "message": "The mobility service does not offer the socket",
+    }
+    drone["status"] = {"conditions": [*drone["status"]["conditions"], condition]}
+
+
+def test_doctor_accepts_gateway_with_ready_sidecars() -> None:
+    cluster = Cluster()
+    _with_gateway(cluster)
+    _program(cluster)
+    assert {finding.level for finding in findings(cluster)} == {"ok"}
+    assert "gateway" in {finding.check for finding in findings(cluster)}
+
+
 def no_certificate(cluster: Cluster) -> None:
     del cluster.objects[f"/api/v1{SYSTEM}/configmaps/fractus-ca"]
 
@@ -202,6 +266,10 @@ def empty_certificate(cluster: Cluster) -> None:
         (renamed_node, "warning", "nodes", "drone drone-0 has no node", "kubectl delete drone drone-0"),
         (ipv6_first, "error", "nodes", "drone-1 has fd00::7 as first address", "--node-ip"),
         (weakly_tainted, "warning", "nodes", "drone-1 has no taint fractus.dev/class with the effect NoExecute", "=drone:NoExecute"),
+        (_program, "warning", "gateway", "no gateway for the MAVLink programs of city/survey", "--set gateway.enabled=true"),
+        (waiting_sidecar, "warning", "gateway", "city/survey-program: the sidecar fractus-mavlink is not ready: ErrImagePull: not found", "kubectl -n city logs survey-program -c fractus-mavlink"),
+        (failed_access, "error", "pods", "fractus-mobility-x on drone-1: CrashLoopBackOff", "logs fractus-mobility-x"),
+        (gateway_without_socket, "warning", "hardware", "drone-1: MavlinkGateway: NotServing: The mobility service does not offer the socket", "kubectl describe drone drone-1"),
         (no_certificate, "error", "certificates", "the ConfigMap fractus-ca, from which nodes read", "logs deployment/fractus-operator"),
         (empty_certificate, "error", "certificates", "of the authority, has no ca.crt", "restores it within 10 s"),
         (audit_only_binding, "error", "admission", f"{POLICIES[0]}: not in force", "helm upgrade --install fractus "),

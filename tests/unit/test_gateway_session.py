@@ -27,7 +27,8 @@ class World:
         self.vehicle = VirtualVehicle(granted=granted)
         self.parameters = ParameterView()
         self.parameters.replace({"WPNAV_SPEED": 1000.0, "RTL_ALT": 1500.0, "FS_GCS_ENABLE": 1.0})
-        self.session = Session(self.vehicle, self.parameters)
+        self.verdicts: list[str] = []
+        self.session = Session(self.vehicle, self.parameters, count=self.verdicts.append)
         self.program = Endpoint(255, 190)
         self.now = 100.0
         self._parser = Parser()
@@ -380,6 +381,25 @@ def test_garbage_is_delayed(garbage: bytes) -> None:
     world = World()
     world.session.receive(garbage * 50_000, world.now)
     assert world.session.delay_s(world.now) >= 0.5
+
+
+def test_each_message_is_counted_with_its_verdict() -> None:
+    world = World()
+    world.send("HEARTBEAT", type=6, autopilot=8)
+    world.send("PARAM_REQUEST_LIST", target_system=1)
+    world.send("SERIAL_CONTROL")
+    world.command(mavlink.MAV_CMD_DO_FLIGHTTERMINATION, 1)
+    world.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1, 21196)
+    assert world.verdicts == ["consume", "respond", "refuse", "refuse", "refuse"]
+    for result, text, verdict in (
+        (ACCEPTED, "", "allow"),
+        (ACCEPTED, "at most 15 m", "correct"),
+        (mavlink.MAV_RESULT_DENIED, "inside zone pool", "deny"),
+    ):
+        (call,) = world.command(mavlink.MAV_CMD_NAV_LAND)
+        world.session.finish(call, result, text, world.now)
+        assert world.verdicts[-1] == verdict
+    assert len(world.verdicts) == 8
 
 
 # Hostile input

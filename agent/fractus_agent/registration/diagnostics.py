@@ -1,4 +1,4 @@
-"""Diagnostics that the node's services leave in files: heads of audit logs, and recording problems."""
+"""Diagnostics that the node's services leave in files: heads of audit logs, recording problems, and problems of the gateway."""
 
 from __future__ import annotations
 
@@ -38,3 +38,12 @@ def read_recording_problems(state: Path) -> list[str]:
         if problem:
             problems.append(f"{path_text(path.parent.name)}: {problem}")
     return problems
+
+
+def read_gateway_problem(state: Path) -> str:
+    """Return the reason why MAVLink programs cannot fly, from a file below the node's state directory, or an empty string."""
+    try:
+        problem = read_file(state / "gateway" / "gateway.problem", _MAX_BYTES)
+    except OSError:
+        return ""
+    return problem[:MAX_PROBLEM_BYTES].decode(errors="replace").strip()

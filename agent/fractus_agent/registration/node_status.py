@@ -70,6 +70,7 @@ class NodeObservation:
         camera_described: Condition CameraDescribed, None if there is no problem.
         audit_heads: Heads of the audit logs.
         recording_problems: Reasons why services other than mobility record nothing although they should.
+        gateway_problem: Reason why MAVLink programs cannot fly, empty for none.
     """
 
     kind: str
@@ -82,6 +83,7 @@ class NodeObservation:
     camera_described: ConditionUpdate | None = None
     audit_heads: Sequence[str] = ()
     recording_problems: Sequence[str] = ()
+    gateway_problem: str = ""
 
 
 def ready_condition(observed: NodeObservation) -> ConditionUpdate:
@@ -124,6 +126,7 @@ def node_status(observed: NodeObservation, previous: Object, generation: int | N
         observed.described,
         observed.camera_described,
         _recording_condition(observed),
+        _gateway_condition(observed),
         _control_condition(observed),
     )
     conditions += [condition for condition in optional if condition is not None]
@@ -154,6 +157,12 @@ def _recording_condition(observed: NodeObservation) -> ConditionUpdate | None:
     flights = observed.snapshot.recording_problem if observed.snapshot is not None else ""
     problem = "; ".join(filter(None, (flights, *observed.recording_problems)))
     return ConditionUpdate("Recording", "False", "RecordingStopped", problem) if problem else None
+
+
+def _gateway_condition(observed: NodeObservation) -> ConditionUpdate | None:
+    """Return the condition MavlinkGateway if the node has a gateway with a problem."""
+    problem = observed.gateway_problem
+    return ConditionUpdate("MavlinkGateway", "False", "NotServing", problem) if problem else None
 
 
 def _control_condition(observed: NodeObservation) -> ConditionUpdate | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import ssl
+import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
@@ -13,10 +14,13 @@ from pathlib import Path
 
 from fractus_core.api.names import ComponentIdentity
 from fractus_runtime.audit import AuditLog
+from fractus_runtime.files import write_file
+from fractus_runtime.metrics import BackgroundReader, serve_metrics
 
 from fractus_services.auth import FILES, Callers, TlsFiles
 from fractus_services.clock import Clock
 from fractus_services.errors import NotAuthenticated, ResourceExhausted
+from fractus_services.gateway.gateway_metrics import GatewayMetrics
 from fractus_services.gateway.instance import Instance
 from fractus_services.gateway.session import Session
 from fractus_services.grpc_server import RateLimiter
@@ -40,6 +44,9 @@ AUDITED_PER_S = 2.0
 AUDITED_BURST = 50.0
 """Rate and burst of audit entries about refused messages of an instance. Further refusals are not logged."""
 
+PROBLEM_INTERVAL_S = 5.0
+"""Interval at which the certificate and the socket of the mobility service are checked."""
+
 MAX_CONNECTIONS = 64
 MAX_CONNECTIONS_PER_INSTANCE = 4
 HANDSHAKE_TIMEOUT_S = 5.0
@@ -59,6 +66,12 @@ class GatewayOptions:
     lock_timeout: float
     recordings: Path | None = None
     recordings_mb: int = 0
+    metrics: str = ""
+
+    @property
+    def problem(self) -> Path:
+        """File with the reason why programs cannot fly, if there is one. The agent reads it."""
+        return self.state / "gateway.problem"
 
 
 class Gateway:
@@ -69,11 +82,26 @@ class Gateway:
         callers: Authenticates the instances by their certificates.
         audit: Audit log of refused messages.
         open_recorder: Returns the recorder of an instance.
+        expiry: Returns the Unix time at which the certificate expires, or None if it is unknown.
+
+    Attributes:
+        metrics: Metrics of all connections.
     """
 
     def __init__(
-        self, socket: Path, callers: Callers, audit: AuditLog, open_recorder: Callable[[str], Recorder]
+        self,
+        socket: Path,
+        callers: Callers,
+        audit: AuditLog,
+        open_recorder: Callable[[str], Recorder],
+        expiry: Callable[[], float | None] = lambda: None,
     ) -> None:
+        self.metrics = GatewayMetrics(
+            audit,
+            expiry,
+            lambda: len(self._writers),
+            lambda: [instance.connected for instance, _ in self._instances.values()],
+        )
         self._open_recorder = open_recorder
         self._socket = socket
         self._callers = callers
@@ -115,7 +143,7 @@ class Gateway:
         recorder = self._recorders.get(identity)
         if recorder is None:
             recorder = self._recorders[identity] = self._open_recorder(identity)
-        session = Session(instance.vehicle, instance.parameters, recorder.take_sent)
+        session = Session(instance.vehicle, instance.parameters, recorder.take_sent, self.metrics.count)
         instance.sessions.add(session)
         self._writers[writer] = identity
         self._ended.clear()
@@ -142,7 +170,7 @@ class Gateway:
         if len(self._writers) >= MAX_CONNECTIONS:
             return None
         if entry is None:
-            instance = Instance(identity, self._socket)
+            instance = Instance(identity, self._socket, self.metrics.observe)
             instance.certificate = certificate
             task = asyncio.get_running_loop().create_task(instance.run())
             task.add_done_callback(partial(self._close_failed, identity))
@@ -207,10 +235,23 @@ async def run(options: GatewayOptions, stop: asyncio.Event) -> None:
     Raises:
         CannotServe: An option is wrong.
     """
-    await TlsFiles(options.tls).wait()
+    tls = TlsFiles(options.tls)
+    reporting = asyncio.get_running_loop().create_task(_report_problems(options, tls))
+    try:
+        await _serve(options, tls, stop)
+    finally:
+        reporting.cancel()
+        await asyncio.gather(reporting, return_exceptions=True)
+        options.problem.unlink(missing_ok=True)
+
+
+async def _serve(options: GatewayOptions, tls: TlsFiles, stop: asyncio.Event) -> None:
+    await tls.wait()
     clock = Clock()
     audit = AuditLog(options.audit, clock, tls=options.tls)
-    gateway = Gateway(options.mobility, Callers(clock), audit, partial(open_recorder, options))
+    gateway = Gateway(
+        options.mobility, Callers(clock), audit, partial(open_recorder, options), BackgroundReader(tls.expires_s)
+    )
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.verify_mode = ssl.CERT_REQUIRED
     host, _, port = options.listen.rpartition(":")
@@ -232,12 +273,50 @@ async def run(options: GatewayOptions, stop: asyncio.Event) -> None:
     log.info("gateway: serving (address=%s)", options.listen)
     reload = asyncio.get_running_loop().create_task(_reload(context, options.tls))
     try:
-        await stop.wait()
+        async with serve_metrics(options.metrics, gateway.metrics.collect):
+            await stop.wait()
     finally:
         reload.cancel()
         server.close()
         await gateway.close()
         await audit.close()
+
+
+async def _report_problems(options: GatewayOptions, tls: TlsFiles) -> None:
+    """Write the reason why programs cannot fly to a file, and remove the file when the problem is solved."""
+    reported: str | None = None
+    while True:
+        problem = current_problem(options.mobility, tls, time.time())
+        if problem != reported:
+            reported = problem
+            if problem:
+                log.warning("gateway: programs cannot fly (problem=%s)", problem)
+            with suppress(OSError):  # a full disk is reported by the audit log
+                if problem:
+                    write_file(options.problem, problem.encode(), durable=False)
+                else:
+                    options.problem.unlink(missing_ok=True)
+        await asyncio.sleep(PROBLEM_INTERVAL_S)
+
+
+def current_problem(socket: Path, tls: TlsFiles, now_s: float) -> str:
+    """Return why programs cannot fly, or an empty string.
+
+    Args:
+        socket: Socket of the mobility service.
+        tls: Certificate of the node.
+        now_s: Unix time.
+    """
+    expires_s = tls.expires_s()
+    if expires_s is None:
+        return "The gateway cannot read the certificate of the node."
+    if expires_s <= now_s:
+        return "The certificate of the node has expired."
+    if not socket.is_socket():
+        return (
+            f"The mobility service does not offer the socket {socket}; it is not running, or has no --gateway-socket."
+        )
+    return ""
 
 
 def open_recorder(options: GatewayOptions, identity: str) -> Recorder:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import aclosing, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -89,12 +89,17 @@ class _Setpoint:
     flying: ProtobufMessage | None = None
 
 
+def ignore_duration(_duration_s: float) -> None:
+    """Record nothing."""
+
+
 class Instance:
     """A component instance with at least one connection.
 
     Args:
         identity: SPIFFE ID.
         socket: Unix socket of the mobility service.
+        observe: Callback that receives the time to the verdict on each call, in seconds.
 
     Attributes:
         certificate: PEM certificate of the latest connection.
@@ -103,8 +108,9 @@ class Instance:
         sessions: Sessions of the connections.
     """
 
-    def __init__(self, identity: str, socket: Path) -> None:
+    def __init__(self, identity: str, socket: Path, observe: Callable[[float], None] = ignore_duration) -> None:
         self.identity = identity
+        self._observe = observe
         self.certificate = b""
         self.vehicle = VirtualVehicle()
         self.parameters = ParameterView()
@@ -121,6 +127,11 @@ class Instance:
         self._granted = asyncio.Event()
         self._calls: set[asyncio.Task[None]] = set()
         self._setpoints = {"motion": _Setpoint(), "gimbal": _Setpoint(), "speed": _Setpoint()}
+
+    @property
+    def connected(self) -> bool:
+        """True if the mobility service is connected."""
+        return self._client is not None
 
     # Connection to the mobility service
 
@@ -320,6 +331,7 @@ class Instance:
     async def _run_call(self, client: MobilityClient, session: Session, call: Call, setpoint: _Setpoint | None) -> None:
         method = call.request.method
         judged = False
+        began_s = self._loop.time()
         try:
             await self._wait_for_control(call)
             timeout_s = _TIMEOUTS_S.get(method, CALL_TIMEOUT_S)
@@ -328,6 +340,7 @@ class Instance:
                 async for reply in replies:
                     if not judged:
                         judged = True
+                        self._observe_verdict(call, began_s)
                         self._accept(session, call, reply)
                         self._free(setpoint, call.request.message if method == "Goto" else None)
         except asyncio.CancelledError:
@@ -340,6 +353,7 @@ class Instance:
             if not judged:
                 if refusal.code == "Replaced" and call.is_setpoint:
                     return
+                self._observe_verdict(call, began_s)
                 session.finish(call, result, refusal.reason, self._loop.time())
             elif refusal.code != "Replaced":
                 text = f"{call.name} ended: {refusal.reason}"
@@ -350,9 +364,13 @@ class Instance:
             elif setpoint is not None and setpoint.flying is call.request.message:
                 setpoint.flying = None
 
+    def _observe_verdict(self, call: Call, began_s: float) -> None:
+        if not _waits_for_control(call):
+            self._observe(self._loop.time() - began_s)
+
     async def _wait_for_control(self, call: Call) -> None:
         """Wait for control if the call arms the drone or sets a parameter. Other calls do not wait."""
-        if call.request.method != "Arm" and not call.parameter:
+        if not _waits_for_control(call):
             return
         try:
             async with asyncio.timeout(None if call.parameter else CONTROL_WAIT_S):
@@ -391,3 +409,7 @@ class Instance:
         setpoint.pending = None
         if pending is not None:
             self.start(*pending)
+
+
+def _waits_for_control(call: Call) -> bool:
+    return call.request.method == "Arm" or bool(call.parameter)

@@ -12,6 +12,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fractus_services.gateway import translate
 from fractus_services.gateway.decisions import DECISIONS
+from fractus_services.gateway.gateway_metrics import Verdict, ignore_verdict
 from fractus_services.gateway.parameters import ParameterView
 from fractus_services.gateway.translate import Request, Untranslatable
 from fractus_services.gateway.virtual_vehicle import DESCENTS, VirtualVehicle
@@ -147,6 +148,7 @@ class Session:
         vehicle: Vehicle as the instance sees it, shared by the sessions of the instance.
         parameters: Parameters of the instance.
         record: Callback that receives each valid frame of the program.
+        count: Callback that receives the verdict on each message.
 
     Attributes:
         refusals: Refusals since the last call of `take_refusals`.
@@ -155,8 +157,14 @@ class Session:
     """
 
     def __init__(
-        self, vehicle: VirtualVehicle, parameters: ParameterView, record: Callable[[bytes], None] = ignore
+        self,
+        vehicle: VirtualVehicle,
+        parameters: ParameterView,
+        record: Callable[[bytes], None] = ignore,
+        count: Callable[[Verdict], None] = ignore_verdict,
     ) -> None:
+        self._count = count
+        self._decision: Verdict = "respond"
         self._vehicle = vehicle
         self._parameters = parameters
         self._record = record
@@ -190,11 +198,17 @@ class Session:
             self.frames += 1
             self._record(message.frame)
             if not _addresses_vehicle(message):
+                self._count("consume")
                 continue
+            caused: list[Call] = []
+            self._decision = "respond"
             try:
-                calls += self._handle(message, now)
+                caused = self._handle(message, now)
             except Untranslatable as problem:
                 self._refuse(message.name, str(problem), now)
+            if not caused:
+                self._count(self._decision)  # calls are counted when they have a verdict
+            calls += caused
         return calls
 
     def delay_s(self, now: float) -> float:
@@ -208,6 +222,7 @@ class Session:
     def _handle(self, message: Message, now: float) -> list[Call]:
         decision = DECISIONS.received.get(message.name, "refuse")
         if decision == "consume":
+            self._decision = "consume"
             if message.name == "HEARTBEAT":
                 self._heartbeat_at = now
             return []
@@ -355,6 +370,7 @@ class Session:
         if progress is not None and progress.call is call:
             del self._in_progress[call.key]
         accepted = result == mavlink.MAV_RESULT_ACCEPTED
+        self._count(_verdict(accepted, text))
         if call.command is not None:
             self._acknowledge(call.source, call.command, result)
         elif call.mission_ack:
@@ -427,6 +443,7 @@ class Session:
 
     def _refuse(self, name: str, reason: str, now: float, *, audited: bool = True) -> None:
         """Report a refused message, at most once in `TEXT_INTERVAL_S` for each name. Unknown commands share a name."""
+        self._decision = "refuse"
         kind = "unknown command" if name.isdecimal() else name
         if now - self._text_at.get(kind, -math.inf) < TEXT_INTERVAL_S:
             return
@@ -635,6 +652,12 @@ def _addresses_vehicle(message: Message) -> bool:
     system = message.integer("target_system") if message.has("target_system") else 0
     component = message.integer("target_component") if message.has("target_component") else 0
     return system in {0, 1} and component in {0, mavlink.MAV_COMP_ID_AUTOPILOT1}
+
+
+def _verdict(accepted: bool, text: str) -> Verdict:
+    if not accepted:
+        return "deny"
+    return "correct" if text else "allow"
 
 
 def _fields_of(message: Message) -> _CommandFields:

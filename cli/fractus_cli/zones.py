@@ -99,7 +99,9 @@ def import_(
         raise click.ClickException(f"{file}: {error}") from None
     _print_notes(imported.notes)
     if not zones:
-        raise click.ClickException(f"{file}: the file contains no zone")
+        raise click.ClickException(
+            f"{file}: the file contains no zone; draw a polygon or a circle in it, or specify another file"
+        )
     _print_notes(_places(zones, depots))
     click.echo(dump_documents(map(_manifest, zones)), nl=False)
 

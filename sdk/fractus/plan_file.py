@@ -26,6 +26,7 @@ _ENDS = frozenset({20, 21})
 _DO_CHANGE_SPEED = 178
 _GROUND_SPEEDS = (0, 1)
 _VERTICAL_SPEEDS = (2, 3)
+_SAME_SPEED = -1
 _DEFAULT_SPEED = -2
 
 _COMMANDS = {
@@ -108,11 +109,17 @@ def read_plan(path: str | Path) -> tuple[Waypoint, ...]:
     except OSError as error:
         raise InvalidRequest(f"{path}: {error.strerror}") from None
     except (ValueError, RecursionError) as error:
-        raise InvalidRequest(f"{path}: not a QGroundControl plan, which is JSON ({error})") from None
+        raise InvalidRequest(f"{path}: not a QGroundControl plan, which is JSON; save it as .plan ({error})") from None
+    if isinstance(plan, dict) and plan.get("fileType", "Plan") != "Plan":
+        raise InvalidRequest(
+            f"{path}: fileType must be Plan, not {plan['fileType']!r:.40}; save the plan with QGroundControl"
+        )
     mission = plan.get("mission") if isinstance(plan, dict) else None
     items = mission.get("items") if isinstance(mission, dict) else None
     if not isinstance(items, list):
-        raise InvalidRequest(f"{path}: not a QGroundControl plan; it has no list mission.items")
+        raise InvalidRequest(
+            f"{path}: not a QGroundControl plan, because it has no list mission.items; save the plan again"
+        )
     for part in ("geoFence", "rallyPoints"):
         contents = plan.get(part)
         lists = contents.values() if isinstance(contents, dict) else ()
@@ -182,6 +189,10 @@ def _waypoint(item: _Item, speed_mps: float | None) -> Waypoint:
         item.refuse("has no complete position; give latitude, longitude and altitude")
     if not (-90 <= lat <= 90 and -180 <= lon <= 180):
         item.refuse(f"has the position {lat}, {lon}, which is not a place on Earth; correct it")
+    if lat == lon == 0:
+        item.refuse("has the position 0, 0, which ArduPilot treats as the current position; place it on the map")
+    if yaw_deg is not None and abs(yaw_deg) > 360:
+        item.refuse(f"has the heading {yaw_deg:g} degrees; set param 4 to -360 to 360")
     if pass_m:
         item.refuse(f"passes its position at {pass_m} m, which cannot be flown; set param 3 to 0")
     if (stay_s or 0.0) < 0 or (radius_m or 0.0) < 0:
@@ -200,6 +211,8 @@ def _speed_mps(item: _Item, current_mps: float | None) -> float | None:
         item.refuse("has an unknown speed type; use a ground speed (param 1: 1, param 4: 0)")
     if speed_mps == _DEFAULT_SPEED:
         return None
+    if speed_mps is not None and speed_mps < 0 and speed_mps != _SAME_SPEED:
+        item.refuse(f"has the speed {speed_mps:g} m/s; set param 2 to a speed above 0")
     return speed_mps if speed_mps is not None and speed_mps > 0 else current_mps
 
 

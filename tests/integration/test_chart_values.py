@@ -144,3 +144,50 @@ def test_digest_of_unknown_image_is_refused() -> None:
     with pytest.raises(subprocess.CalledProcessError) as refused:
         render(f"--set=image.digests.navigator=sha256:{'0' * 64}")
     assert "navigator" in refused.value.stderr
+
+
+DRONE = "drone=drone-1"
+WRONG_VALUES = [
+    ("fractus", "operator.replica=3", "at '/operator': additional properties 'replica' not allowed"),
+    ("fractus", "operator.replicas=two", "at '/operator/replicas': got string, want integer"),
+    ("fractus", "image.repository=x", "at '/image': additional properties 'repository' not allowed"),
+    ("fractus", "image.tag=a:b", "at '/image/tag': 'a:b' does not match"),
+    ("fractus", "image.pullPolicy=Allways", "one of 'Always', 'IfNotPresent', 'Never'"),
+    ("fractus", "logLevel=info", "one of 'DEBUG', 'INFO', 'WARNING', 'ERROR'"),
+    ("fractus", "mobility.autopilot=127.0.0.1:5760", "at '/mobility/autopilot': '127.0.0.1:5760' does not match"),
+    ("fractus", "mobility.autopilot=tcp:127.0.0.1", "at '/mobility/autopilot': 'tcp:127.0.0.1' does not match"),
+    ("fractus", "mobility.autopilot=tcp:a:99999", "at '/mobility/autopilot': 'tcp:a:99999' does not match"),
+    ("fractus", "mobility.extraArgs=--verbose", "at '/mobility/extraArgs': got string, want array"),
+    ("fractus", "mobility.extraEnv[0].name=1A", "at '/mobility/extraEnv/0/name': '1A' does not match"),
+    ("fractus", "agent.resources.limits.memory=128", "at '/agent/resources/limits/memory': minimum: got 128"),
+    ("fractus", "agent.resources.limits.memory=128MB", "at '/agent/resources/limits/memory': '128MB' does not match"),
+    ("fractus", "mobility.resources.requests.cpu=fast", "at '/mobility/resources/requests/cpu': 'fast' does not match"),
+    ("fractus", "agent.resources.limit.cpu=1", "at '/agent/resources': additional properties 'limit' not allowed"),
+    ("fractus", "camera.recordings.megabytes=1GB", "at '/camera/recordings/megabytes': got string, want integer"),
+    ("fractus", "host.state=/", "at '/host/state': '/' does not match"),
+    ("fractus", "admission.exemptNamespaces=kube-system", "at '/admission/exemptNamespaces': got string, want array"),
+    ("fractus", "imagePullSecrets[0].name=regcred", "at '/imagePullSecrets/0': got object, want string"),
+    ("fractus-crds", "kep=true", "additional properties 'kep' not allowed"),
+    ("fractus-crds", "keep=yes", "at '/keep': got string, want boolean"),
+    ("fractus-demo", "dron=drone-1", "additional properties 'dron' not allowed"),
+    ("fractus-demo", "drone=Drone_1", "at '/drone': 'Drone_1' does not match"),
+    ("fractus-demo", f"{DRONE},edgeNodes=edge-1", "at '/edgeNodes': got string, want array"),
+    ("fractus-demo", f"{DRONE},edgeNodes={{edge-1,Edge_2}}", "at '/edgeNodes/1': 'Edge_2' does not match"),
+    ("fractus-demo", f"{DRONE},edgeNodes={{drone-1}}", "edgeNodes: drone-1 is the drone of this release; specify other"),
+    ("fractus-demo", f"{DRONE},vehicle.home=50.8\\,4.6", "at '/vehicle/home': '50.8,4.6' does not match"),
+    ("fractus-demo", f"{DRONE},vehicle.home=95\\,4.6\\,10", "at '/vehicle/home': '95,4.6,10' does not match"),
+]  # fmt: skip
+"""A chart, wrong values, and a part of the answer of helm, which names the value."""
+
+
+@pytest.mark.parametrize(("chart", "values", "answer"), WRONG_VALUES, ids=[values for _, values, _ in WRONG_VALUES])
+def test_wrong_value_of_chart_is_refused_with_its_name(chart: str, values: str, answer: str) -> None:
+    with pytest.raises(subprocess.CalledProcessError) as refused:
+        render(f"--set={values}", chart=chart)
+    assert answer in refused.value.stderr
+
+
+@pytest.mark.parametrize("memory", ["128Mi", "1.5Gi", "134217728", "1e9", "500M"])
+def test_chart_accepts_quantities_of_memory(memory: str) -> None:
+    assert render(f"--set-string=agent.resources.limits.memory={memory}")
+    assert render(f"--set=agent.resources.limits.memory={memory}")

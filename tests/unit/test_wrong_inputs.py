@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
+import fractus
 import pytest
 from fractus_cli import status  # noqa: F401  (its import of urllib3 binds a socket, which tests of this tier may not do)
 from fractus_cli.main import run
@@ -298,6 +301,88 @@ COMMANDS = [
 ]  # fmt: skip
 """A command, and parts of its answer."""
 
+RING = [[50.87, 4.68], [50.87, 4.69], [50.88, 4.69]]
+AT = [0, 0, 0, None, 50.87, 4.68, 20]
+
+
+def plan_file(**parts: Any) -> str:
+    """Return a plan of QGroundControl with these parts."""
+    return json.dumps({"fileType": "Plan", "version": 1, **parts})
+
+
+def fence(*polygons: Any, **more: Any) -> str:
+    return plan_file(geoFence={"version": 2, "polygons": polygons, **more})
+
+
+def polygon(**fields: Any) -> dict[str, Any]:
+    return {"polygon": RING, "inclusion": False, "version": 1, **fields}
+
+
+def circle(**fields: Any) -> str:
+    return fence(
+        circles=[{"circle": {"center": [50.87, 4.68], "radius": 50, **fields}, "inclusion": True, "version": 1}]
+    )
+
+
+def item(command: object = 16, params: Any = AT, frame: object = 3) -> dict[str, Any]:
+    return {"type": "SimpleItem", "command": command, "frame": frame, "params": params}
+
+
+def mission(*items: Any) -> str:
+    return plan_file(mission={"version": 2, "items": items})
+
+
+FENCES = [
+    ("", "line 1: invalid JSON", "export the file again"),
+    ("QGC WPL 110\n", "line 1: invalid JSON", "export the file again"),
+    ("[1]", "this is not a JSON object", "export the file again"),
+    (plan_file(fileType="Mission"), "fileType: must be Plan, not 'Mission'; save the plan with QGroundControl"),
+    (plan_file(version=2), "version: must be 1, not 2; save the plan again"),
+    (plan_file(), "the file contains no zone; draw a polygon or a circle"),
+    (plan_file(geoFence={"version": 1, "polygon": []}), "geoFence.version: must be 2, not 1; save the plan again"),
+    (plan_file(geoFence={"version": 2, "polygons": polygon()}), "geoFence.polygons: must be a list of objects"),
+    (fence(polygon(version=7)), "geoFence.polygons[0].version: must be 1, not 7; save the plan again"),
+    (fence(polygon(inclusion="no")), "polygons[0].inclusion: must be true or false, not 'no'; choose Inclusion or not"),
+    (fence(polygon(altitude=50)), "polygons[0].altitude: a Zone cannot represent this field; remove it if"),
+    (fence(polygon(polygon=RING[:2])), "polygons[0].polygon: a ring needs at least three points"),
+    (
+        fence(polygon(polygon=[[150.87, 4.68], *RING])),
+        "polygon[0]: 150.87, 4.68 is not a place on Earth; the order is lat, lon",
+    ),
+    (fence(polygon(polygon=[["50.87", 4.68], *RING])), "polygon[0]: must be two numbers, degrees"),
+    (fence(polygon(polygon=[[50.87, 4.68, 5], *RING])), "has a height; remove the heights"),
+    (fence(polygon(polygon=[*RING, [50.86, 4.685]])), "the ring crosses itself", "list the points in order"),
+    (fence(polygon()).replace("50.88", "NaN"), "NaN is not a JSON number; use a finite number"),
+    (circle(radius=0), "circle.radius: must be above 0 and at most 200000 metres, not 0"),
+    (circle(radius="50 m"), "circle.radius: must be above 0 and at most 200000 metres, not '50 m'"),
+    (circle(center={"lat": 50.87, "lon": 4.68}), "circle.center: must be two numbers, degrees"),
+]
+"""A plan file of QGroundControl with a wrong fence, and parts of the answer of `fractus zones import`."""
+
+MISSIONS = [
+    ("", "not a QGroundControl plan, which is JSON; save it as .plan"),
+    ("QGC WPL 110\n", "not a QGroundControl plan, which is JSON; save it as .plan"),
+    ("[]", "has no list mission.items; save the plan again"),
+    (plan_file(), "has no list mission.items; save the plan again"),
+    (plan_file(fileType="Fence", mission={"items": [item()]}), "fileType must be Plan, not 'Fence'; save the plan"),
+    (mission(), "the plan contains no waypoint; add waypoints or a survey"),
+    (mission("a"), "item 1 must be an object, not 'a'; save the plan again"),
+    (mission(item("16")), "item 1 has no MAV_CMD as command, but '16'; save the plan again"),
+    (mission(item(), item(177)), "item 2 (MAV_CMD_DO_JUMP) cannot be flown; remove it from the plan"),
+    (mission(item(), item(20), item()), "item 2 (MAV_CMD_NAV_RETURN_TO_LAUNCH) comes before a waypoint", "split the plan"),
+    (mission(item(frame=2)), "has the unsupported frame 2; use altitudes above home, AMSL or terrain"),
+    (mission(item(params=AT[:5])), "must have a list of 7 params; save the plan again"),
+    (mission(item(params=[*AT[:4], "50.8", 4.6, 20])), "has the param 5 '50.8', which must be a number or null"),
+    (mission(item(params=[*AT[:4], 150.8, 4.6, 20])), "has the position 150.8, 4.6, which is not a place on Earth"),
+    (mission(item(params=[*AT[:4], 0, 0, 20])), "has the position 0, 0, which ArduPilot treats as the current position"),
+    (mission(item(params=[*AT[:6], None])), "has no complete position; give latitude, longitude and altitude"),
+    (mission(item(params=[-3, *AT[1:]])), "has a negative stay or acceptance radius; set params 1 and 2 to 0 or more"),
+    (mission(item(params=[0, 0, 0, 9000, *AT[4:]])), "has the heading 9000 degrees; set param 4 to -360 to 360"),
+    (mission(item(178, [1, -5, -1, 0, 0, 0, 0]), item()), "item 1 (MAV_CMD_DO_CHANGE_SPEED) has the speed -5 m/s; set param 2"),
+    (mission({"type": "ComplexItem", "complexItemType": "StructureScan"}), "item 1 (StructureScan) contains no waypoints", "replace it"),
+]  # fmt: skip
+"""A plan file of QGroundControl with a wrong mission, and parts of the answer of `fractus.read_plan`."""
+
 Answer = Callable[[str], str]
 
 
@@ -337,6 +422,24 @@ def test_wrong_command_is_answered_with_what_is_wrong_and_the_remedy(answer: Ans
     command, *fragments = row
     text = answer(command)
     assert [fragment for fragment in fragments if fragment not in text] == [], text
+
+
+@pytest.mark.parametrize("row", FENCES, ids=range(len(FENCES)))
+def test_wrong_fence_of_plan_is_answered_with_its_field_and_the_remedy(answer: Answer, row: tuple[str, ...]) -> None:
+    content, *fragments = row
+    Path("wrong.plan").write_text(content)
+    text = answer("zones import wrong.plan --from qgc-plan")
+    assert [fragment for fragment in fragments if fragment not in text] == [], text
+
+
+@pytest.mark.parametrize("row", MISSIONS, ids=range(len(MISSIONS)))
+def test_wrong_mission_of_plan_is_answered_with_its_item_and_the_remedy(tmp_path: Path, row: tuple[str, ...]) -> None:
+    content, *fragments = row
+    path = tmp_path / "wrong.plan"
+    path.write_text(content)
+    with pytest.raises(fractus.InvalidRequest) as refused:
+        fractus.read_plan(path)
+    assert [fragment for fragment in (str(path), *fragments) if fragment not in str(refused.value)] == [], refused.value
 
 
 def test_right_manifests_of_the_table_are_accepted(answer: Answer, capsys: pytest.CaptureFixture[str]) -> None:

@@ -440,7 +440,7 @@ def test_import_rejects_duplicate_keys():
             (
                 formats.read_geojson,
                 json.dumps(feature({"type": "Point", "coordinates": [4, 50]}, properties={"radius": radius})),
-                "properties.radius: must be 0 to 200000 metres, not",
+                "properties.radius: must be above 0 and at most 200000 metres, not",
             )
             for radius in (0, -1, True, "5", 10**200)
         ),

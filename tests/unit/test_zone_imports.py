@@ -36,7 +36,7 @@ def import_file(path, source, *options):
             ],
         ),
         ("geo-polygon-buffer.geojson", ["properties.buffer: may state", "properties.Bufferzone: may state"]),
-        ("geo-radius-string.geojson", ["properties.radius: must be 0 to 200000 metres, not '2000'"]),
+        ("geo-radius-string.geojson", ["properties.radius: must be above 0 and at most 200000 metres, not '2000'"]),
         ("kml-gx.kml", ["altitudeMode: relativeToSeaFloor uses heights, which cannot be imported; clamp"]),
         ("kml-kmz.kmz", ["this is a ZIP archive, such as a KMZ file; unpack it and import the file inside (doc.kml)"]),
         ("kml-latin1.kml", ["not a UTF-8 text file"]),
@@ -343,7 +343,7 @@ def test_ed318_reads_each_geometry_with_its_own_layer():
     [
         (POINT, {}, "geometry.extent.subType: must be Circle"),
         ({**POINT, "extent": {**CIRCLE, "uom": "NM"}}, {}, "geometry.extent.uom: a Zone cannot represent"),
-        ({**POINT, "extent": CIRCLE | {"radius": "5"}}, {}, "geometry.extent.radius: must be 0 to 200000 metres"),
+        ({**POINT, "extent": CIRCLE | {"radius": "5"}}, {}, "geometry.extent.radius: must be above 0 and at most 200000 metres"),
         ({**FLAT, "layer": LAYER | {"uom": "FL"}}, {}, "geometry.layer.uom: must be M or FT"),
         ({**FLAT, "layer": LAYER | {"lowerReference": "WGS84"}}, {}, "geometry.layer.lowerReference: must be AGL or AMSL"),
         ({**FLAT, "layer": LAYER | {"to": 9}}, {}, "geometry.layer.to: a Zone cannot represent"),

@@ -24,7 +24,9 @@ from fractus_core.geo.formats.zone_builder import (
     unsupported_parts,
 )
 
+_PLAN_VERSION = 1
 _FENCE_VERSION = 2
+_SHAPE_VERSION = 1
 _OF_PLAN = frozenset({"fileType", "version", "groundStation", "geoFence", "mission", "rallyPoints"})
 _OF_FENCE = frozenset({"version", "polygons", "circles", "breachReturn"})
 
@@ -43,7 +45,13 @@ def read_qgc_plan(text: str, without: Collection[str] = ()) -> Imported:
     """
     document = parse_json(text)
     if document.get("fileType") != "Plan":
-        raise InvalidObject("fileType", f"must be Plan, not {document.get('fileType')!r}")
+        raise InvalidObject(
+            "fileType", f"must be Plan, not {document.get('fileType')!r}; save the plan with QGroundControl as .plan"
+        )
+    if document.get("version", _PLAN_VERSION) != _PLAN_VERSION:
+        raise InvalidObject(
+            "version", f"must be {_PLAN_VERSION}, not {document.get('version')!r:.40}; save the plan again"
+        )
     reject_unknown_fields(document, _OF_PLAN, "")
     fence = optional_object(document.get("geoFence"), "geoFence")
     if fence and fence.get("version") != _FENCE_VERSION:
@@ -72,9 +80,16 @@ def read_qgc_plan(text: str, without: Collection[str] = ()) -> Imported:
 
 
 def _kind(item: dict[str, Any], field: str) -> str:
+    if item.get("version", _SHAPE_VERSION) != _SHAPE_VERSION:
+        raise InvalidObject(
+            f"{field}.version", f"must be {_SHAPE_VERSION}, not {item.get('version')!r:.40}; save the plan again"
+        )
     value = item.get("inclusion")
     if not isinstance(value, bool):
-        raise InvalidObject(f"{field}.inclusion", f"must be true or false, not {value!r:.40}")
+        raise InvalidObject(
+            f"{field}.inclusion",
+            f"must be true or false, not {value!r:.40}; choose Inclusion or not in QGroundControl, and save the plan again",
+        )
     return "inclusion" if value else "exclusion"
 
 
@@ -123,12 +138,12 @@ def write_qgc_plan(zones: Iterable[Zone], *, inclusion: bool = False) -> Exporte
         if area.circle is not None:
             centre = [area.circle.center.lat, area.circle.center.lon]
             circle = {"center": centre, "radius": area.circle.radius}
-            circles.append({"circle": circle, "inclusion": inclusion, "version": 1})
+            circles.append({"circle": circle, "inclusion": inclusion, "version": _SHAPE_VERSION})
         elif area.polygon is not None:
             corners = [[p.lat, p.lon] for p in area.polygon.exterior]
             if any(abs(a[1] - b[1]) > 180 for a, b in itertools.pairwise([*corners, corners[0]])):
                 notes.append(f"{zone.name}: it crosses the antimeridian; QGroundControl draws it around the world")
-            polygons.append({"polygon": corners, "inclusion": inclusion, "version": 1})
+            polygons.append({"polygon": corners, "inclusion": inclusion, "version": _SHAPE_VERSION})
     mission = {
         "cruiseSpeed": 15, "firmwareType": 3, "globalPlanAltitudeMode": 1, "hoverSpeed": 5, "items": [],
         "plannedHomePosition": [0, 0, 0], "vehicleType": 2, "version": 2,
@@ -139,6 +154,6 @@ def write_qgc_plan(zones: Iterable[Zone], *, inclusion: bool = False) -> Exporte
         "groundStation": "QGroundControl",
         "mission": mission,
         "rallyPoints": {"points": [], "version": 2},
-        "version": 1,
+        "version": _PLAN_VERSION,
     }
     return Exported(json.dumps(document, indent=2) + "\n", tuple(notes))

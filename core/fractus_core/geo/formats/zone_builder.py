@@ -347,7 +347,7 @@ def parse_json(text: str) -> dict[str, Any]:
     except BadDocument as error:
         raise InvalidObject(f"line {error.line}" if error.line else "", error.problem) from None
     if not isinstance(value, dict):
-        raise InvalidObject("", "this is not a JSON object")
+        raise InvalidObject("", "this is not a JSON object, which begins with {; export the file again")
     return value
 
 
@@ -512,7 +512,9 @@ def circle_area(centre: Point, radius_m: Any, field: str) -> dict[str, Any]:
         InvalidObject: The radius is not a length.
     """
     if not is_number(radius_m) or not 0 < radius_m <= MAX_RADIUS_M:
-        raise InvalidObject(field, f"must be 0 to {MAX_RADIUS_M:.0f} metres, not {_short_repr(radius_m)}")
+        raise InvalidObject(
+            field, f"must be above 0 and at most {MAX_RADIUS_M:.0f} metres, not {_short_repr(radius_m)}"
+        )
     return {"circle": {"center": centre.to_dict(), "radius": float(radius_m)}}
 
 

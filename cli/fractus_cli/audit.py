@@ -37,7 +37,7 @@ def audit() -> None:
     "--since",
     multiple=True,
     help="Checkpoint stored off the node: a copy of the log's .checkpoint file, or LOG:NUMBER:HASH from the node's status."
-    " The log must contain this entry and every later one. May be repeated, once for each log.",
+    " The log must contain this entry and all later entries. May be repeated, once for each log.",
 )
 @click.option("--ca", type=_FILE, help="CA certificate that must have issued the certificates in checkpoints.")
 @output_option
@@ -236,7 +236,7 @@ def _cluster_shapes(application: str, config: str | None) -> list[Shape]:
     areas = area_of_plan(plan.spec)
     if not areas:
         raise click.ClickException(
-            f"--application {application}: its plan has no operation area, because no drone flies it"
+            f"--application {application}: its plan has no operation area, because the application uses no drone"
         )
     return [*_zone_shapes({zone.name: zone for zone in zones}), *((area, area.name, "") for area in areas)]
 

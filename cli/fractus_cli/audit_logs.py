@@ -30,7 +30,7 @@ def find_logs(paths: Iterable[Path]) -> dict[Path, list[Path]]:
 
 
 def verify_log(name: Path, files: list[Path], since: ChainEntry | None = None) -> tuple[Finding, str]:
-    """Verify a log. Return the finding, and the problem with its file and line (empty if the log is sound).
+    """Verify a log. Return the finding, and the first problem with its file and line (empty if the log is sound).
 
     Args:
         name: Path of the log. It is not among `files` if only some segments are verified.

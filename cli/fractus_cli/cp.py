@@ -69,7 +69,10 @@ def _parse_source(context: click.Context, argument: click.Parameter, text: str) 
 @click.argument("destination", type=click.Path(path_type=Path))
 @click.option("-n", "--namespace", default="default", show_default=True, help="Namespace of the Application.")
 @click.option("--pod", help="Pod to copy from, if several pods of the component run.")
-@click.option("--image", help="Image with `sleep` and `tar` that reads a claim.  [default: image of the component]")
+@click.option(
+    "--image",
+    help="Image of the pod that reads a claim; it must contain `sleep` and `tar`.  [default: image of the component]",
+)
 @click.option(
     "--kubeconfig",
     type=click.Path(exists=True, dir_okay=False),
@@ -91,7 +94,9 @@ def cp(
     labels = f"fractus.dev/application={shortened(source.application, 63)},fractus.dev/component={source.component}"
     running = [body["metadata"]["name"] for body in kubectl.get("pods", "-l", labels)["items"] if _runs(body)]
     if pod is not None and pod not in running:
-        raise click.ClickException(f"--pod {pod} is no running pod of {source.component} (running: {_listed(running)})")
+        raise click.ClickException(
+            f"--pod {pod} is not a running pod of {source.component} (running: {_listed(running)})"
+        )
     if pod is None and len(running) > 1:
         raise click.ClickException(
             f"{source.component} has several running pods; select one with --pod: {_listed(running)}"
@@ -161,7 +166,7 @@ class Kubectl:
                 try:
                     yield process.stdout
                     if len(process.stdout.read(_MAX_PADDING_BYTES + 1)) > _MAX_PADDING_BYTES:
-                        raise click.ClickException("stopped: the pod sends data after the end of its archive")
+                        raise click.ClickException("stopped: the pod sent data after the end of its archive")
                 except (tarfile.TarError, ValueError):
                     failed = True
                 except BaseException:
@@ -236,7 +241,7 @@ def extract(stream: IO[bytes], name: str, target: Path) -> int:
                     copied += 1
                 else:
                     click.echo(
-                        printable(f"warning: not copied, because it is no regular file: {member.name}"), err=True
+                        printable(f"warning: not copied, because it is not a regular file: {member.name}"), err=True
                     )
             except OSError as error:
                 raise click.ClickException(f"cannot write {printable(str(file))}: {error.strerror or error}") from None
@@ -271,7 +276,7 @@ def reader_pod(application: Body, component: Body, source: Source, image: str | 
     if mount is None:
         paths = _listed([str(path) for path in mounts])
         raise click.ClickException(
-            f"no pod of {source.component} runs, and {source.path} is in no PersistentVolumeClaim of it (claims: {paths});"
+            f"no pod of {source.component} runs, and {source.path} is in no PersistentVolumeClaim of the component (claims: {paths});"
             " other files are deleted with the pod: write results to a claim, or copy them before the pod ends (spec.afterFlight)"
         )
     reader = {

@@ -33,7 +33,7 @@ _LISTED = 5
 @output_option
 @kubeconfig_option
 def explain(name: str, namespace: str, list_all: bool, output: str, config: str | None) -> int:
-    """Explain where APPLICATION runs, why other nodes were rejected, and what policies changed.
+    """Explain where APPLICATION runs, why other nodes were rejected, and how policies changed the mission.
 
     The exit code is 2 if there is no plan, or if policies forbid the mission as planned.
     """

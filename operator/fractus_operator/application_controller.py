@@ -251,7 +251,7 @@ class ApplicationController:
                 return None
             flown = flown.model_copy(update={"flown": record})
         elif application is not None and self._next_mission_begins(application, flown):
-            # A remaining plan of the last mission would claim its drone, and exempt the next mission from checks.
+            # If the plan of the last mission remained, it would claim its drone, and exempt the next mission from checks.
             removed = await self._start_over(observed.key, until_deleted(application, flown), _drone_of(flown))
             # The Grants of the last mission must be deleted before a new one begins.
             return 1.0 if removed else None

@@ -36,10 +36,10 @@ class Claim:
     returning: bool = False
 
     def holder(self, requester: str | None) -> Key:
-        """Return the key of the holder for the planning of the Application with the uid `requester`.
+        """Return the key of the holder, for planning the Application with the uid `requester`.
 
-        For other claims under the requester's name, and for a returning drone, the name has a suffix. Only the current
-        claim of the requester itself therefore equals the requester's key.
+        The key equals the requester's key only if the requester itself holds the drone and the drone is not returning.
+        Otherwise the name in the key has a suffix if it could be confused with the requester's name.
         """
         namespace, name = self.key
         if requester is None:

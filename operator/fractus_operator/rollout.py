@@ -1,4 +1,4 @@
-"""Rollout of a plan: applies the child objects of an Application in order, and updates addresses and certificates later."""
+"""Rollout of a plan: applies the child objects of an Application in order, and later updates addresses and certificates."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ class Rollout:
             # The plan records which Application flies the drone, also after a crash. So it comes first.
             await self._objects.apply(application, {kinds.DEPLOYMENT_PLAN: desired[kinds.DEPLOYMENT_PLAN]})
             await self._objects.prune(application, desired)
-            # If the rules changed meanwhile, only existing Grants are applied. They are compiled again in the next step.
+            # If the rules changed meanwhile, only existing Grants are applied. The next step compiles all Grants again.
             current = rules == self._cache.rules_revision
             granted = {
                 kinds.GRANT: [

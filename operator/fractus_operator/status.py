@@ -1,4 +1,4 @@
-"""Status of an Application: phase, message and conditions, from its plan, pods, Grants and drone. Pure."""
+"""Status of an Application: phase, message and conditions, from its plan, pods, Grants and drone. Pure functions."""
 
 from __future__ import annotations
 
@@ -128,11 +128,11 @@ def flight(name: str, drone: Drone | None, *, took_off: bool) -> FlightStatus:
         last = "on the ground"
         if status is not None and status.last_flight_state:
             last = _ACTIVITY[status.last_flight_state]
-        return FlightStatus("Unknown", f"{name} is in an unknown state, at its last report it was {last}", None, begun)
+        return FlightStatus("Unknown", f"{name} is in an unknown state (at its last report: {last})", None, begun)
     if not in_air:
         if begun:
             return FlightStatus("Landed", f"{name} has landed", None, begun)
-        return FlightStatus("Waiting", f"{name} is on the ground, its mission has not begun", None, begun)
+        return FlightStatus("Waiting", f"{name} is on the ground and its mission has not begun", None, begun)
     controller = status.controller
     flown_by = f", flown by {controller}" if controller else ""
     phase: FlightPhase = "TakingOff" if status.flight_state == "takingOff" else "Flying"
@@ -142,8 +142,8 @@ def flight(name: str, drone: Drone | None, *, took_off: bool) -> FlightStatus:
 def mission_outcome(uid: str | None, grants: Iterable[Grant]) -> Outcome | None:
     """Return the mission outcome of the Application with this uid, or None while its mission continues.
 
-    The node of the driver reports the outcome. Without a driver, the node of the component reports it whose points of interest
-    the system visits.
+    The node of the driver reports the outcome. If there is no driver, the node of the component with points of interest reports
+    the outcome.
     """
     for grant in grants:
         spec = grant.spec
@@ -308,7 +308,7 @@ def apply_failed(reported: Mapping[str, Any], reason: str, error: str) -> Status
     """
     message = f"cannot apply child objects, retrying: {error}"
     known = (Condition.model_validate(c) for c in reported.get("conditions") or ())
-    # A stage that was reached stays reached. For the other stages the present state is unknown, so their conditions are removed.
+    # Conditions of reached stages stay True. The state of the other stages is unknown, so their conditions are removed.
     kept = [
         ConditionUpdate(c.type, c.status, c.reason, c.message)
         for c in known

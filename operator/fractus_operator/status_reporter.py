@@ -107,7 +107,7 @@ class StatusReporter:
         facts = {"drone": update.drone, "controller": update.controller, "pods": update.pods}
         status |= {name: value for name, value in facts.items() if value is not None}
         present = self._applications.get(submitted.key)
-        # The observed status is compared, because a user may have edited it since the last report.
+        # Compare with the observed status, because a user may have edited it since the last report.
         if present is not None and present.uid == submitted.uid and present.body.get("status") == status:
             return
         namespace, name = submitted.key
@@ -121,7 +121,7 @@ class StatusReporter:
         except Conflict:
             present = self._applications.get(submitted.key)
             if present is not None and present.uid == submitted.uid:
-                # The caller relies on the write: the outcome of a mission has no other record.
+                # Do not ignore the conflict: the status may be the only record of a mission's outcome.
                 raise
             return
         self._applications.record_write(key_of(applied), applied)

@@ -99,7 +99,7 @@ def test_cp_copies_a_directory_of_a_running_pod(cluster: Path, tmp_path: Path) -
     result = run("survey/Store:/data/", "results")
     assert result.exit_code == 0, result.output
     assert "copied 2 files from survey/Store:/data" in result.output
-    assert "not copied, because it is no regular file: data/pictures/latest" in result.output.replace("./", "")
+    assert "not copied, because it is not a regular file: data/pictures/latest" in result.output.replace("./", "")
     copied = {str(p.relative_to(tmp_path / "results")) for p in (tmp_path / "results").rglob("*")}
     assert copied == {"pictures", "pictures/1.jpg", "summary.csv"}
     assert (tmp_path / "results" / "pictures" / "1.jpg").read_bytes() == b"picture" * 10_000
@@ -160,7 +160,7 @@ def test_cp_stops_a_container_that_sends_more_than_its_archive(cluster: Path, tm
     endless.chmod(0o755)
     result = run("survey/Store:/data", "results")
     assert result.exit_code == 1
-    assert "the pod sends data after the end of its archive" in result.output
+    assert "the pod sent data after the end of its archive" in result.output
 
 
 def test_cp_reports_a_missing_file(cluster: Path, tmp_path: Path) -> None:
@@ -178,9 +178,9 @@ def test_cp_reports_a_missing_file(cluster: Path, tmp_path: Path) -> None:
         (["survey/Store:data", "x"], "is not APPLICATION/COMPONENT:PATH"),
         (["survey/Store:/data/../etc", "x"], "contains '..'"),
         (["survey/Stor:/data", "x"], "has no component Stor (components: Navigator, Store)"),
-        (["survey/Store:/tmp/x", "x"], "/tmp/x is in no PersistentVolumeClaim of it (claims: /data)"),
+        (["survey/Store:/tmp/x", "x"], "/tmp/x is in no PersistentVolumeClaim of the component (claims: /data)"),
         (["survey/Navigator:/tmp/x", "x"], "(claims: none)"),
-        (["survey/Store:/data", "x", "--pod", "a"], "--pod a is no running pod of Store (running: none)"),
+        (["survey/Store:/data", "x", "--pod", "a"], "--pod a is not a running pod of Store (running: none)"),
     ],
 )
 def test_cp_refuses_a_source_that_does_not_exist(cluster: Path, arguments: list[str], sentence: str) -> None:

@@ -425,7 +425,7 @@ def fresh(world: World, namespace: str, before: set[str]) -> set[str]:
 def test_phase_follows_drone(world: World, operator: OperatorProcess, namespace: str) -> None:
     status = running(world, namespace)
     assert "flies" not in status["message"]
-    assert "drone-1 is on the ground, its mission has not begun" in status["message"]
+    assert "drone-1 is on the ground and its mission has not begun" in status["message"]
     assert world.condition(namespace, "MissionComplete")["reason"] == "MissionWaiting"
     path = f"{FRACTUS}/drones/drone-1/status"
     world.api.merge(path, {"status": {"flightState": "takingOff", "controller": "Navigator"}})
@@ -442,7 +442,7 @@ def test_phase_follows_drone(world: World, operator: OperatorProcess, namespace:
     assert "controller" not in lost
     ready = world.condition(namespace, "Ready")
     assert (ready["status"], ready["reason"]) == ("Unknown", "TelemetryLost")
-    assert "at its last report it was flying" in ready["message"]
+    assert "(at its last report: flying)" in ready["message"]
     world.drone_status("drone-1", "inactive")
     assert "has landed" in world.phase(namespace, "Landed")["message"]
     assert {"MissionBegun", "TelemetryLost"} <= set(events(world, namespace))

@@ -79,7 +79,7 @@ def test_application_that_starts_when_ready_waits_for_its_components_until_takeo
     set_ready(world, namespace, "DataStore", "False")
     wait_for(lambda: awaits(world, namespace) == ["DataStore"], "the drone to wait for the DataStore")
     expected = (
-        "waiting for traffic-data-store; drone-1 is on the ground, its mission has not begun;"
+        "waiting for traffic-data-store; drone-1 is on the ground and its mission has not begun;"
         " the mission begins when all components are ready"
     )
     wait_for(lambda: world.status(namespace)["message"] == expected, lambda: f"{expected}: {world.status(namespace)}")

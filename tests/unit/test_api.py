@@ -75,7 +75,7 @@ def test_invalid_application_error_names_field_and_remedy():
         ([navigator([plain | {"lat": 95}])], "spec.components[0].controlPoints[0].path[0].lat: must be less than or equal to 90, not 95"),
         ([STORE | {"replicas": 0}], "spec.components[0].replicas: must be greater than or equal to 1, not 0"),
         ([edge_component(locations=[{"center": plain, "radius": -1}])], "spec.components[0].locations[0].radius: must be greater than 0, not -1"),
-        ([edge_component(locations=[{"center": plain, "radius": 1, "instances": 0}])], "spec.components[0].locations[0].instances: instances is a whole number of 1 to 10000, or"),
+        ([edge_component(locations=[{"center": plain, "radius": 1, "instances": 0}])], "spec.components[0].locations[0].instances: instances must be a whole number from 1 to 10000, or"),
         ([edge_component(locations=[])], "spec.components[0].locations: locations are required for placement edge"),
         ([STORE | {"egress": ["Stranger"]}], "spec.components[0].egress[0]: egress names a component that is not in the application; correct the name or add the component (Stranger)"),
         ([STORE | {"egress": ["DataStore"]}], "spec.components[0].egress[0]: egress names the component itself; remove it (DataStore)"),

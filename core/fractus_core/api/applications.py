@@ -78,7 +78,8 @@ class ApplicationSpec(Model):
         " action applies.",
     )
     contact_lost: ContactLoss | None = Field(
-        default=None, description="Reaction when the drone loses contact with the API server; unset: it flies on."
+        default=None,
+        description="Reaction when the drone loses contact with the API server; unset: the mission continues.",
     )
     update_policy: Literal["OnGround", "Immediate"] = Field(
         default="OnGround",

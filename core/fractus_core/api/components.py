@@ -16,7 +16,7 @@ from fractus_core.api.names import ComponentName, HeuristicKind, Name, PortName,
 from fractus_core.api.rules import Violation, one_of, rule
 
 _LEAST_MEMORY = "4Mi"
-"""Least memory of a container. A smaller amount lacks its unit, because no container starts with it."""
+"""Minimum memory of a container. No container starts with less, so the unit of a smaller amount is probably missing."""
 _RESOURCES = ("cpu", "memory", "ephemeral-storage")
 _EXTENDED = (
     r"^[a-z0-9]([-a-z0-9]*[a-z0-9])?([.][a-z0-9]([-a-z0-9]*[a-z0-9])?)*/[A-Za-z0-9]([-A-Za-z0-9_.]*[A-Za-z0-9])?$"
@@ -279,7 +279,7 @@ ReferenceField = Literal["ingress", "egress", "hybridTo"]
 
 
 def default_lifetime(placement: Placement) -> Lifetime:
-    """Return the end of a component that declares none."""
+    """Return the default of `endsWith` for a placement."""
     return "application" if placement == "cloud" else "flight"
 
 
@@ -364,7 +364,7 @@ class ControlPoint(Model):
         description="Start location; default: the first waypoint of path, or the centre of region.",
     )
     navigation: Literal["pathBased", "regionBased"] = Field(
-        description="pathBased: the driver follows the waypoints of path. regionBased: it flies freely in region."
+        description="pathBased: the driver follows the waypoints of path. regionBased: the driver flies freely in region."
     )
     path: tuple[Position, ...] | None = Field(
         default=None, min_length=1, max_length=1000, description="Waypoints in flight order."
@@ -424,7 +424,7 @@ class EdgeLocation(Circle):
     @rule(
         "!has(self.instances) || self.instances == '*' || (type(self.instances) == int && self.instances >= 1"
         " && self.instances <= 10000)",
-        'instances is a whole number of 1 to 10000, or "*" for as many as possible',
+        'instances must be a whole number from 1 to 10000, or "*" for as many as possible',
     )
     def _positive(self) -> Violation:
         return "instances" if self.instances != "*" and not 1 <= self.instances <= 10000 else None
@@ -442,7 +442,10 @@ class Heuristic(Model):
         description="Metric for max and min: bandwidth or latency of the traffic from (ingress) or to (egress) its peers.",
     )
 
-    @rule("(self.kind in ['max', 'min']) == has(self.metric)", "kinds max and min need a metric, all others take none")
+    @rule(
+        "(self.kind in ['max', 'min']) == has(self.metric)",
+        "kinds max and min require a metric; other kinds must not have a metric",
+    )
     def _measured(self) -> Violation:
         return "metric" if (self.kind in {"max", "min"}) != (self.metric is not None) else None
 
@@ -464,7 +467,7 @@ class Component(Model):
     )
     control: ControlScope | None = Field(
         default=None,
-        description="Control of a driver: full (from arming to landing, the default) or partial (at its control points).",
+        description="Control of a driver: full (from arming to landing, the default) or partial (only at its control points).",
     )
     control_points: tuple[ControlPoint, ...] = Field(
         default=(), max_length=30, description="Places where the driver gets control, in flight order."

@@ -80,7 +80,7 @@ class DirectLinkSpec(OpenModel):
         description="Planned waypoints of the drone in order; empty if the drone flies freely in a region.",
     )
     services: tuple[LinkedService, ...] = Field(
-        default=(), description="Services on the other node that components on the drone call."
+        default=(), description="Services on the other node that components on the drone may call over the link."
     )
 
 

@@ -39,10 +39,12 @@ class GrantedPolicy(Model):
     name: str = Field(description="Name of the Policy.")
     spec: PolicySpec
     selected: bool = Field(
-        default=False, description="True if the application selected spec.action; otherwise it is that of the Policy."
+        default=False,
+        description="True if the application selected spec.action; false if spec.action is the default of the Policy.",
     )
     selected_land_at: Point | None = Field(
-        default=None, description="spec.landAt if the application selected it; unset if it is that of the Policy."
+        default=None,
+        description="Landing place that the application selected; unset: spec.landAt is the landing place of the Policy.",
     )
     zones: tuple[GrantedZone, ...] = Field(
         default=(),
@@ -88,7 +90,8 @@ class GrantSpec(Model):
         description="Class of a drone component: driver (commands the drone) or passenger (does not); unset for other nodes.",
     )
     control: ControlScope | None = Field(
-        default=None, description="Control of a driver: full (the whole flight) or partial (at its control points)."
+        default=None,
+        description="Control of a driver: full (the whole flight) or partial (only at its control points).",
     )
     control_points: tuple[ControlPoint, ...] = Field(
         default=(), description="Control points of the driver, in flight order."
@@ -120,12 +123,13 @@ class GrantSpec(Model):
     )
     policies: tuple[GrantedPolicy, ...] = Field(default=(), description="Policies that apply to the instance.")
     contact_lost: ContactLoss | None = Field(
-        default=None, description="Reaction when the drone loses contact with the API server; unset: it flies on."
+        default=None,
+        description="Reaction when the drone loses contact with the API server; unset: the mission continues.",
     )
     mission: str | None = Field(
         default=None,
         max_length=253,
-        description="Identifier of the mission, set when the Grant is signed. The drone remembers finished missions, so a new"
+        description="Identifier of the mission, set when the Grant is signed. The drone stores finished missions, so a new"
         " mission needs a new identifier.",
     )
     issued_at: datetime | None = Field(
@@ -323,7 +327,7 @@ def pack(bodies: Iterable[Mapping[str, Any]]) -> str:
 
 
 def pack_oldest(bodies: Sequence[Mapping[str, Any]]) -> tuple[str, int]:
-    """Pack the Grants of a node. If they are too many, pack the oldest ones that fit.
+    """Pack the Grants of a node. If not all of them fit, pack the oldest ones.
 
     Keeping the oldest Grants means that revoked Grants always leave the node and that new Grants have to wait.
 

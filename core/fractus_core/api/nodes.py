@@ -83,7 +83,9 @@ class Interface(Model):
     range: float | None = Field(
         default=None, gt=0, le=100_000, description="Range of a direct link in metres; unset: no direct links."
     )
-    pairing: Pairing | None = Field(default=None, description="Network settings for direct links; required for them.")
+    pairing: Pairing | None = Field(
+        default=None, description="Network settings for direct links; without them, the interface has no direct links."
+    )
     bandwidth: float | None = Field(
         default=None,
         gt=0,

@@ -216,7 +216,7 @@ def _check_loop(loop: ast.While) -> Iterator[Problem]:
     endless = isinstance(loop.test, ast.Constant) and bool(loop.test.value)
     waits = any(isinstance(node, (ast.Await, ast.AsyncFor, ast.AsyncWith)) for node in ast.walk(loop))
     if endless and not waits:
-        yield Problem(loop.lineno, f"the loop never awaits, so it blocks the event loop: {_SLEEP} in it")
+        yield Problem(loop.lineno, f"the loop never awaits, so it blocks the event loop: {_SLEEP} in the loop")
 
 
 def _check_handler(handler: ast.ExceptHandler, names: _Names) -> Iterator[Problem]:

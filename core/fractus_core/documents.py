@@ -110,7 +110,7 @@ class Documents:
 
 
 def _with_remedy(problem: str) -> str:
-    """Return a problem that the YAML parser reports, with what the writer of the file should do."""
+    """Return a problem that the YAML parser reports, with a remedy."""
     return f"{problem}; {next((remedy for part, remedy in _REMEDIES.items() if part in problem), _REMEDY)}"
 
 

@@ -213,7 +213,8 @@ class Subscriptions:
     def set_placed(self, key: Key, *, placed: bool, full: Collection[str] = frozenset()) -> None:
         """Record which released resources wake an Application.
 
-        Without a suitable plan, all of them do. With a suitable plan, only free capacity on the nodes `full` does.
+        If the Application has no suitable plan, all released resources wake it. Otherwise, only free capacity on the nodes `full`
+        wakes it.
 
         Args:
             key: The Application.

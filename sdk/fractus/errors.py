@@ -185,7 +185,7 @@ class Busy(FractusError):
 
 
 class NotConfigured(FractusError):
-    """Environment variables of a component's pod are missing or invalid. The message names what to set."""
+    """Environment variables of a component's pod are missing or invalid. The message names the variables to set."""
 
 
 def _text_of(decision: Decision, text: str) -> str:

@@ -58,9 +58,9 @@ class Caller:
 class Callers:
     """Authenticates callers by their client certificates.
 
-    A certificate is checked against the system clock when it is first seen. From then on, its remaining lifetime is counted in
-    steady time, so that a clock step neither disconnects a driver in flight nor revives an expired certificate. The TLS
-    handshake of each new connection also checks the certificate, against the system clock alone.
+    The first use of a certificate is checked against the system clock. From then on, its remaining lifetime is measured with
+    the monotonic clock. A clock step therefore neither disconnects a driver in flight nor makes an expired certificate valid
+    again. The TLS handshake of each new connection also checks the certificate, but only against the system clock.
 
     Args:
         clock: Returns Unix time.

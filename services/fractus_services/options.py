@@ -51,7 +51,7 @@ class ServiceOptions:
 
     @property
     def recording_problem(self) -> Path:
-        """File with the reason why nothing is recorded, if there is one. The agent reads it."""
+        """File with the reason why recording fails. It exists only while recording fails. The agent reads it."""
         return self.state / "recording.problem"
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 
 class ClusterError(Exception):
-    """An error of the embedded cluster. The message says what is wrong, where, and what to do."""
+    """An error of the embedded cluster. The message contains the problem, its place and a remedy."""
 
     exit_code = 1
     """Exit code of the command."""

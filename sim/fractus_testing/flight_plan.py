@@ -25,7 +25,7 @@ _REGION_MINUTES = 15
 
 
 def polygon(*corners: tuple[float, float]) -> Manifest:
-    """Return an area with these corners: latitude and longitude in degrees, in order."""
+    """Return a polygonal area. Corners are latitude and longitude in degrees, in order."""
     return {"polygon": {"exterior": [{"lat": lat, "lon": lon} for lat, lon in corners]}}
 
 

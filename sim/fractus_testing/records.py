@@ -28,7 +28,7 @@ Entry = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class RunRecord:
-    """Everything that the analyzer knows of a run. Times are seconds of the run.
+    """Data of a run, as the analyzer has read it. Times are seconds of the run.
 
     Attributes:
         folder: Folder of the run.

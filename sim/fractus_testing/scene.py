@@ -550,7 +550,7 @@ class Scene:
             raise AssertionError(f"not within {timeout:g} s: {trigger.title} ({states})")
 
     def advance_until(self, condition: Callable[[], bool], timeout: float) -> bool:
-        """Let the flights continue until a condition holds. Return False after the timeout.
+        """Let the flights continue until a condition is true. Return False after the timeout.
 
         Raises:
             ExperimentError: A service or vehicle ended.

@@ -21,7 +21,7 @@ INPUT_TIMEOUT_S = 4.0
 USE_BEST = 1
 BLEND = 2
 USE_PRIMARY_WITH_FIX = 4
-# A receiver with this many more satellites is better than another one with the same type of fix.
+# Of two receivers with the same type of fix, the receiver with at least this many more satellites is better.
 MORE_SATELLITES = 2
 
 # Parameters of the two receivers, by purpose.

@@ -60,7 +60,7 @@ The vehicle exceeds a commanded speed by up to 0.3 m/s and a commanded height by
 """
 
 GUST_SHARE = 0.3
-"""Share of the strength of gusts by which they change the speed, and the height, for a moment."""
+"""Momentary changes of speed and height by a gust, as shares of the speed of the gust."""
 
 TURN_IN_WIND_SHARE = 0.025
 SLOW_MPS = 6.0
@@ -92,7 +92,7 @@ JERK_MPS3 = 5.0
 
 JUMP_SWERVE_M = 5.0
 JUMP_SWERVE_MPS = 20.0
-"""Distance from docs/mobility.md by which a drone may leave its course when its estimate jumps, without delay and per second of it."""
+"""Distance by which a drone may leave its course when its estimate jumps (docs/mobility.md): without delay, and per second of delay."""
 
 DRIFT_MPS = 0.5
 """Speed of a GPS position that drifts. GPS and estimate drift together, so that no sign shows the fault."""

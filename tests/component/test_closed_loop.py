@@ -1,4 +1,4 @@
-"""Some random flights of the complete mobility service on the simulated vehicle.
+"""A few random flights of the complete mobility service on the simulated vehicle.
 
 `bench/closed_loop.py` runs hundreds of these flights.
 """

@@ -560,7 +560,7 @@ def test_return_found_after_restart_is_distinguished_from_return_of_system() -> 
     assert recovered.task is not None and recovered.task.begun_by_others
     again, _ = apply_events(events.VehicleFound(), state=recovered)
     assert again.task is not None and again.task.begun_by_others, (
-        "after a reconnect, the return flight still counts as begun by others"
+        "after a reconnect, the return flight still counts as a flight that another station began"
     )
     begun, _ = apply_events(
         events.TakeoverDemanded("returnToLaunch", "X", "x"), state=replace(known, expected_mode=RTL)

@@ -1,4 +1,4 @@
-"""The table of MAVLink decisions is complete, and refuses what could move, reconfigure or blind a drone unjudged."""
+"""The table of MAVLink decisions is complete. It refuses messages that could move, reconfigure or blind a drone unjudged."""
 
 from __future__ import annotations
 

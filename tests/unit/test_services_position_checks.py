@@ -154,7 +154,7 @@ def test_position_stays_unknown_until_it_has_jumped_back() -> None:
     flight.north_m += 33.0
     flight.send(30.0)
     assert not flight.known
-    assert "33 m from where the vehicle flew" in flight.vehicle.position_problem
+    assert "33 m from the expected position" in flight.vehicle.position_problem
     flight.north_m -= 33.0
     flight.send(QUIET_S - 0.1)
     assert not flight.known
@@ -180,7 +180,7 @@ def test_position_stays_unknown_after_landing_at_place_to_which_it_jumped_until_
     flight.vehicle.armed = False
     flight.send(600.0)
     assert not flight.known
-    assert "33 m from where the vehicle flew" in flight.vehicle.position_problem
+    assert "33 m from the expected position" in flight.vehicle.position_problem
     flight.boot_s = -flight.now
     flight.send(QUIET_S + 0.5)
     assert flight.known
@@ -220,7 +220,7 @@ def test_position_stays_unknown_after_restart_of_service_until_it_has_jumped_bac
     flight.send(4.0, lost=True)
     flight.send(60.0)
     assert not flight.known
-    assert "33 m from where the vehicle flew" in flight.vehicle.position_problem
+    assert "33 m from the expected position" in flight.vehicle.position_problem
     flight.restart_service(tmp_path)
     flight.north_m -= 33.0
     flight.send(QUIET_S + 1.5)
@@ -422,7 +422,7 @@ def test_altitude_jump_makes_position_unknown() -> None:
     flight.amsl_m += 10.0
     flight.send(0.05)
     assert not flight.known
-    assert "altitude is 10 m from where the vehicle flew" in flight.vehicle.position_problem
+    assert "altitude is 10 m from the expected altitude" in flight.vehicle.position_problem
 
 
 @pytest.mark.parametrize("lost_s", [0.05, 0.5, 1.0, 10.0])

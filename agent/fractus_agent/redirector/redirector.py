@@ -179,7 +179,7 @@ class Redirector:
                 self._write({}, None)
 
     async def switch(self, targets: Mapping[Endpoint, Endpoint | None], *, planned: bool) -> SwitchResult:
-        """Redirect services. A switch may begin while an older one drains. It does not wait for the older one.
+        """Redirect services. A switch does not wait until older switches have drained their connections.
 
         Args:
             targets: Target by virtual endpoint of a service, None for the cloud path.

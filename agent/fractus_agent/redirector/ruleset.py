@@ -7,7 +7,7 @@ element it falls through to kube-proxy, and so to the cloud path. Elements time 
 cloud path if the agent dies.
 
 Every radio in range can send to a direct interface. Therefore a direct interface accepts only beacons, pairing, and
-redirected connections from paired nodes to pods. Only redirected connections leave by it.
+redirected connections from paired nodes to pods. Only redirected connections leave through it.
 """
 
 from __future__ import annotations

@@ -223,7 +223,7 @@ class Container(Model):
         default=(),
         max_length=32,
         json_schema_extra=keyed("port", "protocol"),
-        description="Ports that the component listens on. Components that name it in egress connect to the first one.",
+        description="Ports that the component listens on. Components that name this component in egress connect to the first port.",
     )
     resources: Resources = Field(default_factory=Resources)
     volumes: tuple[Volume, ...] = Field(
@@ -555,7 +555,7 @@ class Component(Model):
 
     @rule(
         "!has(self.controlPoints) || size(self.controlPoints) <= 1 || (has(self.control) && self.control == 'partial')",
-        "a driver with full control has one control point; put the whole path there, or set control: partial to let the"
+        "a driver with full control has one control point; put the whole path into it, or set control: partial to let the"
         " system fly between the control points",
     )
     def _full_control_has_one_point(self) -> Violation:

@@ -390,7 +390,7 @@ def _similar(word: str, names: Iterable[str], cutoff: float = 0.7) -> str | None
 
 
 def _hint(finding: ErrorDetails) -> str:
-    """Return the end of the sentence about a wrong value: what its writer probably meant."""
+    """Return the hint at the end of an error message: how to write the value that the user probably meant."""
     kind = finding["type"]
     value = finding.get("input")
     if not isinstance(value, str):

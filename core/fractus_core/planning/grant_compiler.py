@@ -98,7 +98,9 @@ def compile_grants(
         last = before.get((placed.instance, placed.node))
         if placed.node not in inventory.drones and placed.node not in inventory.edge_nodes:
             if last is None:
-                raise InvalidObject(f"node {placed.node}", "it has no Drone or EdgeNode; nothing can be granted there")
+                raise InvalidObject(
+                    f"node {placed.node}", "it has no Drone or EdgeNode, so no Grant can be created for it"
+                )
             grants.append(refresh(last, inventory, awaits))
             continue
         if placed.placement == "drone" and area is not None:
@@ -276,7 +278,7 @@ def _policies(
         last: Policies of the previous Grant as a fallback, or None for a new Grant.
         bounds: Position and distance up to which zones matter, or None for the range of the node. With bounds, invalid zones
             out of reach are ignored.
-        actions: Actions that the application selects. None: those that it selected for the previous Grant.
+        actions: Actions that the application selects. None: use the selected actions of the previous Grant.
 
     Raises:
         InvalidObject: A policy is invalid, and `last` is None.

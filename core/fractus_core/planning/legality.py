@@ -34,7 +34,7 @@ MAX_LISTED = 50
 """Maximum number of legs that a plan lists."""
 
 TAKEOFF_ALTITUDE_M = 10.0
-"""Takeoff altitude, in metres above home, if the first position has no altitude. The mobility service uses the same."""
+"""Takeoff altitude, in metres above home, if the first position has no altitude. The mobility service uses the same altitude."""
 
 MAX_ROUTES = 10
 """Maximum number of routes that are judged for one plan."""

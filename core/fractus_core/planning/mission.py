@@ -54,8 +54,8 @@ class MissionEstimator:
     def estimate(self, home: Point, drone: Drone) -> Estimate:
         """Estimate distance, altitude and time of the mission, including approach and return.
 
-        Legs are straight. Altitude changes at the climb speed take additional time. A region counts with the distance to
-        its centre and the duration that its control point declares.
+        Legs are straight. Altitude changes at the climb speed take additional time. A region adds the
+        distance to its centre, and the duration that its control point declares.
         """
         approach, distance = self._distances(home)
         top, climb = self._climb(drone)

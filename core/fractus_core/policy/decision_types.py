@@ -274,7 +274,7 @@ class Situation:
     def margin_m(self) -> float:
         """Horizontal distance that a leg keeps from fences: position error plus tracking error.
 
-        The stopping distance is not part of the margin. It counts along the direction of motion: a leg sweeps the
+        The stopping distance is not part of the margin, because it applies only in the direction of motion: a leg sweeps the
         triangle of present position, turning point and target.
         """
         return self.position_error_m + self.airframe.tracking_m

@@ -275,8 +275,8 @@ def _leaves_height(zone: PolicyZone, leg: Leg, now: Situation, grant: CompiledGr
     def gap_m(lower_m: float, upper_m: float) -> float:
         return band_gap_m(zone.band, lower_m, upper_m, now.home, grant.flat_terrain)
 
-    # A leg passes all altitudes at which the drone could come to rest. So of its lowest and highest altitude, the one that
-    # is farther from the zone is where the leg ends.
+    # A leg passes all altitudes at which the drone could come to rest. Its end is its lowest or its highest altitude, whichever
+    # is farther from the zone.
     end_m, rest_m = (max(map(gap_m, heights, heights)) for heights in ((leg.lower_m, leg.upper_m), present))
     closest_m = gap_m(leg.lower_m, leg.upper_m)
     return 0.0 < closest_m >= gap_m(*present) - 1e-6 and end_m >= height_margin_m and end_m > rest_m + 1e-6
@@ -341,7 +341,7 @@ def _leaves_by_height(
 
     A drone inside such a zone leaves it because of its altitude, even if the leg leads into another zone in the
     horizontal plane. A drone outside such a zone, beside it or within the height margin above or below it, must return
-    into it and not fly through uncovered air to another zone.
+    into it. It must not fly to another zone through air that no zone covers.
 
     Args:
         fence: Zones to stay in.
@@ -371,7 +371,7 @@ def _leaves_by_height(
 def _returns_by_height(fence: Inclusion, leg: Leg, now: Situation, grant: CompiledGrant, air: AirVolume) -> bool:
     """Return True if a drone above or below the nearest zone, or too close to its limits, sinks or climbs into it.
 
-    Only a motion on the spot counts, because autopilots control the axes independently.
+    Only a vertical motion counts, because autopilots control the axes independently.
     """
     west, south, east, north = shapely.bounds(leg.ground)
     if max(east - west, north - south) > STATIONARY_LEG_M:

@@ -81,8 +81,8 @@ def _distorted(lens: CameraLens, side: float, aspect: float) -> tuple[float, flo
     """Return bounds for the Brown-Conrady model.
 
     A ray with tangent r is shown at g(r) = r (1 + k1 r² + k2 r⁴ + k3 r⁶), displaced by at most t r². A shown ray is
-    therefore no farther out than the r at which g(r) - t r² reaches the corner of the picture. If g never reaches it,
-    or turns back before, the model does not define what is shown there.
+    therefore no farther out than the r at which g(r) - t r² reaches the corner of the picture. If
+    g(r) - t r² never reaches the corner, or g decreases before the corner, the model does not define what is shown there.
     """
     k1, k2, k3, p1, p2 = (getattr(lens, name) or 0.0 for name in ("k1", "k2", "k3", "p1", "p2"))
     tangential = 3.0 * (abs(p1) + abs(p2))

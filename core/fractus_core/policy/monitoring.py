@@ -47,8 +47,11 @@ AIM_SHARE = 0.1
 may turn the drone's course."""
 
 SINKING_MPS = 0.5
-"""Vertical speed used by two rules: a drone that climbs more slowly may continue while its altitude limits are unknown, and
-a drone that the system flies and that sinks faster counts as returning below a limit."""
+"""Vertical speed of two rules, in m/s.
+
+While its altitude limits are unknown, a drone may continue if it climbs more slowly. In a system flight, a drone above an upper
+limit that sinks faster counts as returning below the limit.
+"""
 
 CLIMBING_MPS = 0.2
 """Maximum climb or sink rate of a drone that holds its altitude."""

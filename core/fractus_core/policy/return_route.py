@@ -118,7 +118,7 @@ def may_change_altitude(now: Situation, grant: CompiledGrant, altitude_m: float)
 
     A drone that is too close below or above a zone may move away from it, even next to another zone: a vertical motion
     does not bring it closer to the other zone. A drone that breaks the altitude limit of a zone may move to any altitude.
-    No other drone may enter a zone from above or below, or move in it, where its altitude limit forbids that.
+    Any other drone must not climb or sink into or inside a zone at altitudes that the zone's altitude limit forbids.
     """
     position = grant.locate(now)
     if position is None:

@@ -89,7 +89,7 @@ class VehicleState:
         position_at: Time of the position. The delay relative to the fastest recent message is subtracted.
         yaw_deg: Heading from the position message; `heading_deg` is from the attitude message.
         gimbal: Measured attitude of the camera, yaw from true north. It is computed from the attitudes of gimbal and
-            vehicle. `gimbal_at` is the time of the older one.
+            vehicle. `gimbal_at` is the time of the older of these two attitudes.
         ground_home: Latest home that was reported while the vehicle did not fly, or the first one after arming.
         ready: True if the pre-arm checks of the current mode pass, reported at `checks_at`.
         estimated: True if the estimator has an absolute position and predicts to keep it, reported at `estimated_at`.

@@ -282,7 +282,7 @@ class Recorder:
         node: Name of the node, which is the first part of each topic.
         decoder: See `FlightWriter`.
         max_waiting: Size of the queue. Messages beyond it are lost.
-        problem_file: File that contains `problem` while there is one. The agent reads it. None writes no file.
+        problem_file: File that contains `problem` while recording fails. The agent reads it. None: no file is written.
         clock: Returns Unix nanoseconds.
     """
 

@@ -17,7 +17,7 @@ BREACH = 3
 
 
 def leaves_corridor(distance_m: float = 200.0) -> App:
-    """Fly out of the permitted area, to a position this far north, and to the same position in short steps.
+    """Fly out of the permitted area: to a position this far north in one leg, then to the same position in short legs.
 
     Only the full distance counts as a breach. The test must compare the track with the border.
     """
@@ -43,7 +43,7 @@ def wrong_frames() -> App:
 
 
 def forges_identity() -> App:
-    """Call the services with a certificate of its own authority, and with the identity of another instance."""
+    """Call the services with certificates of the program's own authority, also with the identity of another instance."""
     return _app("forges-identity")
 
 
@@ -53,17 +53,17 @@ def forces_arming() -> App:
 
 
 def reads_foreign_pictures(*names: str) -> App:
-    """Retrieve and delete pictures of others by name, and names outside of the picture store. Needs a camera."""
+    """Retrieve and delete pictures of other components, and files outside of the picture store, by name. Needs a camera."""
     return _app("reads-foreign-pictures", NAMES=names)
 
 
 def stalls(seconds: float = 60.0) -> App:
-    """Block its event loop in flight, while it has control."""
+    """Block the program's event loop in flight, while the program has control."""
     return _app("stalls", SECONDS=seconds)
 
 
 def crashes() -> App:
-    """End without a farewell in flight, while it has control."""
+    """Exit in flight without returning control."""
     return _app("crashes")
 
 

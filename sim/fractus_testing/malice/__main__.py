@@ -153,7 +153,7 @@ async def forces_arming(drone: fractus.Mobility) -> None:
 
 
 async def reads_foreign_pictures(_drone: fractus.Mobility) -> None:
-    """Retrieve and delete pictures of others."""
+    """Retrieve and delete pictures of other components."""
     names = [
         *json.loads(os.environ["NAMES"]),
         "../grants-seen.json",

@@ -253,7 +253,7 @@ class ZoneBuilder:
             raise InvalidObject(
                 f"{field}.{first}" if field else first,
                 f"may state the size, altitude or time of the zone{also}; draw the size or give a Point its radius in metres,"
-                f" write the others as altitude or schedule in the form of a Zone, or drop it ({drops})",
+                f" write altitudes and times as altitude or schedule of a Zone, or ignore the property ({drops})",
             )
         if unknown:
             self.note(title, f"properties {', '.join(unknown)} cannot be imported; left out")

@@ -380,7 +380,7 @@ class ControlStore:
         return lease
 
     def driver_permit(self, grant: ActiveGrant, motion: Motion | None = None) -> Permit:
-        """Return a permit that holds while the driver has control.
+        """Return a permit that is valid while the driver has control.
 
         Args:
             grant: Grant of the driver.
@@ -473,7 +473,7 @@ class ControlStore:
         if not mission.legs:
             self.dispatch(WaypointsDone(grant.key, mission.waypoints, leg=True))
 
-    # Home: the position where the mission armed for its first takeoff. Altitudes are measured from it, and return flights lead there.
+    # Home: the position where the mission armed for its first takeoff. Altitudes are relative to home, and return flights end at home.
 
     @property
     def home_moved(self) -> bool:

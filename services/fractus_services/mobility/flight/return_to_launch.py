@@ -347,7 +347,9 @@ class ReturnFlight:
         """
         self._require_trusted_position()
         if self._control.home_moved:
-            raise Unavailable("AutopilotUnavailable", "another station moved home; it must be set back first")
+            raise Unavailable(
+                "AutopilotUnavailable", "another station moved home; a return is possible when home is restored"
+            )
         now = self._gate.situation()
         if now.lat is None or now.lon is None or now.home is None:
             return None

@@ -141,7 +141,7 @@ async def first_leg(
         flight: System flight whose constraints apply.
 
     Returns:
-        The leg, whether it is the last one, and the altitude of the route; None if there is no route.
+        The leg, True if it is the last leg of the route, and the altitude of the route; None if there is no route.
 
     Raises:
         Refused: The constraints change faster than a route is found.
@@ -301,5 +301,5 @@ class RouteFollower:
         """
         verdict = self._gate.judge(Call("Goto", leg), flight.constraints.grant, flight.constraints.compiled)
         if not verdict.permits or not isinstance(verdict.args, GotoArgs):
-            raise PreconditionFailed("NoLegalWay", f"the system cannot fly there: {verdict.reason}")
+            raise PreconditionFailed("NoLegalWay", f"the system cannot fly this leg: {verdict.reason}")
         return replace(verdict.args, speed_mps=verdict.args.speed_mps or self._control.cruise_mps)

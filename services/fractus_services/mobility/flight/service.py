@@ -336,7 +336,7 @@ class MobilityService:
             yield Progress(verdict, step)
 
     def _require_armed(self, call: Call, grant: ActiveGrant) -> None:
-        """Refuse a takeoff that cannot be carried out, before the policy engine judges it, which takes long.
+        """Refuse a takeoff that cannot be carried out, before the policy engine judges it, because the judgement takes long.
 
         Calls of a method that is not granted are not refused here: the judgement refuses them and writes the audit log.
         """

@@ -199,9 +199,9 @@ class RecentSetpoints:
     def pending_since(self, earliest: float, measured: Velocity) -> tuple[Velocity, ...]:
         """Return the setpoints that the vehicle may still be reacting to, the latest last. Drop older setpoints.
 
-        Setpoints sent after `earliest` always count. The setpoint that was in force at `earliest` counts in two cases.
-        If it is a velocity command, the vehicle brakes only until it has reached that velocity. If it is a leg onto
-        which the vehicle still turns, the vehicle will not continue in its measured direction.
+        Setpoints sent after `earliest` are always included. The setpoint that was in force at `earliest` is included in two
+        cases. If it is a velocity command, the vehicle brakes only until it has reached that velocity. If it is a leg, and
+        the vehicle still turns towards the leg, the vehicle will not continue in its measured direction.
 
         Args:
             earliest: Time on the clock of `add_velocity`.

@@ -171,7 +171,7 @@ class PositionChecks:
     Attributes:
         variance_limit: FS_EKF_THRESH of the vehicle: a variance of this size or larger is a sign.
         pace: Seconds of the vehicle's clock per second of real time.
-        blind: True while nothing is known of the expected position, because the record of an earlier process cannot be read.
+        blind: True while the expected position is unknown, because the record of an earlier process cannot be read.
     """
 
     def __init__(self) -> None:
@@ -194,8 +194,8 @@ class PositionChecks:
     def problem(self, now: float) -> str:
         """Return why the position is not trusted; empty if it is.
 
-        A sign of EKF_STATUS_REPORT or GPS_RAW_INT holds until a later message without it. A position that jumped is not trusted
-        before it has returned, because either of the two positions may be the wrong one.
+        A sign of EKF_STATUS_REPORT or GPS_RAW_INT lasts until a later message without this sign. A position that jumped is not
+        trusted before it has jumped back, because either the position before or the position after the jump may be wrong.
         """
         gps_problem = next((each.problem for each in self._receivers.values() if each.problem), "")
         lasting = self._estimator_problem or gps_problem or self._displacement
@@ -230,7 +230,7 @@ class PositionChecks:
         self._displacement = reason
 
     def set_variance_limit(self, limit: float) -> None:
-        """Use the vehicle's FS_EKF_THRESH. Values that switch the failsafe off, or on late, do not apply."""
+        """Use the vehicle's FS_EKF_THRESH. Use the default if the value disables the failsafe, or triggers it too late."""
         self.variance_limit = limit if 0.0 < limit <= 1.0 else DEFAULT_VARIANCE_LIMIT
 
     def take_estimator(self, flags: int, variances: dict[str, float], now: float, *, positioned: bool) -> None:
@@ -343,9 +343,9 @@ class PositionChecks:
         off_m = abs(reported.amsl_m - self._trusted.amsl_m - self._climbed_m)
         self._displacement = ""
         if away_m > RETURNED_M + ERROR_FACTOR * error_m + self._unseen_m:
-            self._displacement = f"the reported position is {away_m:.0f} m from where the vehicle flew"
+            self._displacement = f"the reported position is {away_m:.0f} m from the expected position"
         elif off_m > RETURNED_M + self._unseen_m:
-            self._displacement = f"the reported altitude is {off_m:.0f} m from where the vehicle flew"
+            self._displacement = f"the reported altitude is {off_m:.0f} m from the expected altitude"
 
     def _look_for_jump(
         self, last: ReportedPosition, reported: ReportedPosition, elapsed_s: float, error_m: float, now: float
@@ -367,7 +367,7 @@ class PositionChecks:
         repeated = fix.fix_us != 0 and fix.fix_us == receiver.fix_us
         receiver.fix_us = fix.fix_us
         if repeated or not self._path or now - self._path_at > PATH_S / self.pace:
-            return  # There is nothing to compare, so an earlier disagreement remains.
+            return  # No recent position to compare with, so an earlier disagreement remains.
         frame = LocalFrame(fix.lat, fix.lon)
         apart_m = min(math.hypot(*frame.xy(known.lat, known.lon)) for known in self._path)
         agrees = apart_m <= DISAGREEMENT_M + ERROR_FACTOR * min(fix.error_m, MAX_TOLERATED_ERROR_M)

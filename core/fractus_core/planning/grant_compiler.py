@@ -13,7 +13,7 @@ import numpy as np
 import shapely
 from shapely.geometry.base import BaseGeometry
 
-from fractus_core.api import Application, Component, Drone, EdgeNode, InvalidObject, Policy, Zone
+from fractus_core.api import Application, Component, Depot, Drone, EdgeNode, InvalidObject, Policy, Zone
 from fractus_core.api.components import ServiceRequest
 from fractus_core.api.geometry import MAX_HOLES, MAX_RING_POINTS, Area, Circle, Point, Position
 from fractus_core.api.grants import GrantedLimits, GrantedPolicy, GrantedZone, GrantSpec
@@ -168,13 +168,9 @@ def _drone_grant(
 ) -> GrantSpec:
     mobility = drone.spec.services.mobility
     depot = inventory.depots.get(drone.spec.depot or "")
-    home = drone.spec.home
-    base = depot.spec.location if depot is not None else area.start
-    if home is not None:
-        base = ground_point(home)
-    stand = Area(circle=Circle(center=base, radius=depot.spec.radius if depot is not None else 30.0))
     shape = _outlined(area.shape)
-    corridor = shapely.union(shape, area_polygon(area.frame, stand)).convex_hull
+    stand = area_polygon(area.frame, stand_of(drone, inventory.depots, area))
+    corridor = shapely.union(shape, stand).convex_hull
     return GrantSpec(
         node=drone.name,
         application=application_reference(application),
@@ -183,10 +179,20 @@ def _drone_grant(
         operation_area=areas_of_shape(area.frame, shape),
         corridor=areas_of_shape(area.frame, corridor.simplify(ROUNDING_M)),
         depot=depot.spec.location if depot is not None else None,
-        home=home,
+        home=drone.spec.home,
         limits=GrantedLimits(max_altitude=mobility.max_altitude, max_speed=mobility.max_speed) if mobility else None,
         contact_lost=application.spec.contact_lost,
     )
+
+
+def stand_of(drone: Drone, depots: Mapping[str, Depot], area: OperationArea) -> Area:
+    """Return the area in which a drone is parked: around its home, or else around its depot or the start of the route."""
+    depot = depots.get(drone.spec.depot or "")
+    home = drone.spec.home
+    center = depot.spec.location if depot is not None else area.start
+    if home is not None:
+        center = ground_point(home)
+    return Area(circle=Circle(center=center, radius=depot.spec.radius if depot is not None else 30.0))
 
 
 def _outlined(shape: BaseGeometry) -> BaseGeometry:

@@ -1,4 +1,4 @@
-"""Paths that are no readable regular file, for tests of everything that reads files."""
+"""Paths that are not readable regular files, for tests of all functions that read files."""
 
 from __future__ import annotations
 

@@ -77,7 +77,7 @@ class GrantDirectory:
         """Return the content of a stored Grant.
 
         Raises:
-            OSError: The file is missing, no regular file, too large, or cannot be read.
+            OSError: The file is missing, is not a regular file, is too large, or cannot be read.
         """
         return read_file(self._file(name))
 

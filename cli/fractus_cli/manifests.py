@@ -237,7 +237,7 @@ def read_file(file: pathlib.Path) -> bytes:
     """Return the content of a file.
 
     Raises:
-        BadManifest: The file cannot be read, is no regular file, or is too large.
+        BadManifest: The file cannot be read, is not a regular file, or is too large.
     """
     try:
         return files.read_file(file, MAX_BYTES)

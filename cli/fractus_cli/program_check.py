@@ -63,7 +63,7 @@ class _Names:
     clients: dict[str, type] = field(default_factory=dict)
 
     def full_name(self, node: ast.expr) -> str:
-        """Return the full name of a function, for example `fractus.run`; empty if the expression is no name."""
+        """Return the full name of a function, for example `fractus.run`; empty if the expression is not a name."""
         if isinstance(node, ast.Name):
             return self.imports.get(node.id, node.id)
         if isinstance(node, ast.Attribute):

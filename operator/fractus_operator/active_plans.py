@@ -27,7 +27,7 @@ class PlanListener(Protocol):
 class ActivePlans:
     """The active plans by Application. A plan is active until it records the outcome of its mission.
 
-    The status of an Application is no input, because anyone who may edit the status could end a flight with it.
+    The status of an Application is not used, because everybody who may edit the status could otherwise end a flight.
 
     Args:
         applications: All Applications. `application_changed` must be called for each change.

@@ -79,7 +79,7 @@ def _register(registry: kopf.OperatorRegistry, applications: Controller, oldest_
         return round(oldest_contact_s(), 1)
 
     # kopf stores the progress in an annotation that has the id of the handler as its name. The default id of a nested function
-    # is no valid name, and one failure would then make the Application undeletable. Therefore the ids are explicit.
+    # is not a valid name, and one failure would then make the Application undeletable. Therefore the ids are explicit.
     @kopf.daemon(
         group,
         version,

@@ -190,7 +190,7 @@ def parse_pod(body: Body) -> PodView:
 
 
 def _stops(spec: Body, status: Body) -> bool:
-    """Return True if a pod has ended or is being stopped. A pod that has only the label may still run."""
+    """Return True if a pod has ended or is being stopped. The label `FINISHED_LABEL` alone does not prove that."""
     return status.get("phase") in _ENDED or spec.get("activeDeadlineSeconds") == FINISHED_DEADLINE_S
 
 

@@ -112,7 +112,7 @@ async def _operator(store: Store, namespace: str, timeout_s: float) -> Body:
 
 
 async def remove(store: Store, namespace: str, *, keep_authority: bool = False) -> list[str]:
-    """Remove the objects that the operator and the agents created. A missing object is no error.
+    """Remove the objects that the operator and the agents created. A missing object is not an error.
 
     Args:
         store: The API server.

@@ -83,7 +83,7 @@ def choose_plan(
         return Choice(previous)
     drone = decided.drone.node if decided.drone is not None else None
     if previous is not None and in_flight is not None and reason != "SpecChanged" and drone != in_flight:
-        # A problem on another node is no reason to give up a drone in flight.
+        # Do not give up a drone in flight because of a problem on another node.
         return Choice(previous)
     if previous is not None and in_flight is not None:
         decided = _with_names_of(previous, decided)
@@ -155,7 +155,7 @@ def replan_reason(
 ) -> str | None:
     """Return why a new plan is needed, as a CamelCase reason, or None.
 
-    An unreachable node is no reason, because its pods continue to run until it is reachable again. A cordoned node is a reason.
+    A cordoned node is a reason. An unreachable node is not, because its pods continue to run until it is reachable again.
 
     Args:
         application: The Application.

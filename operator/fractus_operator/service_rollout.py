@@ -62,7 +62,7 @@ def next_step(
         fleet: Number of nodes that have services.
         ready: Returns the number of nodes with a ready pod of the required revision of a DaemonSet.
     """
-    # Services that do not start on an unreachable node are no evidence against the release.
+    # If services do not start on an unreachable node, this does not show that the release is faulty.
     starting = [node for node in nodes if node.starting and (node.obstacle or ("",))[0] != "NodeUnreachable"]
     stuck = [node for node in starting if node.starting_s > STUCK_S]
     failed = Counter(daemon_set for node in stuck for daemon_set in node.starting)

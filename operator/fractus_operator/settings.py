@@ -89,7 +89,7 @@ class Settings:
         """
         level = environment.get("FRACTUS_LOG_LEVEL", "INFO").upper()
         if level not in logging.getLevelNamesMapping():
-            raise BadSetting(f"FRACTUS_LOG_LEVEL: {level} is no level; use DEBUG, INFO, WARNING or ERROR")
+            raise BadSetting(f"FRACTUS_LOG_LEVEL: {level} is not a log level; use DEBUG, INFO, WARNING or ERROR")
         log_format = environment.get("FRACTUS_LOG_FORMAT") or "text"
         if log_format not in FORMATS:
             raise BadSetting(f"FRACTUS_LOG_FORMAT: unknown log format {log_format!r}; use {' or '.join(FORMATS)}")

@@ -32,7 +32,7 @@ def check_program(program: Any) -> None:
     name = getattr(program, "__name__", type(program).__name__)
     function = inspect.unwrap(program)
     if inspect.isasyncgenfunction(function):
-        raise InvalidRequest(f"{name} contains `yield`, so it is no coroutine function: remove the `yield`")
+        raise InvalidRequest(f"{name} contains `yield`, so it is not a coroutine function: remove the `yield`")
     if _is_synchronous(function):
         raise InvalidRequest(
             f"{name} is a synchronous function: {_FORM} and await its calls, or fly with `fractus.sync.mobility()`"

@@ -70,7 +70,7 @@ def run(
         response_timeout_s: Seconds for which the program may block the event loop; see `Mobility.control`.
 
     Raises:
-        SystemExit: The program is no coroutine function of drone and control, or the mission could not be completed. The
+        SystemExit: The program is not a coroutine function of drone and control, or the mission could not be completed. The
             message contains the reason and the remedy.
         InvalidRequest: An event loop is running already, as in a notebook.
     """
@@ -133,7 +133,7 @@ async def fly(
         response_timeout_s: Seconds for which the program may block the event loop; see `Mobility.control`.
 
     Raises:
-        InvalidRequest: The program is no coroutine function of drone and control.
+        InvalidRequest: The program is not a coroutine function of drone and control.
         MissionEnded: The mission ended early.
         FractusError: An error of the program that a retry cannot resolve.
     """

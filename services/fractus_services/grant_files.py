@@ -65,7 +65,7 @@ class GrantFiles:
     """Grants in a directory of Grant manifests.
 
     A file that cannot be read or parsed, or that the operator did not sign, grants nothing. If a file becomes invalid, its Grant
-    is revoked, because its restrictions are then unknown. The same applies to a path that is no regular file, or too large. After
+    is revoked, because its restrictions are then unknown. The same applies if the path is not a regular file, or the file is too large. After
     a disk error the Grant returns when the file can be read again.
 
     Args:

@@ -106,13 +106,13 @@ def report(
 
 
 def _check_folder(folder: Path, audit: Sequence[Path]) -> None:
-    """Refuse a folder in which the report would replace files that are no earlier report.
+    """Refuse a folder in which the new report would replace other files than an earlier report.
 
     Raises:
-        ExperimentError: The folder contains other files, or the audit logs to read.
+        ExperimentError: The folder contains files but no report, or contains the audit logs to read.
     """
     if folder.is_dir() and any(folder.iterdir()) and not (folder / OBJECTS).exists():
-        raise ExperimentError(f"{folder} contains files and no earlier report; specify a new folder with --out")
+        raise ExperimentError(f"{folder} contains other files than an earlier report; specify a new folder with --out")
     if any(path.resolve().is_relative_to((folder / AUDIT).resolve()) for path in audit):
         raise ExperimentError(
             f"--audit is inside {folder}, which the report replaces; specify another folder with --out"

@@ -734,7 +734,7 @@ def _require_replaceable(folder: Path) -> None:
         ExperimentError: The folder contains other files.
     """
     if folder.exists() and any(folder.iterdir()) and not (folder / DEFINITION).exists():
-        raise ExperimentError(f"{folder} contains files and no earlier test; specify a new folder")
+        raise ExperimentError(f"{folder} contains other files than an earlier test; specify a new folder")
 
 
 def _component(drone: VirtualDrone) -> str:

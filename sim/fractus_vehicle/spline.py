@@ -43,7 +43,7 @@ class SplineLeg:
     def _profile(self, v: VehicleState) -> list[float]:
         """Return the maximum speed at each sample of the curve.
 
-        The vehicle can brake from it for bends, climbs and the end.
+        From these speeds, the vehicle can brake in time for bends, climbs and the end of the curve.
         """
         allowed = [self._local_limit(v, step / _SAMPLES) for step in range(_SAMPLES + 1)]
         allowed[-1] = 0.0 if self._stops else allowed[-1]

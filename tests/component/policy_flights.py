@@ -695,7 +695,7 @@ def flights(
                 measured(fleet, tally, flown, exempt)
             broken = fleet.trespassing() & ~exempt
             for i in np.flatnonzero(broken.any(axis=1)):
-                # Drift in the wind is no violation if no command was permitted.
+                # Drift in the wind is not a violation if no command was permitted.
                 if not permitted[i]:
                     continue
                 tally.wrong.append(f"seed {seed}, drone {i}, turn {turn}, {fleet.time_s:.2f} s: {permitted[i]}")

@@ -90,7 +90,7 @@ def test_report_replaces_only_an_earlier_report(files: tuple[Path, Path], tmp_pa
     before = (audit / "mobility.jsonl").read_bytes()
     code, output = run(*arguments, tmp_path)
     assert code == 1
-    assert "contains files and no earlier report" in output
+    assert "contains other files than an earlier report" in output
     (tmp_path / "objects.json").write_text("{}")
     code, output = run(*arguments, tmp_path)
     assert code == 1

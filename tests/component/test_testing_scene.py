@@ -126,7 +126,7 @@ def test_drones_share_the_restrictions_of_their_plans(tmp_path: Path) -> None:
 
 def test_folder_with_other_files_is_not_replaced(tmp_path: Path) -> None:
     (tmp_path / "thesis.txt").write_text("important")
-    with pytest.raises(ExperimentError, match="contains files and no earlier test; specify a new folder"):
+    with pytest.raises(ExperimentError, match="contains other files than an earlier test; specify a new folder"):
         Scene(tmp_path)
     assert (tmp_path / "thesis.txt").exists()
     (tmp_path / "experiment.yaml").touch()

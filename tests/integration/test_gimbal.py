@@ -73,7 +73,7 @@ class Stage:
     async def take_picture(self) -> tuple[Any, bytes]:
         """Return the decision on a picture and the picture. Retry until the camera is ready and the position is known.
 
-        The decision is that of the capture if the capture changed the picture, and otherwise that of the retrieval.
+        The decision is from the capture if the capture changed the picture, otherwise from the retrieval.
         """
         async with asyncio.timeout(TIMEOUT_S):
             while True:

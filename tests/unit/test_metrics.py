@@ -11,7 +11,7 @@ from prometheus_client import Counter
 from scraping import DOCS, documented, values
 
 NON_METRIC_NAMES = {"fractus_agent", "fractus_call", "fractus_operator"}
-"""Names in the code that begin with fractus_ but are no metrics: loggers and a context variable."""
+"""Names in the code that begin with fractus_ but are not metrics: loggers and a context variable."""
 
 
 def test_metrics_page_lists_exactly_the_metrics_of_the_code() -> None:

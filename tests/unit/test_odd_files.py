@@ -1,4 +1,4 @@
-"""Readers of files do not block, read without bound or fail on paths that are no regular files."""
+"""Readers of files do not block, read without bound or fail on paths that are not regular files."""
 
 from __future__ import annotations
 

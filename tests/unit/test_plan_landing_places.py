@@ -36,7 +36,7 @@ def test_landing_place_inside_zone_is_refused():
     covering = policy("cover", zones=["covering"], **FENCE)
     message = refusal(stock(aborting((100, 0)), covering, zones=[FAR, zone("covering", (100, 0), 15)]))
     place = Point(**{name: at(100, 0)[name] for name in ("lat", "lon")})
-    assert message.startswith(f"landAt of policy far ({place.lat:.6f}, {place.lon:.6f}) is no legal landing place:")
+    assert message.startswith(f"landAt of policy far ({place.lat:.6f}, {place.lon:.6f}) is not a legal landing place:")
     assert "it is inside zone covering of policy cover" in message
 
 

@@ -63,7 +63,7 @@ async def test_unknown_vehicle_is_selected_and_stored_after_it_was_alone(tmp_pat
     known = known_file(tmp_path)
     selector = VehicleSelector(known)
     assert not selector.select(heartbeat(7), 0.0, flying=False)
-    assert not selector.problem(heartbeat(7), 0.0), "a vehicle that is alone on the link is no problem"
+    assert not selector.problem(heartbeat(7), 0.0), "a single vehicle on the link is not a problem"
     assert not selector.select(heartbeat(7), SELECT_AFTER_S - 0.1, flying=False)
     assert selector.select(heartbeat(7), SELECT_AFTER_S, flying=False)
     assert not selector.problem(heartbeat(7), SELECT_AFTER_S + CONFIRM_AFTER_S)

@@ -377,7 +377,7 @@ def test_import_reports_many_refused_features_of_a_large_file_in_seconds(tmp_pat
 
 
 def around(count, *, bend=0.0):
-    """Return a ring of that many points around a circle of 5 km. Every second point is moved inwards by a share."""
+    """Return a ring of `count` points on a circle of 5 km. Every second point is moved inwards by the share `bend`."""
     radii = [0.05 * (1 - bend * (i % 2)) for i in range(count)]
     angles = [2 * math.pi * i / count for i in range(count)]
     ring = [[4 + r * math.cos(a), 50 + r * math.sin(a)] for r, a in zip(radii, angles, strict=True)]

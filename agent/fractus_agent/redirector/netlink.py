@@ -131,7 +131,7 @@ class Netlink:
         Args:
             sequences: Sequence numbers of messages with NLM_F_ACK.
             refusals: Sequence numbers of messages to which the kernel responds only if it refuses the whole batch.
-            ignore: errno values that are no errors here, such as ENOENT of a deletion.
+            ignore: errno values that do not count as errors, such as ENOENT of a deletion.
 
         Raises:
             NetlinkError: The kernel refused a message, or did not respond in time.

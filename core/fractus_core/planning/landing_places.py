@@ -59,7 +59,7 @@ def check_landing_places(
     for name, place in places:
         problem = _problem(place, now, grant)
         if problem:
-            return f"{name} ({place.lat:.6f}, {place.lon:.6f}) is no legal landing place: {problem}"
+            return f"{name} ({place.lat:.6f}, {place.lon:.6f}) is not a legal landing place: {problem}"
     return ""
 
 

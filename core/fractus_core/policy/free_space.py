@@ -133,7 +133,7 @@ def _outline(shape: BaseGeometry, away_m: float) -> BaseGeometry:
 def _corners(shape: BaseGeometry, turning: float) -> Floats:
     """Return the corners that turn in one direction, with their neighbours, shape (n, 6).
 
-    Direction 1 is left, with the shape on the left.
+    The border is followed with the shape on the left. `turning` 1 selects left turns, -1 right turns.
     """
     corners = [np.empty((0, 6))]
     for part in shapely.get_parts(shape):

@@ -21,7 +21,7 @@ log = logging.getLogger(__name__)
 _SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp"})
 _MAX_FILES = 100_000
 _EXIF_ERRORS = (OSError, KeyError, TypeError, ValueError, ZeroDivisionError, SyntaxError, Image.DecompressionBombError)
-"""Exceptions that Pillow raises for files that are no images or have no valid position."""
+"""Exceptions that Pillow raises for files that are not images, or that have no valid position."""
 
 
 class GeotaggedDirectory:

@@ -358,7 +358,7 @@ class PositionChecks:
             self._see(f"the reported altitude jumped by {climbed_m:.0f} m within {elapsed_s:.2f} s", now)
 
     def take_gps(self, fix: GpsFix, now: float) -> None:
-        """Compare a position of a GPS receiver with the estimator's positions of the last second. A repeated fix is no new sign.
+        """Compare a position of a GPS receiver with the estimator's positions of the last second. A repeated fix does not count again.
 
         The estimator uses one receiver, or a mean of two. If two receivers disagree, at least one disagrees with the estimate.
         """

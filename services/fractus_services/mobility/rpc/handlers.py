@@ -64,7 +64,7 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
         grants: Grants of this node.
         node: Name of the node.
         clock: Unix time.
-        on_passenger: Called with the Grant of the caller for every call of a component that is no driver.
+        on_passenger: Called with the Grant of the caller for every call of a component that is not a driver.
         fixed_camera: Returns True if the node description declares a camera that does not move.
         on_contact: Called with the seconds since the last contact of the node's agent with the API server.
         recording_problem: Returns why flights are not recorded; an empty string if there is no problem.

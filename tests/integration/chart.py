@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import subprocess
 from collections.abc import Iterator
+from http import HTTPStatus
 from pathlib import Path
 from typing import Any
 
 import yaml
+from control_plane import wait_for
 from fractus_cluster.binaries import KUBERNETES_VERSIONS, chosen_kubernetes
+from fractus_runtime.kubernetes import KubeError
 from operator_world import SYSTEM, World
 
 Body = dict[str, Any]
@@ -23,6 +26,8 @@ _PLURALS = {
     "PriorityClass": "priorityclasses",
     "ValidatingAdmissionPolicy": "validatingadmissionpolicies",
 }
+_LAST = "last-policy"
+"""Name of the admission policy that is created after those of the chart, and of the ConfigMap that it refuses."""
 
 
 def install(world: World) -> None:
@@ -33,6 +38,42 @@ def install(world: World) -> None:
     for body in render():
         if body["kind"] not in {"Deployment", "DaemonSet", "Pod"}:
             world.api.apply(path_of(body), body)
+    _await_policies(world)
+
+
+def _await_policies(world: World) -> None:
+    """Wait until the admission policies are in force, with a policy that is created after them and refuses one ConfigMap.
+
+    The API server adopts new policies about once per second, all of them together.
+    """
+    rule = {"apiGroups": [""], "apiVersions": ["v1"], "resources": ["configmaps"], "operations": ["CREATE"]}
+    specs = {
+        "ValidatingAdmissionPolicy": {
+            "matchConstraints": {"resourceRules": [rule]},
+            "validations": [{"expression": f"object.metadata.name != '{_LAST}'"}],
+        },
+        "ValidatingAdmissionPolicyBinding": {"policyName": _LAST, "validationActions": ["Deny"]},
+    }
+    objects = [
+        {"apiVersion": "admissionregistration.k8s.io/v1", "kind": kind, "metadata": {"name": _LAST}, "spec": spec}
+        for kind, spec in specs.items()
+    ]
+    probe = {"apiVersion": "v1", "kind": "ConfigMap", "metadata": {"name": _LAST}}
+
+    def in_force() -> bool:
+        try:
+            world.api.call("POST", f"/api/v1/namespaces/{SYSTEM}/configmaps?dryRun=All", probe)
+        except KubeError as error:
+            return error.status == HTTPStatus.UNPROCESSABLE_ENTITY
+        return False
+
+    try:
+        for body in objects:
+            world.api.apply(path_of(body), body)
+        wait_for(in_force, "the admission policies to be in force")
+    finally:
+        for body in objects:
+            world.api.delete(path_of(body))
 
 
 def uninstall(world: World) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import chart as fractus_chart
 import pytest
-from control_plane import ControlPlane, programs
+from control_plane import ControlPlane, programs, wait_for
 from mobility_rig import Rig
 from operator_world import OperatorProcess, World, fresh_namespace
 
@@ -88,10 +88,11 @@ def chart(control_plane: ControlPlane) -> Iterator[None]:
 
 @pytest.fixture
 def operator(kept_operator: OperatorProcess, world: World) -> Iterator[OperatorProcess]:
-    """A running operator. A failed test prints its log."""
+    """A running operator that has received the drones and edge nodes of the test. A failed test prints its log."""
     kept_operator.begin_log()
     if not kept_operator.running:
         kept_operator.start()
+    wait_for(world.is_labelled, kept_operator.log)
     yield kept_operator
     print(kept_operator.log())
 

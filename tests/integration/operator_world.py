@@ -146,6 +146,16 @@ class World:
         spec = {"location": place, "interfaces": interfaces, "services": {"camera": {"methods": CAMERA}}}
         self.put(fractus_object("EdgeNode", name, spec))
 
+    def is_labelled(self, *nodes: str) -> bool:
+        """Return True if the operator has labelled nodes with their location, because it has received their objects.
+
+        Args:
+            nodes: Names of the nodes. Default: all drones and edge nodes.
+        """
+        labels = {node["metadata"]["name"]: node["metadata"]["labels"] for node in self.api.list("/api/v1/nodes")}
+        names = nodes or [name for name in labels if labels[name].get("fractus.dev/class") != "cloud"]
+        return all("fractus.dev/geohash" in labels[name] for name in names)
+
     def path(self, body: Body) -> str:
         plural = "policies" if body["kind"] == "Policy" else f"{body['kind'].lower()}s"
         namespace = body["metadata"].get("namespace")

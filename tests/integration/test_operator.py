@@ -202,6 +202,8 @@ def test_deleted_or_modified_child_is_restored(world: World, operator: OperatorP
 def test_complete_mission_keeps_only_its_plan(world: World, operator: OperatorProcess, namespace: str) -> None:
     running(world, namespace)
     world.drone_status("drone-1", "flying")
+    world.phase(namespace, "Flying")
+    wait_for(lambda: len(flight_events(world)) >= 2, "the Events of the takeoff")
     end_mission(world, namespace, "Complete", "all control points were returned")
     status = world.phase(namespace, "Returning")
     assert status["message"] == "all control points were returned; drone-1 is returning"
@@ -526,6 +528,7 @@ def test_drone_is_held_by_one_application_until_it_has_returned(
     assert f"{namespace}/{first}" in world.status(namespace, second)["message"]
     assert not world.grants(namespace, second)
     world.drone_status("drone-1", "flying")
+    world.phase(namespace, "Flying", first)
     name = f"{namespace}.{first}-navigator"
     world.api.merge(f"{FRACTUS}/grants/{name}/status", {"status": {"phase": "Complete"}})
     world.phase(namespace, "Returning", first)
@@ -537,6 +540,7 @@ def test_drone_is_held_by_one_application_until_it_has_returned(
 
 def test_application_waits_for_a_drone(world: World, operator: OperatorProcess, namespace: str) -> None:
     world.api.delete(f"{FRACTUS}/drones/drone-1")
+    wait_for(lambda: not world.is_labelled("drone-1"), "the operator to receive the deletion")
     world.put(traffic(namespace))
     world.phase(namespace, "Pending")
     assert world.condition(namespace, "Ready")["reason"] == "NoDrone"
@@ -677,10 +681,11 @@ def test_recreated_application_gets_new_plan(world: World, operator: OperatorPro
         ),
         "one instance",
     )
-    assert {g["spec"]["application"]["uid"] for g in world.grants(namespace)} == {
-        (world.application(namespace) or {})["metadata"]["uid"]
-    }
-    assert old not in {g["spec"]["application"]["uid"] for g in world.grants(namespace)}
+    new = (world.application(namespace) or {})["metadata"]["uid"]
+    assert new != old
+    wait_for(
+        lambda: {g["spec"]["application"]["uid"] for g in world.grants(namespace)} == {new}, "the Grants of the new one"
+    )
 
 
 def test_object_of_another_owner_is_not_taken_over(world: World, operator: OperatorProcess, namespace: str) -> None:
@@ -707,8 +712,10 @@ def test_policy_with_missing_zone_grants_nothing(world: World, operator: Operato
     world.put(fractus_object("Zone", "school", {"area": {"circle": {"center": at(30, 30), "radius": 5}}}))
     world.phase(namespace, "Deploying")
     wait_for(lambda: _ready(world, "policies", "no-school") == "True", "the policy's condition")
-    policies = [p["name"] for g in world.grants(namespace) for p in g["spec"].get("policies", [])]
-    assert "no-school" in policies
+    wait_for(
+        lambda: "no-school" in [p["name"] for g in world.grants(namespace) for p in g["spec"].get("policies", [])],
+        "the policy in the Grants",
+    )
 
 
 def test_new_policy_updates_grants_of_running_application(
@@ -862,7 +869,7 @@ def test_change_pending_at_end_of_mission_starts_another_mission(
 
     wait_for(begins, "the next mission")
     assert driver_env(world, namespace).get("COLOUR") == "red"
-    assert world.grants(namespace)
+    wait_for(lambda: world.grants(namespace), "the Grants of the next mission")
 
 
 def test_field_removed_from_spec_is_removed(world: World, operator: OperatorProcess, namespace: str) -> None:

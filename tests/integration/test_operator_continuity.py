@@ -191,7 +191,7 @@ def test_refreshed_grant_keeps_previous_version_of_broken_policy(
     world.put(fractus_object("Policy", "fence", fence))
     world.put(fractus_object("Policy", "odd", LOW))
     running(world, namespace)
-    assert granted(world, namespace) == ["fence", "odd"]
+    wait_for(lambda: granted(world, namespace) == ["fence", "odd"], "both policies in the Grant")
     world.api.delete(f"{FRACTUS}/zones/school")
     with older_policies(world):
         wait_for(
@@ -224,6 +224,7 @@ def test_refreshed_grant_keeps_previous_version_of_broken_policy(
 def test_returning_drone_belongs_to_no_application(world: World, operator: OperatorProcess, namespace: str) -> None:
     running(world, namespace)
     world.drone_status("drone-1", "flying")
+    world.phase(namespace, "Flying")
     end_mission(world, namespace, "Complete", "done")
     world.phase(namespace, "Returning")
     again = traffic(namespace)
@@ -248,6 +249,7 @@ def test_recreated_application_waits_for_drone_of_deleted_one(
 ) -> None:
     running(world, namespace)
     world.drone_status("drone-1", "flying")
+    world.phase(namespace, "Flying")
     world.api.delete(world.path(traffic(namespace)))
     wait_for(lambda: gone(world, namespace), "the Application to be deleted")
     world.put(traffic(namespace))
@@ -264,9 +266,9 @@ def test_drone_in_two_plans_stays_with_plan_of_older_grant(
     world.add_drone("drone-2")
     world.put(traffic(namespace, "second"))
     assert world.phase(namespace, "Deploying", "second")["drone"] == "drone-2"
-    world.api.delete(f"{FRACTUS}/drones/drone-2")
     path = f"{FRACTUS}/namespaces/{namespace}/deploymentplans/second"
     operator.stop()
+    world.api.delete(f"{FRACTUS}/drones/drone-2")
     spec = copy.deepcopy((world.api.get(path) or {})["spec"])
     spec["drone"]["node"] = "drone-1"
     for placed in spec["placements"]:
@@ -294,6 +296,7 @@ def test_deleted_drone_in_flight_keeps_its_grants(world: World, operator: Operat
     running(world, namespace)
     world.add_drone("drone-2")
     world.drone_status("drone-1", "flying")
+    world.phase(namespace, "Flying")
     uids = {g["metadata"]["name"]: g["metadata"]["uid"] for g in world.grants(namespace)}
     world.api.delete(f"{FRACTUS}/drones/drone-1")
     world.api.delete("/api/v1/nodes/drone-1")

@@ -120,7 +120,7 @@ def test_direct_link_transitions_have_events(world: World, operator: OperatorPro
     path = f"{FRACTUS}/directlinks/{next(iter(world.links(namespace).values()))['metadata']['name']}"
     direct = {"phase": "Up", "traffic": "direct", "switches": 1, "message": "it is faster"}
     world.api.merge(f"{path}/status", {"status": direct})
-    wait_for(lambda: "TrafficDirect" in events(world, namespace), "an Event")
+    wait_for(lambda: {"LinkUp", "TrafficDirect"} <= set(events(world, namespace)), "both Events")
     reasons = events(world, namespace)
     assert reasons.count("LinkUp") == reasons.count("TrafficDirect") == 1
     world.api.merge(f"{path}/status", {"status": {"switches": 2, "traffic": "cloud"}})
@@ -156,10 +156,10 @@ def test_direct_links_follow_drone_and_end_with_mission(
     world.api.delete("/api/v1/nodes/drone-1")
 
     def moved() -> bool:
-        return {body["spec"]["drone"] for body in world.links(namespace).values()} == {"drone-2"}
+        links = world.links(namespace)
+        return set(links) == nodes and {body["spec"]["drone"] for body in links.values()} == {"drone-2"}
 
     wait_for(moved, lambda: f"the DirectLinks of drone-2; {world.links(namespace)}")
-    assert set(world.links(namespace)) == nodes
     world.api.delete(f"{FRACTUS}/edgenodes/{min(nodes)}")
     wait_for(lambda: min(nodes) not in world.links(namespace), "the DirectLink of the deleted node to be deleted")
     world.drone_status("drone-2", "flying")
@@ -196,7 +196,8 @@ def test_direct_links_of_two_applications_on_one_drone_are_separate(
     sorter = component("Sorter", "hybrid", hybridTo=["Camera"], ingress=["Camera"])
     world.put(fractus_object("Application", "guest", {"components": [camera, sorter]}, namespace))
     wait_for(lambda: world.links(namespace, "guest"), lambda: f"links; {world.status(namespace, 'guest')}")
-    deployed(world, namespace, "guest", 1)
+    plan = (world.api.get(f"{FRACTUS}/namespaces/{namespace}/deploymentplans/guest") or {})["spec"]
+    deployed(world, namespace, "guest", pods=7 + len(plan["placements"]))
     guests = world.links(namespace, "guest")
     hosts = world.links(namespace)
     assert {body["spec"]["drone"] for body in [*guests.values(), *hosts.values()]} == {"drone-1"}

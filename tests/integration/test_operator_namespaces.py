@@ -37,7 +37,7 @@ def test_application_created_after_deleted_namespace_of_same_name_is_planned(
     for pod in world.api.list(f"/api/v1/namespaces/{namespace}/pods"):
         world.api.delete(f"/api/v1/namespaces/{namespace}/pods/{pod['metadata']['name']}", 0)
     wait_for(lambda: world.api.get(f"/api/v1/namespaces/{namespace}") is None, "the namespace to be deleted")
-    assert gone(world, namespace)
+    wait_for(lambda: gone(world, namespace), "the Application and its child objects to be deleted")
     world.api.apply(
         f"/api/v1/namespaces/{namespace}",
         {"apiVersion": "v1", "kind": "Namespace", "metadata": {"name": namespace}},

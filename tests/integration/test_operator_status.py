@@ -55,7 +55,7 @@ def flying(world: World, namespace: str) -> None:
 
 def awaits(world: World, namespace: str) -> list[str]:
     """Return the components for which the driver's mission waits."""
-    (grant,) = (grant for grant in world.grants(namespace) if grant["spec"]["component"] == "Navigator")
+    grant = world.api.get(f"{FRACTUS}/grants/{namespace}.traffic-navigator") or {}
     return list(grant["spec"].get("awaits") or ())
 
 
@@ -72,7 +72,7 @@ def test_application_that_starts_when_ready_waits_for_its_components_until_takeo
     manifest = traffic(namespace)
     manifest["spec"]["start"] = "whenReady"
     world.put(manifest)
-    wait_for(lambda: world.grants(namespace), "the Grants")
+    wait_for(lambda: world.api.get(f"{FRACTUS}/grants/{namespace}.traffic-navigator"), "the Grant of the driver")
     assert awaits(world, namespace) == ["Navigator", "AerialViewer", "GroundViewer", "ImageChecker", "DataStore"]
     deployed(world, namespace)
     wait_for(lambda: awaits(world, namespace) == [], lambda: f"no awaited component: {world.status(namespace)}")

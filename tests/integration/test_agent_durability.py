@@ -118,10 +118,17 @@ def test_killed_write_set_leaves_all_old_or_all_new_files(tmp_path: Path, before
 
 
 WRITER = """
-import sys
+import os, sys
 from pathlib import Path
 from fractus_agent.grant_synchronizer import GrantDirectory, GrantSynchronizer
 from fractus_agent.store import GrantList
+for _ in sys.stdin:  # each line starts an agent, so that the modules are imported only once
+    if not os.fork():
+        break
+    os.wait()
+    print("ended", flush=True)
+else:
+    sys.exit()
 def grant(name, size):
     return {"apiVersion": "fractus.dev/v1alpha1", "kind": "Grant", "metadata": {"name": name, "uid": name},
         "spec": {"node": "n", "application": {"namespace": "d", "name": "a", "uid": "u"}, "component": "C",
@@ -129,7 +136,7 @@ def grant(name, size):
 directory = GrantDirectory(Path(sys.argv[1]))
 directory.open()
 synchronizer = GrantSynchronizer(None, directory, "n", lambda grant: None)
-print("ready", flush=True)
+print(os.getpid(), flush=True)
 turn = 0
 while True:
     turn += 1
@@ -142,22 +149,25 @@ def test_killed_agent_leaves_only_complete_grants(tmp_path: Path) -> None:
     print("seed", seed)
     source = random.Random(seed)
     seen = 0
-    for _ in range(12):
-        writer = subprocess.Popen([sys.executable, "-c", WRITER, str(tmp_path)], stdout=subprocess.PIPE)
-        try:
-            assert writer.stdout is not None
-            assert writer.stdout.readline() == b"ready\n"
-            moment = time.monotonic() + source.uniform(0.0, 0.05)
-            while time.monotonic() < moment:
-                for file in tmp_path.glob("*.json"):
-                    try:
-                        json.loads(file.read_bytes())
-                    except FileNotFoundError:
-                        continue
-        finally:
-            writer.send_signal(signal.SIGKILL)
-            writer.wait(10)
-        for file in tmp_path.glob("*.json"):
-            assert json.loads(file.read_bytes())["kind"] == "Grant"
-            seen += 1
+    argv = [sys.executable, "-c", WRITER, str(tmp_path)]
+    with subprocess.Popen(argv, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as starter:
+        assert starter.stdin is not None
+        assert starter.stdout is not None
+        for _ in range(12):
+            print("start", file=starter.stdin, flush=True)
+            agent = int(starter.stdout.readline())
+            try:
+                moment = time.monotonic() + source.uniform(0.0, 0.05)
+                while time.monotonic() < moment:
+                    for file in tmp_path.glob("*.json"):
+                        try:
+                            json.loads(file.read_bytes())
+                        except FileNotFoundError:
+                            continue
+            finally:
+                os.kill(agent, signal.SIGKILL)
+            assert starter.stdout.readline() == "ended\n"
+            for file in tmp_path.glob("*.json"):
+                assert json.loads(file.read_bytes())["kind"] == "Grant"
+                seen += 1
     assert seen > 0

@@ -29,7 +29,8 @@ def world(tmp_path: Path) -> Iterator[World]:
         yield world
 
 
-@pytest.mark.parametrize("restored", ["nothing", "half"])
+# A node whose operating system has restored half of the state needs more than a node without state.
+@pytest.mark.parametrize("restored", [pytest.param("nothing", marks=pytest.mark.slow), "half"])
 def test_nodes_recover_after_power_loss_during_a_link(world: World, restored: str) -> None:
     edge = world.edge("e1", 20.0)
     drone = world.drone()
@@ -167,7 +168,8 @@ def test_node_with_the_address_of_the_peer_gets_no_traffic(world: World) -> None
     check_restored(world, before)
 
 
-@pytest.mark.parametrize("loss", ["planned", "abrupt"])
+# `make test` shows planned switches with test_call_is_cut_only_if_it_takes_longer_than_the_drain.
+@pytest.mark.parametrize("loss", [pytest.param("planned", marks=pytest.mark.slow), "abrupt"])
 def test_long_stream_is_reopened_without_lost_or_repeated_replies(world: World, loss: str) -> None:
     edge = world.edge("e1", 20.0)
     drone = world.drone()

@@ -77,6 +77,9 @@ def partial(*policies: dict[str, Any], at: tuple[float, float]) -> dict[str, Any
     return grant(*policies, control="partial", controlPoints=points, services=services)
 
 
+# `make test` shows this with test_transit_and_return_fly_around_exclusion_zone and
+# test_partial_control_begins_at_control_point_after_transit.
+@pytest.mark.slow
 async def test_transit_flies_around_zone_to_control_point_and_home(rig: Rig) -> None:
     rig.write_grant(partial(fence("wall", "exclusion", "ignore", *WALL), at=(0, 45)))
     rig.start_service()
@@ -98,6 +101,8 @@ async def test_transit_flies_around_zone_to_control_point_and_home(rig: Rig) -> 
     assert not rig.log("service").count("Traceback")
 
 
+# `make test` shows this with test_poi_mission_visits_all_points_and_returns and test_sdk_dry_runs_and_passenger_poi_mission.
+@pytest.mark.slow
 async def test_poi_mission_visits_points_of_passenger_without_driver(rig: Rig) -> None:
     tour = positions((15, 15), (-15, 15))
     everywhere = [{"service": "mobility", "methods": ["GetControl", "GetPosition"]}]
@@ -132,6 +137,8 @@ def setpoint(north: float, east: float = 0.0, down: float = 0.0, hold_s: float =
     return pb.SetVelocityRequest(velocity=velocity, hold_s=hold_s)
 
 
+# `make test` shows this with test_velocity_setpoint_expires_after_hold_time and test_velocity_setpoints_do_not_enter_exclusion_zone.
+@pytest.mark.slow
 async def test_velocity_setpoint_expires_and_is_denied_toward_zone(rig: Rig) -> None:
     rig.write_grant(grant(altitude_limit(5, 15), fence("no-fly", "exclusion", "land", 50, -50, 90, 50)))
     rig.start_service()
@@ -229,6 +236,9 @@ async def test_vehicle_fence_returns_drone_without_service(rig: Rig) -> None:
     task.cancel()
 
 
+# `make test` shows this with test_fence_is_lowered_after_mission_ends and
+# test_service_stopped_right_after_landing_restores_owner_fence_and_parameters.
+@pytest.mark.slow
 async def test_owner_fence_is_restored_after_mission(rig: Rig) -> None:
     rig.write_grant(grant())
     rig.start_service()

@@ -37,6 +37,8 @@ def speed(telemetry: pb.Telemetry) -> float:
     return math.hypot(velocity.north_mps, velocity.east_mps, velocity.down_mps)
 
 
+# `make test` shows this with test_drone_of_lost_driver_hovers_and_returns_around_zone and test_suspended_driver_process_is_detected_as_lost.
+@pytest.mark.slow
 async def test_lost_driver_causes_hover_then_return(rig: Rig) -> None:
     driver = await flying(rig)
     going = driver.start_goto(0, 90)
@@ -54,6 +56,8 @@ async def test_lost_driver_causes_hover_then_return(rig: Rig) -> None:
     assert math.hypot(*xy(landed.position)) < 2
 
 
+# `make test` shows this with test_killed_navigator_continues_mission_and_keeps_running_after_it.
+@pytest.mark.slow
 async def test_driver_resumes_control_within_grace(rig: Rig) -> None:
     driver = await flying(rig)
     await driver.goto(0, 40)
@@ -135,6 +139,8 @@ async def first(driver: Driver) -> None:
             return
 
 
+# `make test` shows this with test_accelerating_drone_brakes_before_new_zone_without_takeover.
+@pytest.mark.slow
 async def test_zone_added_in_flight_stops_drone(rig: Rig) -> None:
     driver = await flying(rig, speedup=2.0)
     going = driver.start_goto(0, 90)
@@ -150,6 +156,8 @@ async def test_zone_added_in_flight_stops_drone(rig: Rig) -> None:
     await driver.goto(0, 20)
 
 
+# `make test` shows this with test_goto_into_zone_with_takeover_action_ends_mission and test_monitor_aborts_flight_into_zone_that_appears.
+@pytest.mark.slow
 async def test_zone_added_around_drone_revokes_control_and_lands(rig: Rig) -> None:
     driver = await flying(rig)
     rig.write_grant(grant(fence("new", "exclusion", "revoke", -30, -30, 30, 30)))
@@ -179,6 +187,8 @@ async def test_goto_into_zone_with_takeover_action_ends_mission(rig: Rig, action
     assert rig.entries("takeover")[0]["policies"] == ["no-fly"]
 
 
+# `make test` shows this with test_return_respects_zones_of_removed_grant and test_corrupt_grant_file_revokes_control.
+@pytest.mark.slow
 async def test_grant_removed_in_flight_returns_drone_home(rig: Rig) -> None:
     driver = await flying(rig)
     going = driver.start_goto(0, 90)

@@ -152,7 +152,7 @@ def _geohash(world: World, node: str) -> str | None:
     return labels.get("fractus.dev/geohash")
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGKILL, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
 def test_restarted_operator_changes_nothing(
     world: World, operator: OperatorProcess, namespace: str, number: int
 ) -> None:

@@ -153,7 +153,15 @@ def _in_trouble(world: World, namespace: str, trouble: Any) -> None:
     )
 
 
-@pytest.mark.parametrize("trouble", [_infeasible, _invalid, _foreign_deployment])
+@pytest.mark.parametrize(
+    "trouble",
+    # Every trouble raises Blocked, after the Grants were refreshed. `make test` runs one case, and another one below.
+    [
+        pytest.param(_infeasible, marks=pytest.mark.slow),
+        pytest.param(_invalid, marks=pytest.mark.slow),
+        _foreign_deployment,
+    ],
+)
 def test_policy_change_reaches_grant_of_application_in_trouble(
     world: World, operator: OperatorProcess, namespace: str, trouble: Any
 ) -> None:
@@ -168,7 +176,10 @@ def _without_depot(world: World, namespace: str) -> None:
     world.api.delete(f"{FRACTUS}/depots/base")
 
 
-@pytest.mark.parametrize("trouble", [_infeasible, _invalid, _without_depot])
+@pytest.mark.parametrize(
+    "trouble",
+    [_infeasible, pytest.param(_invalid, marks=pytest.mark.slow), pytest.param(_without_depot, marks=pytest.mark.slow)],
+)
 def test_certificate_is_renewed_for_application_in_trouble(
     world: World, operator: OperatorProcess, namespace: str, trouble: Any
 ) -> None:
@@ -335,7 +346,7 @@ def test_refused_teardown_is_retried(world: World, operator: OperatorProcess, na
     assert "is cancelled" not in operator.log(), "the deletion of the Application caused a warning"
 
 
-@pytest.mark.parametrize("restarted", [False, True], ids=["running", "restarted"])
+@pytest.mark.parametrize("restarted", [pytest.param(False, marks=pytest.mark.slow), True], ids=["running", "restarted"])
 def test_application_deleted_at_end_of_mission_leaves_no_pods(
     world: World, operator: OperatorProcess, namespace: str, *, restarted: bool
 ) -> None:

@@ -29,6 +29,15 @@ COMPLETED = {
 }
 
 
+RUNNING_OR_RESTARTED = pytest.mark.parametrize(
+    "restarted",
+    # `make test` restarts the operator in test_edited_status_in_flight_is_corrected_and_flight_continues and
+    # test_returning_drone_stays_claimed_after_restart_with_edited_status.
+    [False, pytest.param(True, marks=pytest.mark.slow)],
+    ids=["running", "restarted"],
+)
+
+
 def edit_status(world: World, namespace: str, status: Body, name: str = "traffic") -> None:
     """Write the status of an Application, as an administrator can."""
     present = world.application(namespace, name) or {}
@@ -114,7 +123,7 @@ def test_edited_status_in_flight_is_corrected_and_flight_continues(
     assert operator.log().count("application controller: planned") == 1, "the edited status led to a new plan"
 
 
-@pytest.mark.parametrize("restarted", [False, True], ids=["running", "restarted"])
+@RUNNING_OR_RESTARTED
 def test_edited_status_of_landed_drone_does_not_end_its_mission(
     world: World, operator: OperatorProcess, namespace: str, *, restarted: bool
 ) -> None:
@@ -130,7 +139,7 @@ def test_edited_status_of_landed_drone_does_not_end_its_mission(
     assert world.phase(namespace, "Landed")["drone"] == "drone-1"
 
 
-@pytest.mark.parametrize("restarted", [False, True], ids=["running", "restarted"])
+@RUNNING_OR_RESTARTED
 def test_edited_status_of_finished_mission_is_corrected(
     world: World, operator: OperatorProcess, namespace: str, *, restarted: bool
 ) -> None:

@@ -147,7 +147,9 @@ async def test_abrupt_switch_moves_traffic_to_the_cloud_path_at_once(world: Rig,
 
 
 @pytest.mark.parametrize(("drain_s", "reply"), [(3.0, "cloud"), (0.5, "FAILED")])
-@pytest.mark.parametrize("before", [0, 1])
+# `make test` has clients that completed calls before a switch in
+# test_planned_switches_lose_no_call_of_a_client_that_pauses_between_calls.
+@pytest.mark.parametrize("before", [0, pytest.param(1, marks=pytest.mark.slow)])
 async def test_call_is_cut_only_if_it_takes_longer_than_the_drain(
     world: Rig, redirector: Redirector, drain_s: float, reply: str, before: int
 ) -> None:

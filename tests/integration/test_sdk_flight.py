@@ -200,6 +200,8 @@ def calls(stage: Stage) -> list[tuple[str, str, str]]:
     return [(last["method"], last["action"], last["code"]) for *_, last in judgements]
 
 
+# `make test` shows this with test_traffic_monitoring_flies_under_policies, which flies the same path on a cluster.
+@pytest.mark.slow
 def test_navigator_flies_path_with_corrections_and_refusals(stage: Stage) -> None:
     stage.start_navigator()
     stage.wait("landing", lambda: stage.is_logged("landed"))
@@ -244,6 +246,9 @@ def test_killed_navigator_continues_mission_and_keeps_running_after_it(short: St
     assert short.processes["navigator"].poll() is None
 
 
+# `make test` shows this with test_killed_navigator_continues_mission_and_keeps_running_after_it and
+# test_second_process_continues_when_the_connection_of_the_first_one_ends.
+@pytest.mark.slow
 def test_navigator_killed_at_each_stage_completes_mission(short: Stage) -> None:
     def has_called(method: str, times: int) -> bool:
         return [entry["method"] for entry in short.entries() if entry["kind"] == "call"].count(method) >= times
@@ -268,6 +273,8 @@ def test_navigator_killed_at_each_stage_completes_mission(short: Stage) -> None:
     short.wait("landing", lambda: short.is_logged("landed"))
 
 
+# `make test` shows this with test_sdk_mission_survives_service_restart_and_takeover.
+@pytest.mark.slow
 def test_navigator_reconnects_to_killed_service(slow: Stage) -> None:
     slow.start_navigator()
     slow.wait("first waypoint", lambda: "waypoint 1/2 reached" in slow.log("navigator"))

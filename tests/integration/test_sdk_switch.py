@@ -98,7 +98,8 @@ def _printed_ids(process: subprocess.Popen[str]) -> list[str]:
     return process.stdout.read().split()
 
 
-@pytest.mark.parametrize(("pause_s", "size"), [(0.03, 10), (0.1, 200_000)])
+# Larger replies need more time, so a switch is more likely to cut one.
+@pytest.mark.parametrize(("pause_s", "size"), [pytest.param(0.03, 10, marks=pytest.mark.slow), (0.1, 200_000)])
 async def test_planned_switches_lose_and_repeat_no_sdk_request(
     world: Rig, redirector: Redirector, pause_s: float, size: int
 ) -> None:

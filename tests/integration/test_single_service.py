@@ -94,7 +94,8 @@ def _move_state_directory(rig: Rig) -> None:
     (rig.directory / "state").rename(rig.directory / "another-mount")
 
 
-@pytest.mark.parametrize("lose", [_replace_lock_file, _move_state_directory])
+# `make test` shows the other loss with test_process_ends_when_its_lock_file_is_lost.
+@pytest.mark.parametrize("lose", [_replace_lock_file, pytest.param(_move_state_directory, marks=pytest.mark.slow)])
 async def test_service_stops_sending_when_lock_is_lost(rig: Rig, lose: Callable[[Rig], None]) -> None:
     await start_flight(rig, speedup=2.0)
     entries = len(rig.entries())

@@ -66,14 +66,14 @@ E2E_IMAGES = $(if $(filter current,$(FRACTUS_E2E_CLUSTER)),,$(RUN) python -m fra
 E2E_WORKERS = $(if $(filter current,$(FRACTUS_E2E_CLUSTER)),0,2)
 
 .PHONY: test
-test: packages env lint ## Run the checks that every change must pass: lint, types, unit, component, integration, attack and kill tests, and a mission on an embedded cluster (30 min)
+test: packages env lint ## Run the checks that every change must pass: lint, types, unit, component, integration, attack and kill tests, and a mission on an embedded cluster (20 min)
 	$(RUN) fractus cluster binaries
 	$(PYTEST) $(UNIT) -m "not slow" tests/component tests/unit
 	@# Integration tests mostly wait. Meanwhile the images are built, with a lower priority and with out/images.log as output.
 	mkdir -p $(OUT); nice $(E2E_IMAGES) > $(OUT)/images.log 2>&1 & build=$$!; tests=0; \
 	$(PYTEST) -n 3 $(GROUPS) -m "not slow" tests/integration || tests=$$?; \
 	wait $$build || { cat $(OUT)/images.log >&2; exit 1; }; exit $$tests
-	$(PYTEST) -n $(E2E_WORKERS) $(GROUPS) -m "not slow" tests/e2e
+	$(PYTEST) -m "not slow" tests/e2e
 
 .PHONY: test-all
 test-all: packages env lint ## Run all tests: also slow tests, all golden flights and property-based examples, images, docs, chaos, and clusters of kind and kubeadm
@@ -121,8 +121,8 @@ fuzz: env ## Fuzz manifests, zones, calls, both services and MAVLink for SECONDS
 lint: env ## Check style, types and import directions
 	$(RUN) ruff check
 	$(RUN) ruff format --check
-	$(RUN) mypy
-	$(RUN) mypy --config-file tests/mypy.ini
+	@# mypy uses one core, and has a separate cache for the tests.
+	$(RUN) mypy --config-file tests/mypy.ini & tests=$$!; product=0; $(RUN) mypy || product=$$?; wait $$tests; exit $$product
 	$(RUN) lint-imports
 
 .PHONY: format

@@ -107,9 +107,9 @@ test-kubeadm: env ## Test the charts and a mission on a cluster of kubeadm, with
 
 # The fuzzers run libFuzzer and store findings in out/fuzz. The examples are the initial inputs for manifests.
 SECONDS ?= 600
-FUZZERS := manifests zones calls mobility camera exchange mavlink
+FUZZERS := manifests zones calls mobility camera exchange mavlink gateway
 .PHONY: fuzz
-fuzz: env ## Fuzz manifests, zones, calls, both services and MAVLink for SECONDS=600 each
+fuzz: env ## Fuzz manifests, zones, calls, both services, MAVLink and its gateway for SECONDS=600 each
 	mkdir -p $(addprefix $(OUT)/fuzz/,manifests $(FUZZERS)) && cp examples/traffic-monitoring/*.yaml $(OUT)/fuzz/manifests
 	failed=; for name in $(FUZZERS); do \
 		PYTHONPATH=tests:tests/component:tests/unit $(RUN) --with atheris==3.0.0 python tests/fuzz/$$name.py \

@@ -201,6 +201,19 @@ class GatewayWorld:
         server.close()
         return program
 
+    def tap(self) -> set[tuple[int, int]]:
+        """Return a set to which system and component id of each frame are added that the vehicle receives from now on."""
+        senders: set[tuple[int, int]] = set()
+        parser = Parser()
+        receive = self.sky.craft.receive
+
+        def tapped(channel: Any, data: bytes) -> None:
+            senders.update((m.sysid, m.compid) for m in parser.feed(data))
+            receive(channel, data)
+
+        self.sky.craft.receive = tapped  # type: ignore[method-assign]
+        return senders
+
 
 @contextlib.asynccontextmanager
 async def flying(sky: Sky, directory: Path) -> AsyncIterator[GatewayWorld]:

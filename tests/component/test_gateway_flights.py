@@ -140,44 +140,12 @@ def test_program_that_dies_in_flight_is_brought_home(tmp_path: Path) -> None:
     fly(flight, tmp_path)
 
 
-def test_escapes_are_refused_and_audited_and_the_flight_continues(tmp_path: Path) -> None:
-    async def flight(world):
-        grant = world.drone.grants.put(mavlink_spec())
-        program = await world.program(grant.identity)
-        await program.up()
-        assert await program.command(400, 0, 21196) == DENIED
-        assert await program.command(185, 1) == DENIED
-        assert await program.command(246, 1) == DENIED
-        assert await program.command(32000, 1) == DENIED
-        program.send("PARAM_SET", param_id=b"FS_GCS_ENABLE", param_value=0.0)
-        program.send("SERIAL_CONTROL", device=0, flags=1)
-        program.send("RC_CHANNELS_OVERRIDE", chan3_raw=1000)
-        program.send("FILE_TRANSFER_PROTOCOL", payload=(0, 0, 0, 4))
-        program.target(0, 20)
-        await program.until(lambda: program.place[1] > 19)
-        assert {entry["message"] for entry in world.refused} == {
-            "COMPONENT_ARM_DISARM", "DO_FLIGHTTERMINATION", "PREFLIGHT_REBOOT_SHUTDOWN", "CAN_FORWARD", "PARAM_SET",
-            "SERIAL_CONTROL", "RC_CHANNELS_OVERRIDE", "FILE_TRANSFER_PROTOCOL",
-        }  # fmt: skip
-        assert world.sky.truth.params["FS_GCS_ENABLE"] != 0.0
-        await program.close()
-
-    fly(flight, tmp_path)
-
-
 def test_vehicle_receives_no_frame_that_the_service_did_not_encode(tmp_path: Path) -> None:
     async def flight(world):
         grant = world.drone.grants.put(mavlink_spec())
         program = await world.program(grant.identity)
         await program.until(lambda: program.mode == GUIDED)
-        senders = set()
-        receive = world.sky.craft.receive
-
-        def tap(channel, data):
-            senders.update((data[5], data[6]) for _ in (data,))
-            receive(channel, data)
-
-        world.sky.craft.receive = tap
+        senders = world.tap()
         await program.up()
         for name in ("MANUAL_CONTROL", "SET_ATTITUDE_TARGET", "HIL_SENSOR", "GPS_INPUT", "SET_MODE"):
             program.send(name)

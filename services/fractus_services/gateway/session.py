@@ -46,6 +46,9 @@ MAX_HOLD_S = 2.0
 HOLD_PERIODS = 1.5
 """Time for which a velocity is held: for the first velocity, at most, and in observed periods between velocities."""
 
+RESERVED_SOURCES = frozenset({(1, mavlink.MAV_COMP_ID_AUTOPILOT1), (244, mavlink.MAV_COMP_ID_ONBOARD_COMPUTER)})
+"""System and component ids of the autopilot and of the mobility service. A HEARTBEAT with such ids is refused."""
+
 TEXT_BYTES = 50
 VERSION = 0x040603FF
 """Version that AUTOPILOT_VERSION reports: ArduCopter 4.6.3. The gateway offers the interface of this version."""
@@ -224,6 +227,8 @@ class Session:
         if decision == "consume":
             self._decision = "consume"
             if message.name == "HEARTBEAT":
+                if (message.sysid, message.compid) in RESERVED_SOURCES:
+                    raise Untranslatable("the ids 1/1 and 244/191 belong to the drone; send heartbeats with other ids")
                 self._heartbeat_at = now
             return []
         if decision == "respond":

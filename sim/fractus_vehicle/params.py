@@ -80,7 +80,7 @@ def _index() -> dict[str, int]:
 
 
 def canonical(name: str) -> str:
-    """Return the name of a parameter in this release, for a name in any case or of a later release."""
+    """Return the name of a parameter in this release. The given name may be in lower case, or the name in a later release."""
     upper = name.upper()
     return ALIASES.get(upper, upper)
 

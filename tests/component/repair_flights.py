@@ -227,7 +227,7 @@ class RepairFlight(Flight):
         return str(mission.outcome) if mission is not None and mission.outcome is not None else ""
 
     async def _lose(self) -> None:
-        """Lose contact: first too short for a reaction, then for good."""
+        """Lose contact twice: first for a time that is too short for a reaction, then permanently."""
         await self._lose_contact(self.chance.uniform(1, self.after_s - 2.5))
         self._expects(not self._outcome(), f"a short interruption of contact ended the mission: {self._outcome()}")
         flying = asyncio.ensure_future(self._wander_on())

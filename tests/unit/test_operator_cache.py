@@ -280,7 +280,7 @@ class EventsOfTheCluster(RuleBasedStateMachine):
             if drone is not None and drone.in_air and drone.name not in held:
                 last = self.last_claims.get(drone.name)
                 if last is None:
-                    # Only plans of missions whose drone returns show who has flown it.
+                    # No earlier claim is known. Only the plan of an ended mission shows whose flight the drone ends.
                     last = self.cache.fleet.claims()[drone.name]
                     assert (last.uid, drone.name) in self.returning or not last.uid
                 held[drone.name] = replace(last, returning=True)

@@ -223,7 +223,7 @@ async def test_deployment_with_changed_owner_is_deleted(owner: str) -> None:
 
 
 def applications(*, over: bool) -> SimpleNamespace:
-    """Return a cache of one Application whose mission is over or not."""
+    """Return a cache of one Application. `over` states if its mission is over."""
     flown = MissionRecord(outcome="Complete") if over else None
     plan = DeploymentPlanSpec(application="a", flown=flown)
     return SimpleNamespace(

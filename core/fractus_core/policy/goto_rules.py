@@ -127,7 +127,7 @@ def _judge_from(request: _Request, target: XY) -> Verdict:
         )
     notes: list[Correction] = []
     if args.alt is not None and args.reference == "terrain":
-        reason = "no terrain model is loaded; the ground is taken as level with home"
+        reason = "no terrain model is loaded; the ground is assumed to be level with home"
         notes.append(Correction(altitude, "TerrainAssumedFlat", reason))
     permitted = _permitted_leg(request, _Aim(target, altitude), notes, adjusting=True)
     if isinstance(permitted, Verdict):

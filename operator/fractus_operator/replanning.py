@@ -188,7 +188,7 @@ def stuck_nodes(
     """Return the planned nodes on which the scheduler cannot place a pod.
 
     Returns:
-        Messages of the scheduler by node, and the seconds until the next check, or None if no other pod may become stuck.
+        Messages of the scheduler by node, which do not name the node, and the seconds until the next check, or None if no other pod may become stuck.
     """
     nodes = {placed.instance: placed.node for placed in plan.placements} if plan is not None else {}
     stuck: dict[str, str] = {}
@@ -207,7 +207,7 @@ def stuck_nodes(
             # The predecessor of the pod still uses the resources. They are released when the predecessor has ended.
             wait_s = min(1.0, wait_s or 1.0)
         elif remaining_s <= 0:
-            stuck[node] = f"the scheduler cannot place {pod.instance} on {node}: {pod.unschedulable_message}"
+            stuck[node] = f"the scheduler cannot place {pod.instance}: {pod.unschedulable_message}"
         else:
             wait_s = min(remaining_s, wait_s or remaining_s)
     return stuck, wait_s

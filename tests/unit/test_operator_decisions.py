@@ -186,7 +186,7 @@ def test_node_is_stuck_after_grace_period() -> None:
     assert stuck_nodes(PLAN, [waiting], NOW) == ({}, 3.0)
     stuck, again_s = stuck_nodes(PLAN, [waiting], NOW + timedelta(seconds=10))
     assert (set(stuck), again_s) == ({"edge-1"}, None)
-    assert "no cpu" in stuck["edge-1"]
+    assert stuck["edge-1"] == "the scheduler cannot place a-1: no cpu"  # shown after the name of the node
     in_the_cloud = view("a-c", ready=False, unschedulable_since=NOW - timedelta(minutes=1))
     leaving = view("a-1", terminating=True, unschedulable_since=NOW - timedelta(minutes=1))
     forged = view("a-1", deployment=None, unschedulable_since=NOW - timedelta(minutes=1))

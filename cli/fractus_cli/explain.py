@@ -8,6 +8,8 @@ from typing import Any
 
 import click
 from fractus_core.api import InvalidObject, Policy
+from fractus_core.api.applications import ApplicationSpec
+from fractus_core.api.components import default_lifetime
 from fractus_core.api.grants import ApplicationReference
 from fractus_core.policy.selectors import policy_applies
 
@@ -24,6 +26,7 @@ from fractus_cli.cluster_reader import (
 from fractus_cli.output import output_option, printable
 
 _LISTED = 5
+_AFTER_FLIGHT_S: int = ApplicationSpec.model_fields["after_flight"].default
 
 
 @click.command()
@@ -76,6 +79,7 @@ def collect(cluster: ClusterReader, namespace: str, name: str) -> dict[str, Any]
         "message": status.get("message", "not processed by the operator yet"),
         "conditions": list(status.get("conditions") or ()),
         "drone": plan.get("drone"),
+        "lifetimes": _lifetimes(body.get("spec") or {}),
         "placements": list(plan.get("placements") or ()),
         "rejected": list(plan.get("rejected") or ()),
         "rejectedOmitted": plan.get("rejectedOmitted", 0),
@@ -122,6 +126,7 @@ def lines(summary: dict[str, Any], limit: int | None) -> Iterator[str]:
         yield f"Takeoff: when all components are ready (start: whenReady); not ready: {', '.join(summary['awaits'])}"
     for placement in summary["placements"]:
         yield from _placement(placement)
+    yield from _ends(summary["lifetimes"])
     yield from _rejections(summary, limit)
     yield from _policies(summary["policies"])
     yield from summary["notes"]
@@ -168,6 +173,21 @@ def _placement(placement: Body) -> Iterator[str]:
     }.get(placement["role"], placement["role"])
     coverage = f", {placement['coverage']:.0%} of it" if placement.get("coverage") else ""
     yield f"{placement['component']}: {placement.get('node') or 'cloud'} ({reason}{coverage})"
+
+
+def _lifetimes(spec: Body) -> dict[str, Any]:
+    """Return the components that end with the flight and those that outlive it, and the time after the landing in seconds."""
+    ends: dict[str, list[str]] = {"flight": [], "application": []}
+    for component in spec.get("components") or ():
+        ends[component.get("endsWith") or default_lifetime(component["placement"])].append(component["name"])
+    return {"afterFlight": spec.get("afterFlight", _AFTER_FLIGHT_S), **ends}
+
+
+def _ends(lifetimes: dict[str, Any]) -> Iterator[str]:
+    if lifetimes["flight"]:
+        yield f"Until {lifetimes['afterFlight']} s after the landing (spec.afterFlight): {', '.join(lifetimes['flight'])}"
+    if lifetimes["application"]:
+        yield f"Until the Application is deleted (endsWith: application): {', '.join(lifetimes['application'])}"
 
 
 def _rejections(summary: dict[str, Any], limit: int | None) -> Iterator[str]:

@@ -57,7 +57,14 @@ DRONE = named(
 APPLICATION = named(
     "traffic",
     "default",
-    spec={"contactLost": {"after": 20, "action": "hover"}, "components": [{"name": "Navigator"}]},
+    spec={
+        "contactLost": {"after": 20, "action": "hover"},
+        "components": [
+            {"name": "Navigator", "placement": "drone"},
+            {"name": "Viewer", "placement": "edge", "endsWith": "application"},
+            {"name": "Store", "placement": "cloud"},
+        ],
+    },
     status={"phase": "Flying", "drone": "drone-1", "pods": "3/3", "message": "drone-1 flies"},
 )
 
@@ -166,6 +173,8 @@ def test_explain_prints_placements_rejected_nodes_and_policies(run: Run, explain
         "leg to 39.500000, 22.500000: Detour by school: the system flies a detour of 80 m",
         "Viewer: edge-1 (for location 1)",
         "Store: cloud (any cloud node)",
+        "Until 30 s after the landing (spec.afterFlight): Navigator\n",
+        "Until the Application is deleted (endsWith: application): Viewer, Store\n",
         "Rejected for Navigator:",
         "drone-3: FlightTooLong: needs 9 min",
         "and 2 more (--all)",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -169,6 +170,40 @@ def test_report_is_deterministic(record: FlightRecord, written: Path, tmp_path: 
 def test_policies_for_other_drones_are_not_drawn(record: FlightRecord) -> None:
     assert "no-heavy-drones-at-the-riverside" not in {p.name for p in record.policies_in_force}
     assert "no-fly-hospital" in {p.name for p in record.policies_in_force}
+
+
+@pytest.mark.parametrize(
+    ("selection", "drawn"),
+    [
+        ({"action": "abort"}, (10.0, 20.0)),
+        ({"action": "abort", "landAt": {"north": 30.0, "east": 40.0}}, (30.0, 40.0)),
+        ({"action": "returnToLaunch"}, None),
+        (None, None),
+    ],
+)
+def test_landing_place_of_a_selected_policy_is_drawn(
+    selection: dict[str, Any] | None, drawn: tuple[float, float] | None, record: FlightRecord
+) -> None:
+    def place(north_m: float, east_m: float) -> dict[str, float]:
+        lat, lon = record.frame.latlon(east_m, north_m)
+        return {"lat": lat, "lon": lon}
+
+    content = copy.deepcopy(demo_flight.content())
+    for body in content["objects"]:
+        if body["kind"] == "Application" and selection is not None:
+            own = (
+                {"landAt": place(**{f"{k}_m": v for k, v in selection["landAt"].items()})}
+                if "landAt" in selection
+                else {}
+            )
+            body["spec"]["policyActions"] = [{"policy": "no-fly-hospital", "action": selection["action"], **own}]
+        if body["metadata"]["name"] == "no-fly-hospital":
+            body["spec"] |= {"choices": ["abort", "returnToLaunch"], "landAt": place(10.0, 20.0)}
+    landings = dict(mission_map(FlightRecord.of(content, demo_flight.audit())).landings)
+    if drawn is None:
+        assert landings == {}
+    else:
+        assert landings["landing (no-fly-hospital)"] == pytest.approx((drawn[1], drawn[0]), abs=0.01)
 
 
 def test_report_of_a_mission_without_flight_is_written(tmp_path: Path) -> None:

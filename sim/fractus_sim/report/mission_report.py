@@ -12,6 +12,7 @@ import shapely
 import shapely.geometry
 import yaml
 from fractus_core.api import EdgeNode, Policy
+from fractus_core.api.geometry import Point
 from fractus_core.geo import LocalFrame, area_polygon, multipolygon_geojson
 
 from fractus_sim.report.flight_geojson import feature, feature_collection, lonlat, path_feature, point
@@ -290,11 +291,19 @@ def mission_map(record: FlightRecord) -> FlightMap:
 
 
 def _landing_places(record: FlightRecord) -> Iterable[tuple[str, tuple[float, float]]]:
-    """Yield the names and positions of the landing places that the application or its policies specify."""
+    """Yield the names and positions of the landing places that the application or its policies specify.
+
+    The place of a policy also applies if the application selects `abort` without an own place.
+    """
     spec = record.application.spec
-    places = [(selection.policy, selection.land_at) for selection in spec.policy_actions]
-    selected = {selection.policy for selection in spec.policy_actions}
-    places += [(policy.name, policy.spec.land_at) for policy in record.policies if policy.name not in selected]
+    selections = {selection.policy: selection for selection in spec.policy_actions}
+    places: list[tuple[str, Point | None]] = []
+    for policy in record.policies:
+        selection = selections.get(policy.name)
+        action = selection.action if selection is not None else policy.spec.action
+        own_place = selection.land_at if selection is not None else None
+        if action == "abort":
+            places.append((policy.name, own_place or policy.spec.land_at))
     if spec.contact_lost is not None:
         places.append(("contact lost", spec.contact_lost.land_at))
     for name, place in places:

@@ -27,6 +27,7 @@ from fractus_sim.demo.mission_data import (
 from fractus_sim.errors import ExperimentError
 from fractus_sim.report.audit_log_reader import read_audit_logs
 from fractus_sim.report.flight_record import AUDIT, OBJECTS, PICTURES, FlightRecord, TimeWindow, last_mission
+from fractus_sim.report.html_page import HTML_PAGE
 from fractus_sim.report.mission_report import write_mission_report
 from fractus_sim.report.report_files import PAGE, remove_report
 from fractus_sim.testbeds.kube_commands import Kube, Object
@@ -81,7 +82,7 @@ def report(
 
     The report has a summary, a map, an altitude plot, the decisions of policies, and pictures if the camera service records.
     The data come from the cluster with kubectl (the user needs `pods/exec` in fractus-system), or from manifests, audit
-    logs and recordings.
+    logs and recordings. The file report.html contains the whole report.
     """
     folder = out or Path("out") / application
     if audit and not manifests:
@@ -91,7 +92,7 @@ def report(
     with command_errors():
         _check_folder(folder, audit)
         folder.mkdir(parents=True, exist_ok=True)
-        remove_report(folder, OBJECTS, "events.json")
+        remove_report(folder, OBJECTS, HTML_PAGE, "events.json")
         shutil.rmtree(folder / PICTURES, ignore_errors=True)
         if audit:
             collect_from_files(application, namespace, manifests, audit, folder)
@@ -102,7 +103,7 @@ def report(
         extract_pictures(files, record, folder)
         write_mission_report(FlightRecord.read(folder), folder)
     Console().print(Markdown((folder / PAGE).read_text()))
-    click.echo(f"report: {folder / PAGE}")
+    click.echo(f"report: {folder / HTML_PAGE}")
 
 
 def _check_folder(folder: Path, audit: Sequence[Path]) -> None:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import base64
 import copy
 import json
+import re
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -14,6 +16,7 @@ import pytest
 import yaml
 from fractus_core.api import DeploymentPlan
 from fractus_sim.report.flight_record import FlightRecord
+from fractus_sim.report.html_page import html_page
 from fractus_sim.report.mission_report import (
     mission_geojson,
     mission_map,
@@ -154,12 +157,39 @@ def test_geojson_contains_all_objects_as_longitude_latitude(record: FlightRecord
 
 def test_all_report_files_are_written(written: Path) -> None:
     names = {path.name for path in written.iterdir()}
-    assert names == {"summary.md", "report.json", "flight.geojson", "plan.yaml", "map.png", "altitude.png"}
+    assert names == {
+        "summary.md",
+        "report.json",
+        "flight.geojson",
+        "plan.yaml",
+        "map.png",
+        "altitude.png",
+        "report.html",
+    }
     for figure in ("map.png", "altitude.png"):
         content = (written / figure).read_bytes()
         assert content.startswith(PNG)
         assert len(content) > 20_000
     assert DeploymentPlan.from_body(yaml.safe_load((written / "plan.yaml").read_text())).spec.placements
+
+
+def test_html_page_contains_figures_and_no_reference_to_other_files(written: Path) -> None:
+    page = (written / "report.html").read_text()
+    figures = [base64.b64encode((written / name).read_bytes()).decode() for name in ("map.png", "altitude.png")]
+    assert re.findall(r' src="([^"]*)"', page) == [f"data:image/png;base64,{figure}" for figure in figures]
+    assert "href=" not in page
+    assert "<table>" in page
+    assert "no-fly-hospital" in page
+
+
+def test_html_page_escapes_texts_of_components_and_embeds_no_files_that_they_name(tmp_path: Path) -> None:
+    (tmp_path / "secret.jpg").write_bytes(b"secret")
+    text = "![x](secret.jpg) ![y](https://example.com/y.png) <script>alert(1)</script>"
+    page = html_page("<b>", summary=text, figures=(), sections=text, pictures=(), folder=tmp_path)
+    assert "<script>" not in page
+    assert "<title>&lt;b&gt;</title>" in page
+    assert base64.b64encode(b"secret").decode() not in page
+    assert "default-src 'none'; img-src data:" in page
 
 
 def test_report_is_deterministic(record: FlightRecord, written: Path, tmp_path: Path) -> None:

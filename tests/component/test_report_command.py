@@ -81,7 +81,9 @@ def test_report_is_written_from_manifests_and_audit_log(files: tuple[Path, Path]
     page = (out / "summary.md").read_text()
     assert page.startswith("# Flight of traffic-monitoring")
     assert "no-fly-hospital" in page
-    assert {"map.png", "altitude.png", "flight.geojson", "report.json"} <= {path.name for path in out.iterdir()}
+    assert {"report.html", "map.png", "altitude.png", "flight.geojson", "report.json"} <= {
+        path.name for path in out.iterdir()
+    }
 
 
 def test_report_replaces_only_an_earlier_report(files: tuple[Path, Path], tmp_path: Path) -> None:

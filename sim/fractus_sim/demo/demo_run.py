@@ -21,6 +21,7 @@ from fractus_sim.demo.mission_data import RECORDINGS, collect_mission_data, extr
 from fractus_sim.errors import ExperimentError
 from fractus_sim.progress import Progress
 from fractus_sim.report.flight_record import AUDIT, OBJECTS, PICTURES, FlightRecord
+from fractus_sim.report.html_page import HTML_PAGE
 from fractus_sim.report.mission_report import mission_results, write_mission_report
 from fractus_sim.report.report_files import remove_report
 from fractus_sim.testbeds.embedded_cluster import (
@@ -109,7 +110,7 @@ class Demo:
             ExperimentError: A step failed.
         """
         self.out.mkdir(parents=True, exist_ok=True)
-        remove_report(self.out, OBJECTS, "events.json", LOGS)
+        remove_report(self.out, OBJECTS, HTML_PAGE, "events.json", LOGS)
         for folder in (AUDIT, PICTURES, RECORDINGS):
             shutil.rmtree(self.out / folder, ignore_errors=True)
         kube: Kube | None = None

@@ -19,6 +19,7 @@ from fractus_sim.report.flight_geojson import feature, feature_collection, lonla
 from fractus_sim.report.flight_map import XY, DrawnNode, DrawnZone, FlightMap, Mark, ZoneKind, draw_map
 from fractus_sim.report.flight_profile import Limit, Profile, Request, Span, draw_profile
 from fractus_sim.report.flight_record import PICTURES, FlightRecord, JudgedCall, picture_time_s
+from fractus_sim.report.html_page import HTML_PAGE, html_page
 from fractus_sim.report.report_files import format_duration, rounded, table, write_report
 
 _PLACEMENT_REASONS = {
@@ -36,7 +37,7 @@ _SAME_ALTITUDE_M = 0.05
 
 
 def write_mission_report(record: FlightRecord, folder: Path) -> None:
-    """Write summary.md, report.json, flight.geojson, plan.yaml, map.png and altitude.png into a folder."""
+    """Write summary.md, report.html, report.json, flight.geojson, plan.yaml, map.png and altitude.png into a folder."""
     folder.mkdir(parents=True, exist_ok=True)
     if record.plan is not None:
         (folder / "plan.yaml").write_text(yaml.safe_dump(record.plan.to_dict(), sort_keys=False))
@@ -49,6 +50,7 @@ def write_mission_report(record: FlightRecord, folder: Path) -> None:
             "altitude.png": lambda: draw_profile(mission_profile(record)),
         },
         geojson={"flight.geojson": mission_geojson(record)},
+        texts={HTML_PAGE: lambda: mission_html(record, folder)},
     )
 
 
@@ -57,8 +59,31 @@ def write_mission_report(record: FlightRecord, folder: Path) -> None:
 
 def mission_page(record: FlightRecord) -> str:
     """Return the summary page in Markdown: flight, policy decisions, and placement of components."""
+    files = (
+        "Figures: [map.png](map.png), [altitude.png](altitude.png). Data: [flight.geojson](flight.geojson),"
+        " [report.json](report.json), [plan.yaml](plan.yaml), [audit](audit). All in one file: [report.html](report.html)."
+    )
+    return "\n\n".join((_summary(record), *_sections(record), files)) + "\n"
+
+
+def mission_html(record: FlightRecord, folder: Path) -> str:
+    """Return the summary page as HTML that contains the figures and pictures of a folder."""
+    return html_page(
+        f"Flight of {record.application.name}",
+        summary=_summary(record),
+        figures=("map.png", "altitude.png"),
+        sections="\n\n".join(_sections(record)),
+        pictures=[f"{PICTURES}/{name}" for name in record.pictures],
+        folder=folder,
+    )
+
+
+def _summary(record: FlightRecord) -> str:
+    return f"# Flight of {record.application.name}\n\n{_headline(record)}"
+
+
+def _sections(record: FlightRecord) -> list[str]:
     parts = [
-        f"# Flight of {record.application.name}\n\n{_headline(record)}",
         _times_section(record),
         decisions_section(record.decisions, _utc),
         _pictures_section(record),
@@ -66,10 +91,8 @@ def mission_page(record: FlightRecord) -> str:
         _links_section(record),
         _pods_section(record),
         _audit_section(record),
-        "Figures: [map.png](map.png), [altitude.png](altitude.png). Data: [flight.geojson](flight.geojson),"
-        " [report.json](report.json), [plan.yaml](plan.yaml), [audit](audit).",
     ]
-    return "\n\n".join(part for part in parts if part) + "\n"
+    return [part for part in parts if part]
 
 
 def _headline(record: FlightRecord) -> str:

@@ -45,7 +45,9 @@ def write_report(
     page: str,
     results: Mapping[str, Any],
     figures: Mapping[str, Callable[[], Figure]],
+    *,
     geojson: Mapping[str, Mapping[str, Any]] | None = None,
+    texts: Mapping[str, Callable[[], str]] | None = None,
 ) -> None:
     """Write the files of a report.
 
@@ -58,6 +60,7 @@ def write_report(
         results: Machine-readable results.
         figures: Functions that draw the figures, by file name.
         geojson: FeatureCollections by file name.
+        texts: Functions that return text files which contain the figures, by file name.
     """
     folder.mkdir(parents=True, exist_ok=True)
     (folder / RESULTS).write_text(json.dumps(results, indent=2) + "\n")
@@ -65,6 +68,8 @@ def write_report(
         (folder / name).write_text(json.dumps(collection) + "\n")
     for name, draw in figures.items():
         save_figure(draw(), folder / name)
+    for name, text in (texts or {}).items():
+        (folder / name).write_text(text())
     write_page(folder, page)
 
 

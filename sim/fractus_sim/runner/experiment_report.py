@@ -40,7 +40,7 @@ def write_outcome(outcome: Outcome) -> None:
         experiment_page(outcome),
         experiment_results(outcome),
         figures,
-        {"tracks.geojson": experiment_geojson(outcome)},
+        geojson={"tracks.geojson": experiment_geojson(outcome)},
     )
 
 

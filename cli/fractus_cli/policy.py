@@ -30,7 +30,7 @@ from fractus_cli.output import output_option
 R = TypeVar("R", bound=Resource)
 
 IN_AIR_M = 0.5
-"""Altitude above home, in metres, from which the drone counts as flying."""
+"""Altitude above home, in metres, above which the drone counts as flying."""
 
 
 @click.group()

@@ -68,7 +68,7 @@ def after_flight(application: Application | None, plan: DeploymentPlanSpec, now:
 
 
 def until_deleted(application: Application | None, plan: DeploymentPlanSpec) -> AfterFlight:
-    """Return the instances of a plan that run until the Application is deleted. An instance on the drone is none of them."""
+    """Return the instances of a plan that run until the Application is deleted. Instances on the drone are never included."""
     drone = plan.drone.node if plan.drone is not None else None
 
     def lasts(placed: PlannedInstance) -> bool:

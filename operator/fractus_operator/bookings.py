@@ -68,7 +68,7 @@ class Bookings:
 
         Args:
             node: Name of the node.
-            requester: Namespace and label value of the Application that is being planned. Its own bookings do not count.
+            requester: Namespace and label value of the Application that is being planned. Its own bookings are not included.
             pods: Pods of that Application on the node.
         """
         extra: Amounts = {}
@@ -96,7 +96,7 @@ class BookedHosts(Mapping[str, Host]):
     Args:
         hosts: All Nodes.
         bookings: Booked resources.
-        requester: Namespace and label value of the Application that is being planned. Its own bookings do not count.
+        requester: Namespace and label value of the Application that is being planned. Its own bookings are not included.
         pods: Pods of that Application.
     """
 

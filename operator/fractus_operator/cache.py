@@ -384,7 +384,7 @@ def _host_inputs(host: Host | None) -> tuple[object, ...] | None:
 
 
 def _changed_by_user(old: Submitted | None, new: Submitted | None) -> bool:
-    """Return True if a user changed the spec of an Application. A change of its status does not count."""
+    """Return True if a user changed the spec of an Application. Changes of the status are ignored."""
     return old is not None and new is not None and old.metadata.generation != new.metadata.generation
 
 

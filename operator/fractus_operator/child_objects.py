@@ -338,7 +338,7 @@ class ChildObjects:
 
 
 def _versions(desired: Body, observed: Body) -> tuple[object, ...]:
-    """Return the digest of a stamped object and the version of an observed one. A change of the status does not count."""
+    """Return the digest of a stamped object, and uid and version of an observed object. Changes of the status change neither."""
     metadata = observed["metadata"]
     digest = desired["metadata"]["annotations"][DIGEST_ANNOTATION]
     return (digest, metadata.get("uid"), metadata.get("generation") or metadata.get("resourceVersion"))

@@ -54,15 +54,15 @@ class PodView:
 
     Attributes:
         requests: Effective resource requests in base units.
-        deployment: Name of the Deployment that created it through a ReplicaSet, if any.
+        deployment: Name of the Deployment that created the pod through a ReplicaSet, if any.
         daemon_set: Name of the DaemonSet that created it, if any.
         revision: Hash of the template of its DaemonSet.
-        finished_at: Time since which it is stopped and only kept for its logs, if so.
+        finished_at: Time of the stop if the pod is stopped and only kept for its logs, otherwise None.
         failure: Exit code of the last failure of its container, the line that states the error, and the log lines before it, or an
             empty string.
-        unschedulable_since: Time since which the scheduler has found no node for it, if so.
+        unschedulable_since: Time since which the scheduler finds no node for it, None if it is scheduled.
         unschedulable_message: Message of the scheduler.
-        eviction: Message why Kubernetes ends it (drain, taint, preemption), or an empty string.
+        eviction: Message why Kubernetes ends the pod (drain, taint, preemption), or an empty string.
     """
 
     namespace: str

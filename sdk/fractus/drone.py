@@ -88,7 +88,7 @@ class Mobility(ServiceClient):
             timeout_s: Longest wait for control, in seconds; by default unlimited.
             progress: Callback for the reason of the wait, called on every change.
             response_timeout_s: Seconds for which the program may block its event loop before it loses control, from 1 to 60;
-                0 if a hanging program shall not be noticed, for example in a debugger.
+                0: a hanging program is not noticed, for example in a debugger.
         """
         self._control = Control(
             self._channel,
@@ -330,8 +330,8 @@ class Mobility(ServiceClient):
 class CanI:
     """Dry runs of the calls of `Mobility`, with the same arguments.
 
-    Each method returns the policy engine's current verdict. Nothing is carried out or taken over. The component needs a
-    Grant, but not control of the drone.
+    Each method returns the policy engine's current verdict. The call is not carried out, and the system does not take the drone.
+    The component needs a Grant, but not control of the drone.
     """
 
     def __init__(self, check: Callable[[mobility_pb2.CheckCallRequest], Awaitable[Check]]) -> None:

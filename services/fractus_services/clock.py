@@ -11,7 +11,7 @@ from fractus_core.policy.decision_types import UncertainTime
 log = logging.getLogger(__name__)
 
 TRUST_AFTER_S = 120.0
-"""Time after a step from which the new reading is trusted."""
+"""Time after a step until the new reading is trusted."""
 
 MAX_SLEW_S = 1.0
 """Maximum correction by NTP in normal operation."""

@@ -273,7 +273,7 @@ def camera() -> None:
 @_option(
     "--face-px",
     48,
-    "Face width in pixels from which detection is reliable; if faces may be smaller, a policy's fallback applies.",
+    "Minimum face width in pixels for reliable detection; if faces may be smaller, a policy's fallback applies.",
     click.FloatRange(min=12, max=1000),
 )
 @_option(

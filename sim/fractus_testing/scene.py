@@ -67,7 +67,7 @@ DEFINITION = "experiment.yaml"
 TRIGGER_TIMEOUT_S = 300.0
 MAX_DURATION_S = 7200.0
 SETTLE_S = 600.0
-"""Calm time after which the experiment of a test would end by itself, seconds. The test ends it earlier."""
+"""Seconds without an event after which an experiment ends. The test ends its experiment earlier."""
 
 STEP_S = 0.25
 PROGRAM_END_S = 5.0

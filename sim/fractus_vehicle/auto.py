@@ -32,7 +32,8 @@ HOLDS = frozenset(
         mavlink.MAV_CMD_NAV_ATTITUDE_TIME,
     }
 )
-# LOITER_TURNS: distance from the circle up to which the vehicle does not fly to it first, and smallest acceleration.
+# LOITER_TURNS: a vehicle farther from the circle than CIRCLE_NEAR_M first flies to it. CIRCLE_ACCEL_MIN_RPS2 is the smallest
+# angular acceleration.
 CIRCLE_NEAR_M = 3.0
 CIRCLE_ACCEL_MIN_RPS2 = math.radians(2.0)
 

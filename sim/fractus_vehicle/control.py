@@ -170,8 +170,8 @@ class Control:
     def shift(self, north: float, east: float, down: float) -> None:
         """Move the trajectory with an estimate that was reset, as ArduCopter does.
 
-        A vehicle that flies with a velocity, or has stopped, therefore does not move. A vehicle that flies to a point corrects its
-        course. The vehicle returns to its altitude.
+        A vehicle that flies with a velocity, or has stopped, therefore does not react to the reset. A vehicle that flies to a point
+        corrects its course. A vehicle whose altitude was reset returns to its altitude.
         """
         self.pos[0] += north
         self.pos[1] += east

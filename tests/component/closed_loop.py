@@ -123,12 +123,12 @@ class Weather:
     """Environment of a flight.
 
     Attributes:
-        uplink_s: Delay from the companion to the vehicle. Jitter adds up to half of it.
+        uplink_s: Delay from the companion to the vehicle. Jitter adds up to half of this delay.
         downlink_s: Delay from the vehicle to the companion, with the same jitter.
         loss: Share of frames lost in each direction.
         wind_mps: Mean wind.
         gusts_mps: Strength of gusts.
-        error_m: Distance of the true position north of the estimated one.
+        error_m: Distance of the true position north of the estimated position.
         claimed_error_m: Position error reported by the GPS. If None, the GPS reports the actual error.
         speedup: Speed of the vehicle's clock relative to the clock of the service.
         cut: Begin and duration of the link outage, if any.
@@ -235,7 +235,7 @@ class Sky(Loop):
 
     @property
     def truth(self) -> VehicleState:
-        """True state of the vehicle. Its telemetry may differ from it."""
+        """True state of the vehicle. The reported state may differ."""
         return self.craft.vehicle.state
 
     async def create_connection(self, factory: Any, *_: Any, **__: Any) -> Any:  # type: ignore[override]

@@ -202,7 +202,7 @@ class GatewayWorld:
         return program
 
     def tap(self) -> set[tuple[int, int]]:
-        """Return a set to which system and component id of each frame are added that the vehicle receives from now on."""
+        """Return a set that collects the senders (system and component id) of all frames that the vehicle receives from now on."""
         senders: set[tuple[int, int]] = set()
         parser = Parser()
         receive = self.sky.craft.receive

@@ -53,7 +53,7 @@ SLOW_TURN_S = 0.7
 SLOW_TURN_MPS = 10.0
 """Documented increase of this distance for a drone that needs longer than `SLOW_TURN_S` to undo its acceleration.
 
-Its speed changes for this time in the direction in which the jump led it, although it already brakes. ArduCopter needs
+For this time, the drone still accelerates in the direction of the jump, although it already brakes. ArduCopter needs
 WPNAV_ACCEL / PSC_JERK_XY: 0.5 s with its default parameters.
 """
 

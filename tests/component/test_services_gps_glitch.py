@@ -22,7 +22,7 @@ from mobility_world import end, goto, spec, zone
 from sky_drone import fly, ready, until
 
 SOUTH = shapely.box(-60.0, -80.0, 190.0, -23.0)
-"""A zone 23 m beside a course to the east. A vehicle that believes to be 33 m north of its course flies into it."""
+"""A zone 23 m beside a course to the east. A vehicle whose estimate is 33 m north of its course flies south into the zone."""
 
 GLITCH_DEG = 0.0003
 """About 33 m."""

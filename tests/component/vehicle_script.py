@@ -40,7 +40,7 @@ RECONNECT_TIMEOUT_S = 20.0
 """Time within which a lost link must be open again. A vehicle that has aborted does not return."""
 
 LONGEST_INTERVAL_US = 2.0**31
-"""Message interval from which the conversion to an integer aborts SITL, in microseconds."""
+"""Message interval above which the conversion to an integer aborts SITL, in microseconds."""
 
 ELSEWHERE_M = 5_000.0
 """A vehicle at least this far from the recorded position, in metres, has another home."""

@@ -27,10 +27,10 @@ PROBE_INTERVAL_S = 1.0
 """Interval between two probes of the API server, in seconds."""
 
 PROBE_TIMEOUT_S = 3.0
-"""Response time, in seconds, from which the API server counts as unreachable."""
+"""Response time, in seconds, above which the API server counts as unreachable."""
 
 STALE_AFTER_S = 2.0
-"""Time without contact, in seconds, from which the state counts as stale. Watches end and restart regularly."""
+"""Time without contact, in seconds, after which the state counts as stale. Watches end and restart regularly."""
 
 T = TypeVar("T", bound=api.Resource)
 

@@ -27,7 +27,7 @@ POLL_INTERVAL_S = 0.5
 """Interval between two scans of the directory, in seconds. Services write every 3 s."""
 
 MAX_CURRENT_AGE_S = 60.0
-"""Time without writes, in seconds, from which a file belongs to an earlier flight."""
+"""Time without writes, in seconds, after which a file counts as part of an earlier flight."""
 
 _BATCH = 1_000
 

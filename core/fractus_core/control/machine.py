@@ -203,9 +203,9 @@ def _on_driver(update: StateUpdate, event: DriverEvent) -> None:
 
 
 def _count_waypoints(update: StateUpdate, event: WaypointsDone) -> None:
-    """Count a leg of the driver, and the waypoints that are complete with it or by the driver's report.
+    """Count a flown leg of the driver, and the waypoints that the driver has completed since the previous event.
 
-    A completed waypoint counts as reached if a leg ended since the waypoint before. Otherwise the driver skipped it.
+    A completed waypoint counts as reached if a leg ended since the previous waypoint. Otherwise it counts as skipped.
     """
     mission = update.state.missions.get(event.key)
     if mission is None or not (event.leg or event.waypoints > mission.waypoints):

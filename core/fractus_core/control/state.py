@@ -334,7 +334,7 @@ class ControlState:
         removed: Key of the mission whose grant was removed in flight. Its constraints apply on the return flight.
         grants: Keys of the grants in force.
         speed_mps: Speed for legs that specify none, as set by the driver.
-        decided: True once it is settled who has control authority.
+        decided: True if the control authority has been determined.
         armed_seen: Armed state at the last heartbeat; None before the first.
         armed_by_others: True if the motors were not started by the system, so that no mission flight was prepared.
         expected_mode: Mode that the vehicle is known to be in, or that the system requested. A different mode was set by

@@ -45,7 +45,7 @@ class TelemetrySample:
 def local_position(frame: LocalFrame, position: Position, sample: TelemetrySample) -> LocalPosition:
     """Convert a position of a manifest to metres east and north of the frame's origin, and metres above home.
 
-    A position without altitude gets the drone's altitude. Terrain is taken to be as high as home.
+    A position without altitude gets the drone's altitude. The terrain is assumed to be as high as home.
     """
     if position.alt is None:
         up_m = sample.above_home_m

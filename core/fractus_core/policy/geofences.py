@@ -250,7 +250,7 @@ def comes_level(
         upper_m: Highest altitude of the leg above home.
         now: State of the drone.
         height_margin_m: Distance to keep from the zone's altitudes.
-        flat: True if the ground is taken as level with home.
+        flat: True if the ground is assumed to be level with home.
     """
     gap_m = band_gap_m(band, lower_m, upper_m, now.home, flat)
     present_m = band_gap_m(band, *altitude_range_to_stop_m(now), now.home, flat)

@@ -1,4 +1,4 @@
-"""Face detectors, and the face size from which each is reliable."""
+"""Face detectors, and the minimum face size for which each detector is reliable."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Box = tuple[int, int, int, int]
 FACE_WIDTH_M = 0.13
 """Width of a child's face, the narrowest face that must be detected."""
 DEFAULT_MIN_PX = 48
-"""Face width, in pixels, from which the cascades are reliable. `bench/faces.py` measures it."""
+"""Minimum face width for which the cascades are reliable, in pixels. `bench/faces.py` measures it."""
 _REDUCED_FACE_PX = 28
 """Images are reduced until the smallest face that they may show has this width. The cascades were trained with faces of 20 pixels,
 so larger images only take more time."""
@@ -52,7 +52,7 @@ class FaceDetector(Protocol):
 
     Attributes:
         name: Name for log messages and benchmarks.
-        min_px: Face width from which detection is reliable, in pixels.
+        min_px: Minimum face width for reliable detection, in pixels.
     """
 
     name: str
@@ -86,7 +86,7 @@ class CascadeDetector:
     """Viola-Jones cascades that OpenCV 4 ships: frontal and profile faces, also rotated and mirrored.
 
     Args:
-        min_px: Face width from which detection counts as reliable, in pixels.
+        min_px: Minimum face width for which detection counts as reliable, in pixels.
     """
 
     name = "cascades"
@@ -144,7 +144,7 @@ class ModelDetector:
 
     Args:
         path: File of the model.
-        min_px: Face width from which detection counts as reliable, in pixels.
+        min_px: Minimum face width for which detection counts as reliable, in pixels.
         score: Minimum score of a detection.
 
     Raises:

@@ -15,7 +15,7 @@ from fractus_core.policy.decision_types import Attitude, Lens, Situation
 from fractus_core.policy.footprint import camera_axes
 
 MAX_AGE_S = 1.0
-"""Age from which a measurement is stale."""
+"""Maximum age of a measurement. An older measurement is stale."""
 HISTORY_S = 30.0
 """Time for which measurements are kept. It is longer than any exposure."""
 ALTITUDE_ERROR_M = 1.0

@@ -19,7 +19,7 @@ class CameraSettings(ServiceOptions):
         keep_total_mb: Maximum size of all stored images, in megabytes.
         camera: Camera connection, such as `v4l2:/dev/video0`. None uses the connection in the node description.
         face_model: YuNet face detection model (ONNX). None uses OpenCV's cascades.
-        face_px: Width from which faces are detected reliably, in pixels.
+        face_px: Minimum width of faces for reliable detection, in pixels.
         relief: Maximum depth of the surrounding ground below home, in metres. It limits the area that an image may show.
         capture_timeout_s: Time after which a camera that has returned no image counts as failed, in seconds.
         motion_frame_interval_s: Interval between the three frames for motion detection, in seconds.

@@ -43,7 +43,7 @@ DEFAULT_ERROR_M = 1.5
 """Default 1-sigma position error if the GPS reports none, in metres."""
 
 MAX_POSITION_AGE_S = 1.0
-"""Age from which a position counts as unknown, in seconds. In flight, 20 positions are due in this time (20 Hz)."""
+"""Age above which a position counts as unknown, in seconds. In flight, 20 positions are due in this time (20 Hz)."""
 
 WIND_MAX_AGE_S = 10.0
 """Maximum age of the wind estimate."""

@@ -48,7 +48,7 @@ RETRY_S = 60.0
 """Delay before recording is tried again after a failure."""
 
 HANG_TIMEOUT_S = 5.0
-"""Duration from which a write counts as failed."""
+"""Duration after which a write counts as failed."""
 
 MAX_WAITING = 5_000
 """Default size of the queue. A drone in flight produces about a hundred messages per second."""

@@ -26,7 +26,7 @@ SCAN_INTERVAL_S = 5.0
 """Interval between two scans of the directory, in seconds."""
 
 MAX_CURRENT_AGE_S = 60.0
-"""Time without writes, in seconds, from which a recording belongs to an earlier flight."""
+"""Time without writes, in seconds, after which a recording counts as part of an earlier flight."""
 
 
 class PictureScanner:

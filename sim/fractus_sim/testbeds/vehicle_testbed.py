@@ -24,7 +24,7 @@ from fractus_sim.testbeds.tlog import TlogWriter
 
 STEPS_PER_TICK = 2
 MAX_BEHIND_S = 1.0
-"""Maximum delay of this process, in real time, that the simulation makes up for. Time beyond it is lost."""
+"""Maximum delay of this process, in real time, that the simulation makes up for. After a longer delay, it stays behind."""
 
 CONNECT_S = 20.0
 

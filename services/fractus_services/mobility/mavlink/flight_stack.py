@@ -84,7 +84,7 @@ class FlightStack(Protocol):
         fence_switch: Parameter that enables the fence.
         fence_total: Parameter that counts the fence items.
         fence_parameters: Fence parameters in the order in which they are set, the switch last.
-        variance_limit: Parameter with the variance of the estimator from which its failsafe acts.
+        variance_limit: Parameter with the variance of the estimator at which its failsafe acts.
         gimbal_type: Parameter with the type of the first gimbal.
         measured_gimbals: Gimbal types with a measured attitude. Other types may report their target.
     """

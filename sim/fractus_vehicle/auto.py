@@ -6,23 +6,20 @@ import math
 from collections.abc import Callable
 
 from fractus_services.mavlink_server.mission_items import LANDINGS, TAKEOFFS, Item
+from fractus_services.mavlink_server.stored_mission import ARRIVALS, CURVES, hold_s, title
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fractus_vehicle.breadcrumbs import Point
 from fractus_vehicle.descent import descend
 from fractus_vehicle.flight import Flight
 from fractus_vehicle.leg import Leg
-from fractus_vehicle.mission_commands import MissionCommands, item_target, title
+from fractus_vehicle.mission_commands import MissionCommands, item_target
 from fractus_vehicle.rtl import ReturnToLaunch
 from fractus_vehicle.spline import SplineLeg
 from fractus_vehicle.state import CONTROL_STEP_S, VehicleState
 
 # Bit of MIS_OPTIONS: the mission goes on after a landing. Otherwise it does so only if it takes off again.
 CONTINUE_AFTER_LAND = 4
-# Waypoint commands that can be passed without a stop.
-CURVES = frozenset({mavlink.MAV_CMD_NAV_WAYPOINT, mavlink.MAV_CMD_NAV_SPLINE_WAYPOINT})
-# Commands whose end is reported in a STATUSTEXT.
-ARRIVALS = CURVES | {mavlink.MAV_CMD_NAV_LOITER_TIME}
 # Commands for which the vehicle holds its position.
 HOLDS = frozenset(
     {
@@ -337,28 +334,7 @@ class AutoFlight(Flight):
             if self._leg is None or not self._arrived(v, self._leg):
                 return False
             self._arrived_s = v.time_s
-        return v.time_s - self._arrived_s >= _wait_s(item)
-
-
-def _wait_s(item: Item) -> float:
-    """Return how long an item lasts after the vehicle has arrived, in seconds. Infinite if only a client can end it."""
-    match item.command:
-        case mavlink.MAV_CMD_NAV_LOITER_UNLIM:
-            return math.inf
-        case mavlink.MAV_CMD_NAV_GUIDED_ENABLE:
-            return math.inf if item.param1 > 0.0 else 0.0
-        case mavlink.MAV_CMD_NAV_SCRIPT_TIME:
-            return item.param2 if item.param2 > 0.0 else math.inf  # there are no scripts that could end earlier
-        case (
-            mavlink.MAV_CMD_NAV_WAYPOINT
-            | mavlink.MAV_CMD_NAV_SPLINE_WAYPOINT
-            | mavlink.MAV_CMD_NAV_LOITER_TIME
-            | mavlink.MAV_CMD_NAV_DELAY
-            | mavlink.MAV_CMD_NAV_ATTITUDE_TIME
-        ):
-            return max(item.param1, 0.0)
-        case _:
-            return 0.0
+        return v.time_s - self._arrived_s >= hold_s(item)
 
 
 def _radius_m(v: VehicleState, item: Item) -> float:

@@ -10,7 +10,7 @@ from fractus_vehicle.telemetry import send_on_all
 def set_home(v: VehicleState, place: Place) -> None:
     """Set the home position, also in the mission, and send HOME_POSITION and GPS_GLOBAL_ORIGIN."""
     v.home = place
-    v.mission.set_home(place)
+    v.mission.set_home(place.lat_e7, place.lon_e7, place.alt_m)
     send_on_all(v, "HOME_POSITION")
     send_on_all(v, "GPS_GLOBAL_ORIGIN")
 

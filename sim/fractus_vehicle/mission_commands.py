@@ -6,6 +6,7 @@ import math
 from collections import deque
 
 from fractus_services.mavlink_server.mission_items import Item
+from fractus_services.mavlink_server.stored_mission import title
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fractus_vehicle.accessories import set_relay, set_servo
@@ -125,56 +126,3 @@ def item_target(v: VehicleState, item: Item) -> tuple[float, float, float]:
         return (v.control.target[0], v.control.target[1], down)
     north, east, _ = origin.vector_to(type(origin)(item.x, item.y, 0.0))
     return (north, east, down)
-
-
-_TITLES: dict[int, str] = {
-    mavlink.MAV_CMD_NAV_WAYPOINT: "WP",
-    mavlink.MAV_CMD_NAV_SPLINE_WAYPOINT: "SplineWP",
-    mavlink.MAV_CMD_NAV_TAKEOFF: "Takeoff",
-    mavlink.MAV_CMD_NAV_LAND: "Land",
-    mavlink.MAV_CMD_NAV_VTOL_TAKEOFF: "VTOLTakeoff",
-    mavlink.MAV_CMD_NAV_VTOL_LAND: "VTOLLand",
-    mavlink.MAV_CMD_NAV_GUIDED_ENABLE: "GuidedEnable",
-    mavlink.MAV_CMD_NAV_PAYLOAD_PLACE: "PayloadPlace",
-    mavlink.MAV_CMD_NAV_SCRIPT_TIME: "NavScriptTime",
-    mavlink.MAV_CMD_NAV_ATTITUDE_TIME: "NavAttitudeTime",
-    mavlink.MAV_CMD_NAV_RETURN_TO_LAUNCH: "RTL",
-    mavlink.MAV_CMD_NAV_LOITER_UNLIM: "LoitUnlim",
-    mavlink.MAV_CMD_NAV_LOITER_TIME: "LoitTime",
-    mavlink.MAV_CMD_NAV_LOITER_TURNS: "LoitTurns",
-    mavlink.MAV_CMD_NAV_LOITER_TO_ALT: "LoitAltitude",
-    mavlink.MAV_CMD_NAV_DELAY: "Delay",
-    mavlink.MAV_CMD_CONDITION_DELAY: "CondDelay",
-    mavlink.MAV_CMD_CONDITION_DISTANCE: "CondDist",
-    mavlink.MAV_CMD_CONDITION_YAW: "CondYaw",
-    mavlink.MAV_CMD_DO_CHANGE_SPEED: "ChangeSpeed",
-    mavlink.MAV_CMD_DO_SET_HOME: "SetHome",
-    mavlink.MAV_CMD_DO_SET_SERVO: "SetServo",
-    mavlink.MAV_CMD_DO_SET_RELAY: "SetRelay",
-    mavlink.MAV_CMD_DO_SET_ROI: "SetROI",
-    mavlink.MAV_CMD_DO_REPEAT_SERVO: "RepeatServo",
-    mavlink.MAV_CMD_DO_REPEAT_RELAY: "RepeatRelay",
-    mavlink.MAV_CMD_DO_DIGICAM_CONFIGURE: "DigiCamCfg",
-    mavlink.MAV_CMD_DO_DIGICAM_CONTROL: "DigiCamCtrl",
-    mavlink.MAV_CMD_DO_SET_CAM_TRIGG_DIST: "SetCamTrigDst",
-    mavlink.MAV_CMD_DO_FENCE_ENABLE: "FenceEnable",
-    mavlink.MAV_CMD_DO_SET_REVERSE: "SetReverse",
-    mavlink.MAV_CMD_DO_SET_RESUME_REPEAT_DIST: "SetRepeatDist",
-    mavlink.MAV_CMD_DO_ENGINE_CONTROL: "EngineControl",
-    mavlink.MAV_CMD_DO_PAUSE_CONTINUE: "PauseContinue",
-    mavlink.MAV_CMD_DO_LAND_START: "LandStart",
-    mavlink.MAV_CMD_DO_MOUNT_CONTROL: "MountControl",
-    mavlink.MAV_CMD_DO_GRIPPER: "Gripper",
-    mavlink.MAV_CMD_DO_PARACHUTE: "Parachute",
-    mavlink.MAV_CMD_DO_SPRAYER: "Sprayer",
-    mavlink.MAV_CMD_DO_AUX_FUNCTION: "AuxFunction",
-    mavlink.MAV_CMD_DO_WINCH: "Winch",
-    mavlink.MAV_CMD_DO_GUIDED_LIMITS: "GuidedLimits",
-    mavlink.MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW: "GimbalPitchYaw",
-    mavlink.MAV_CMD_JUMP_TAG: "JumpTag",
-}
-
-
-def title(item: Item) -> str:
-    """Return ArduPilot's name of a command in STATUSTEXTs."""
-    return _TITLES.get(item.command, "Cmd")

@@ -12,6 +12,7 @@ from fractus_runtime.mavlink_codec import Value
 from fractus_services.mavlink_server.channel import Channel
 from fractus_services.mavlink_server.coordinates import ABSOLUTE_FRAMES, GLOBAL_FRAMES, TERRAIN_FRAMES
 from fractus_services.mavlink_server.mission_items import ItemStore
+from fractus_services.mavlink_server.stored_mission import Mission
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fractus_vehicle.body import Airframe, Body, Wind
@@ -22,7 +23,6 @@ from fractus_vehicle.estimator import FULL_START_S, Estimator
 from fractus_vehicle.fence import Fence
 from fractus_vehicle.gimbal import Gimbal
 from fractus_vehicle.heading import Heading
-from fractus_vehicle.mission import Mission
 from fractus_vehicle.params import Parameters
 from fractus_vehicle.receiver import Receiver
 from fractus_vehicle.sensors import Battery, Gps

@@ -128,13 +128,7 @@ def autopilot_version(_v: VehicleState) -> Values:
 
 def mission_current(v: VehicleState) -> Values:
     """Build MISSION_CURRENT."""
-    total = max(0, len(v.mission.items) - 1)
-    return {
-        "seq": v.mission.current,
-        "total": total,
-        "mission_state": v.mission.state(v.mode),
-        "mission_mode": 1 if v.mode == mavlink.COPTER_MODE_AUTO else 0,
-    }
+    return v.mission.report(v.mode)
 
 
 def mission_item_reached(v: VehicleState) -> Values:

@@ -54,6 +54,7 @@ class Upload:
     received_s: float
     requested_s: float
     old_format: bool = False
+    complete: bool = False  # all items have arrived, and the vehicle has not accepted or refused the list yet
 
     def is_from(self, message: Message) -> bool:
         """Return True if the message comes from the uploading peer."""
@@ -65,15 +66,30 @@ def _address(peer: Message | Upload, kind: int) -> dict[str, Value]:
 
 
 class Transfers:
-    """Vehicle side of the mission protocol for all list kinds and links. Each kind allows one upload at a time."""
+    """Vehicle side of the mission protocol for all list kinds and links. Each kind allows one upload at a time.
+
+    Args:
+        stores: Lists by MAV_MISSION_TYPE.
+        replace_items: Stores a complete list. Returns the MAV_MISSION_RESULT, or None if `conclude` is called later. Empty
+            lists are stored at once.
+        clear: Clears a list. Returns the MAV_MISSION_RESULT.
+        send_text: Sends a STATUSTEXT with a severity.
+        judge_item: Returns the MAV_MISSION_RESULT of one item of a list, with its number.
+        stored_by_item: Lists that are replaced item by item. Other lists are replaced when all items have arrived.
+    """
 
     def __init__(
         self,
         stores: Mapping[int, ItemStore],
-        replace_items: Callable[[ItemStore, list[Item]], int],
+        replace_items: Callable[[ItemStore, list[Item]], int | None],
         clear: Callable[[ItemStore], int],
         send_text: Callable[[int, str], None],
+        *,
+        judge_item: Callable[[Item, int, int], int] = lambda item, kind, _number: validate_item(item, kind),
+        stored_by_item: frozenset[int] = STORED_BY_ITEM,
     ) -> None:
+        self._judge_item = judge_item
+        self._stored_by_item = stored_by_item
         self._stores = stores
         self._replace = replace_items
         self._clear = clear
@@ -136,11 +152,12 @@ class Transfers:
             self._send_text(mavlink.MAV_SEVERITY_WARNING, f"Only {MAX_ITEMS[store.kind]} items are supported")
             self._ack(channel, message, store.kind, mavlink.MAV_MISSION_NO_SPACE)
         elif not item_range:
-            self._complete(channel, message, store, [])
+            verdict = self._replace(store, [])
+            self._report(channel, message, store.kind, mavlink.MAV_MISSION_ACCEPTED if verdict is None else verdict)
         else:
             kept = list(store.items)
             if message.name == "MISSION_COUNT":
-                kept = kept[: len(item_range)] if store.kind in STORED_BY_ITEM else []
+                kept = kept[: len(item_range)] if store.kind in self._stored_by_item else []
                 self._store_arrived(store, kept)
             self.uploads[store.kind] = up = Upload(
                 channel=channel,
@@ -164,6 +181,8 @@ class Transfers:
         if up is None:
             self._ack(channel, message, store.kind, mavlink.MAV_MISSION_ERROR)
             return
+        if up.complete:
+            return  # the client repeats an item because the acknowledgement takes long
         if message.name == "MISSION_ITEM" and not up.old_format:
             up.old_format = True
             self._send_text(mavlink.MAV_SEVERITY_WARNING, "got MISSION_ITEM; GCS should send MISSION_ITEM_INT")
@@ -187,26 +206,33 @@ class Transfers:
         if up.next <= up.last:
             self._request_next(up)
             return
-        del self.uploads[store.kind]
-        self._complete(channel, message, store, up.items)
+        up.complete = True
+        verdict = self._replace(store, up.items)
+        if verdict is not None:
+            self.conclude(store.kind, verdict)
+
+    def conclude(self, kind: int, verdict: int) -> None:
+        """Acknowledge a complete list that the vehicle has accepted or refused."""
+        up = self.uploads.get(kind)
+        if up is not None and up.complete:
+            del self.uploads[kind]
+            self._report(up.channel, up, kind, verdict)
 
     def _store_arrived(self, store: ItemStore, items: list[Item]) -> None:
         """Store the items of an unfinished upload, if the list is stored item by item.
 
         After an aborted upload, the list consists of the new items that arrived and the old items behind them.
         """
-        if store.kind in STORED_BY_ITEM:
+        if store.kind in self._stored_by_item:
             self._replace(store, list(items))
 
-    def _complete(self, channel: Channel, message: Message, store: ItemStore, items: list[Item]) -> None:
-        """Store a completed list and acknowledge it."""
-        verdict = self._replace(store, items)
-        self._ack(channel, message, store.kind, verdict)
-        if verdict == mavlink.MAV_MISSION_ACCEPTED and store.kind in RECEIVED_TEXTS:
-            self._send_text(*RECEIVED_TEXTS[store.kind])
+    def _report(self, channel: Channel, peer: Message | Upload, kind: int, verdict: int) -> None:
+        """Acknowledge a list, and report a stored one in a STATUSTEXT."""
+        self._ack(channel, peer, kind, verdict)
+        if verdict == mavlink.MAV_MISSION_ACCEPTED and kind in RECEIVED_TEXTS:
+            self._send_text(*RECEIVED_TEXTS[kind])
 
-    @staticmethod
-    def _validate(message: Message, item: Item, store: ItemStore, up: Upload) -> int:
+    def _validate(self, message: Message, item: Item, store: ItemStore, up: Upload) -> int:
         if store.kind == mavlink.MAV_MISSION_TYPE_MISSION:
             if message.integer("seq") == 0:
                 return mavlink.MAV_MISSION_ACCEPTED
@@ -215,7 +241,7 @@ class Transfers:
                 return verdict
             if item.command == mavlink.MAV_CMD_DO_JUMP and not 0 < int(item.param1) < max(len(up.items), up.last + 1):
                 return mavlink.MAV_MISSION_ERROR
-        return validate_item(item, store.kind)
+        return self._judge_item(item, store.kind, message.integer("seq"))
 
     def _send_item(self, channel: Channel, message: Message, store: ItemStore) -> None:
         seq = message.integer("seq")
@@ -249,6 +275,8 @@ class Transfers:
         """Repeat requests without a response, and cancel an upload after UPLOAD_TIMEOUT_S."""
         self.now_s = now_s
         for kind, up in list(self.uploads.items()):
+            if up.complete:
+                continue
             if now_s - up.received_s > UPLOAD_TIMEOUT_S:
                 del self.uploads[kind]
                 self._ack(up.channel, up, up.kind, mavlink.MAV_MISSION_OPERATION_CANCELLED)

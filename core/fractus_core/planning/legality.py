@@ -27,6 +27,7 @@ from fractus_core.policy.decision_types import (
     distinct,
 )
 from fractus_core.policy.engine import judge
+from fractus_core.policy.route_check import arrived
 from fractus_core.policy.route_search import quick_route
 from fractus_core.policy.selectors import application_reference, node_attributes, policy_applies
 
@@ -311,15 +312,11 @@ class _Flight:
     def _arrive(self, flown: GotoArgs) -> None:
         now = self.now
         frame = self.grant.frame
-        height = None
-        if flown.alt is not None:
-            height = altitude_above_home_m(flown.alt, flown.reference, now.home, self.grant.flat_terrain)
-        height = now.altitude_m if height is None else height
+        self.now = arrived(flown, now, self.grant)
         distance_m = math.dist(frame.xy(now.lat or 0.0, now.lon or 0.0), frame.xy(flown.lat, flown.lon))
         self.distance_m += distance_m
         self.flown_s += distance_m / (flown.speed_mps or now.speed_setpoint_mps)
-        self.climbed_m += abs(height - now.altitude_m)
-        self.now = replace(now, lat=flown.lat, lon=flown.lon, altitude_m=height)
+        self.climbed_m += abs(self.now.altitude_m - now.altitude_m)
 
     def _note(
         self,

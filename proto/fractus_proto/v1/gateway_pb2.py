@@ -22,9 +22,11 @@ _runtime_version.ValidateProtobufRuntimeVersion(
 _sym_db = _symbol_database.Default()
 
 
+from fractus_proto.v1 import mobility_pb2 as fractus__proto_dot_v1_dot_mobility__pb2
+from fractus_proto.v1 import types_pb2 as fractus__proto_dot_v1_dot_types__pb2
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1e\x66ractus_proto/v1/gateway.proto\x12\nfractus.v1\"y\n\x0eGatewayRequest\x12\n\n\x02id\x18\x01 \x01(\x04\x12\x15\n\x0b\x63\x65rtificate\x18\x02 \x01(\x0cH\x00\x12\'\n\x04\x63\x61ll\x18\x03 \x01(\x0b\x32\x17.fractus.v1.GatewayCallH\x00\x12\x10\n\x06\x63\x61ncel\x18\x04 \x01(\x08H\x00\x42\t\n\x07request\"A\n\x0bGatewayCall\x12\x0e\n\x06method\x18\x01 \x01(\t\x12\x0f\n\x07request\x18\x02 \x01(\x0c\x12\x11\n\ttimeout_s\x18\x03 \x01(\x01\"N\n\x0fGatewayResponse\x12\n\n\x02id\x18\x01 \x01(\x04\x12\x11\n\x07message\x18\x02 \x01(\x0cH\x00\x12\x10\n\x06status\x18\x03 \x01(\x0cH\x00\x42\n\n\x08response\"\x1f\n\rVehicleFrames\x12\x0e\n\x06\x66rames\x18\x01 \x01(\x0c\"u\n\rParameterList\x12\x35\n\x06values\x18\x01 \x03(\x0b\x32%.fractus.v1.ParameterList.ValuesEntry\x1a-\n\x0bValuesEntry\x12\x0b\n\x03key\x18\x01 \x01(\t\x12\r\n\x05value\x18\x02 \x01(\x02:\x02\x38\x01\x62\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1e\x66ractus_proto/v1/gateway.proto\x12\nfractus.v1\x1a\x1f\x66ractus_proto/v1/mobility.proto\x1a\x1c\x66ractus_proto/v1/types.proto\"y\n\x0eGatewayRequest\x12\n\n\x02id\x18\x01 \x01(\x04\x12\x15\n\x0b\x63\x65rtificate\x18\x02 \x01(\x0cH\x00\x12\'\n\x04\x63\x61ll\x18\x03 \x01(\x0b\x32\x17.fractus.v1.GatewayCallH\x00\x12\x10\n\x06\x63\x61ncel\x18\x04 \x01(\x08H\x00\x42\t\n\x07request\"A\n\x0bGatewayCall\x12\x0e\n\x06method\x18\x01 \x01(\t\x12\x0f\n\x07request\x18\x02 \x01(\x0c\x12\x11\n\ttimeout_s\x18\x03 \x01(\x01\"N\n\x0fGatewayResponse\x12\n\n\x02id\x18\x01 \x01(\x04\x12\x11\n\x07message\x18\x02 \x01(\x0cH\x00\x12\x10\n\x06status\x18\x03 \x01(\x0cH\x00\x42\n\n\x08response\"\x1f\n\rVehicleFrames\x12\x0e\n\x06\x66rames\x18\x01 \x01(\x0c\"u\n\rParameterList\x12\x35\n\x06values\x18\x01 \x03(\x0b\x32%.fractus.v1.ParameterList.ValuesEntry\x1a-\n\x0bValuesEntry\x12\x0b\n\x03key\x18\x01 \x01(\t\x12\r\n\x05value\x18\x02 \x01(\x02:\x02\x38\x01\"4\n\x05Route\x12+\n\x05\x63\x61lls\x18\x01 \x03(\x0b\x32\x1c.fractus.v1.CheckCallRequest\"4\n\x0cRouteVerdict\x12$\n\x05\x63\x61lls\x18\x01 \x03(\x0b\x32\x15.fractus.v1.RouteCall\"U\n\tRouteCall\x12\r\n\x05index\x18\x01 \x01(\r\x12&\n\x08\x64\x65\x63ision\x18\x02 \x01(\x0b\x32\x14.fractus.v1.Decision\x12\x11\n\tpermitted\x18\x03 \x01(\x08\x62\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
@@ -33,16 +35,22 @@ if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
   _globals['_PARAMETERLIST_VALUESENTRY']._loaded_options = None
   _globals['_PARAMETERLIST_VALUESENTRY']._serialized_options = b'8\001'
-  _globals['_GATEWAYREQUEST']._serialized_start=46
-  _globals['_GATEWAYREQUEST']._serialized_end=167
-  _globals['_GATEWAYCALL']._serialized_start=169
-  _globals['_GATEWAYCALL']._serialized_end=234
-  _globals['_GATEWAYRESPONSE']._serialized_start=236
-  _globals['_GATEWAYRESPONSE']._serialized_end=314
-  _globals['_VEHICLEFRAMES']._serialized_start=316
-  _globals['_VEHICLEFRAMES']._serialized_end=347
-  _globals['_PARAMETERLIST']._serialized_start=349
-  _globals['_PARAMETERLIST']._serialized_end=466
-  _globals['_PARAMETERLIST_VALUESENTRY']._serialized_start=421
-  _globals['_PARAMETERLIST_VALUESENTRY']._serialized_end=466
+  _globals['_GATEWAYREQUEST']._serialized_start=109
+  _globals['_GATEWAYREQUEST']._serialized_end=230
+  _globals['_GATEWAYCALL']._serialized_start=232
+  _globals['_GATEWAYCALL']._serialized_end=297
+  _globals['_GATEWAYRESPONSE']._serialized_start=299
+  _globals['_GATEWAYRESPONSE']._serialized_end=377
+  _globals['_VEHICLEFRAMES']._serialized_start=379
+  _globals['_VEHICLEFRAMES']._serialized_end=410
+  _globals['_PARAMETERLIST']._serialized_start=412
+  _globals['_PARAMETERLIST']._serialized_end=529
+  _globals['_PARAMETERLIST_VALUESENTRY']._serialized_start=484
+  _globals['_PARAMETERLIST_VALUESENTRY']._serialized_end=529
+  _globals['_ROUTE']._serialized_start=531
+  _globals['_ROUTE']._serialized_end=583
+  _globals['_ROUTEVERDICT']._serialized_start=585
+  _globals['_ROUTEVERDICT']._serialized_end=637
+  _globals['_ROUTECALL']._serialized_start=639
+  _globals['_ROUTECALL']._serialized_end=724
 # @@protoc_insertion_point(module_scope)

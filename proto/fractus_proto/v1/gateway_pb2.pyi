@@ -1,7 +1,9 @@
+from fractus_proto.v1 import mobility_pb2 as _mobility_pb2
+from fractus_proto.v1 import types_pb2 as _types_pb2
 from google.protobuf.internal import containers as _containers
 from google.protobuf import descriptor as _descriptor
 from google.protobuf import message as _message
-from collections.abc import Mapping as _Mapping
+from collections.abc import Iterable as _Iterable, Mapping as _Mapping
 from typing import ClassVar as _ClassVar, Optional as _Optional, Union as _Union
 
 DESCRIPTOR: _descriptor.FileDescriptor
@@ -56,3 +58,25 @@ class ParameterList(_message.Message):
     VALUES_FIELD_NUMBER: _ClassVar[int]
     values: _containers.ScalarMap[str, float]
     def __init__(self, values: _Optional[_Mapping[str, float]] = ...) -> None: ...
+
+class Route(_message.Message):
+    __slots__ = ("calls",)
+    CALLS_FIELD_NUMBER: _ClassVar[int]
+    calls: _containers.RepeatedCompositeFieldContainer[_mobility_pb2.CheckCallRequest]
+    def __init__(self, calls: _Optional[_Iterable[_Union[_mobility_pb2.CheckCallRequest, _Mapping]]] = ...) -> None: ...
+
+class RouteVerdict(_message.Message):
+    __slots__ = ("calls",)
+    CALLS_FIELD_NUMBER: _ClassVar[int]
+    calls: _containers.RepeatedCompositeFieldContainer[RouteCall]
+    def __init__(self, calls: _Optional[_Iterable[_Union[RouteCall, _Mapping]]] = ...) -> None: ...
+
+class RouteCall(_message.Message):
+    __slots__ = ("index", "decision", "permitted")
+    INDEX_FIELD_NUMBER: _ClassVar[int]
+    DECISION_FIELD_NUMBER: _ClassVar[int]
+    PERMITTED_FIELD_NUMBER: _ClassVar[int]
+    index: int
+    decision: _types_pb2.Decision
+    permitted: bool
+    def __init__(self, index: _Optional[int] = ..., decision: _Optional[_Union[_types_pb2.Decision, _Mapping]] = ..., permitted: bool = ...) -> None: ...

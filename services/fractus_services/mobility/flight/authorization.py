@@ -6,13 +6,14 @@ import asyncio
 import logging
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 
 from fractus_core.control.state import CONTACT_LOST
 from fractus_core.policy.compiled_grant import CompiledGrant
 from fractus_core.policy.decision_types import DENY_POSITION_UNKNOWN, Airframe, Call, Situation, Verdict
 from fractus_core.policy.engine import judge
+from fractus_core.policy.route_check import after, at_rest
 from fractus_runtime import tracing
 from fractus_runtime.audit import AuditLog
 
@@ -125,6 +126,7 @@ class PolicyGate:
         *,
         kind: str = "call",
         known: Verdict | None = None,
+        assumed: Situation | None = None,
     ) -> Verdict:
         """Return the verdict on a call and write it to the audit log.
 
@@ -136,8 +138,9 @@ class PolicyGate:
             compiled: Constraints to judge under instead of the grant's, for system flights.
             kind: Kind of the audit entry; `check` if the call is not carried out.
             known: Verdict that was just recorded. An equal verdict is not recorded again.
+            assumed: Situation to judge in instead of the current one. Only refusals are recorded then.
         """
-        situation = self.situation()
+        situation = self.situation() if assumed is None else assumed
         with tracing.child_span("policy.judge") as span:
             try:
                 verdict = judge(call, situation, compiled or grant.compiled)
@@ -146,7 +149,8 @@ class PolicyGate:
                 reason = f"the policy engine failed on {call.method}; nothing was done"
                 verdict = Verdict("deny", None, "InternalError", reason, (), "hover")
             tracing.set_verdict(span, verdict.action, verdict.code, verdict.policies)
-        if verdict != known and (call.method not in REFUSALS_ONLY or not verdict.permits):
+        quiet = assumed is not None or call.method in REFUSALS_ONLY
+        if verdict != known and not (quiet and verdict.permits):
             self.record(call, grant.identity, verdict, situation, kind=kind)
         return verdict
 
@@ -238,6 +242,33 @@ class CallAuthorizer:
             return self._deny_passenger(call, grant, kind="check")
         return self._judge(call, grant, kind="check")
 
+    async def check_route(
+        self, calls: Sequence[Call], grant_of: Callable[[], ActiveGrant]
+    ) -> list[tuple[int, Verdict]]:
+        """Judge calls that would be made one after the other, each from rest at the place to which the call before leads.
+
+        Args:
+            calls: Calls in order.
+            grant_of: Returns the current Grant of the caller.
+
+        Returns:
+            Positions and verdicts of the calls that would not be carried out as requested, up to the first refused one.
+        """
+        changed: list[tuple[int, Verdict]] = []
+        now = at_rest(self._gate.situation())
+        for position, call in enumerate(calls):
+            await self.throttle(grant_of())
+            grant = grant_of()
+            if grant.spec.class_ != "driver":
+                return [(position, self._deny_passenger(call, grant, kind="check"))]
+            verdict = self._judge(call, grant, kind="check", assumed=now)
+            if verdict.action != "allow":
+                changed.append((position, verdict))
+            if not verdict.permits:
+                break
+            now = after(call, verdict, now, grant.compiled)
+        return changed
+
     def allow_motion(self, call: Call, grant: ActiveGrant, known: Verdict | None = None) -> Verdict:
         """Judge a call that moves the drone, of a driver that has control. Dispatch a takeover that the verdict demands.
 
@@ -294,11 +325,19 @@ class CallAuthorizer:
         self._free_at[True] = max(self._free_at[True], self._control.autopilot.now + SETTINGS.suspended_rest_s)
         raise Unavailable(verdict.code, verdict.reason, verdict=verdict, retry_after_s=SETTINGS.suspended_retry_after_s)
 
-    def _judge(self, call: Call, grant: ActiveGrant, *, kind: str = "call", known: Verdict | None = None) -> Verdict:
+    def _judge(
+        self,
+        call: Call,
+        grant: ActiveGrant,
+        *,
+        kind: str = "call",
+        known: Verdict | None = None,
+        assumed: Situation | None = None,
+    ) -> Verdict:
         has_control = self._has_control(grant)
         begun = time.perf_counter()
         try:
-            return self._gate.judge(call, grant, kind=kind, known=known)
+            return self._gate.judge(call, grant, kind=kind, known=known, assumed=assumed)
         finally:
             factor = SETTINGS.driver_rest_factor if has_control else SETTINGS.others_rest_factor
             rest_s = (time.perf_counter() - begun) * factor

@@ -24,8 +24,10 @@ from fractus_runtime.mavlink_codec import Message
 from google.protobuf.message import DecodeError
 from google.rpc import code_pb2, status_pb2
 
+from fractus_services.error_details import decision
 from fractus_services.grpc_server import CallAdmission
 from fractus_services.mobility.rpc.handlers import MobilityHandlers
+from fractus_services.mobility.rpc.proto_conversion import call_of
 from fractus_services.mobility.settings import SETTINGS
 from fractus_services.options import CannotServe
 
@@ -275,6 +277,8 @@ class _Connection:
             return self._subscribe_vehicle
         if method == "ListParameters":
             return self._list_parameters
+        if method == "CheckRoute":
+            return self._check_route
         return partial(_decode_and_call, METHODS[method], getattr(self._handlers, method))
 
     async def _subscribe_vehicle(self, _request: bytes, context: SocketContext) -> None:
@@ -305,6 +309,18 @@ class _Connection:
         async with admission.call(context) as caller:
             admission.grant_of(caller)
             return gateway_pb2.ParameterList(values=await self._vehicle.known_parameters())
+
+    async def _check_route(self, request: bytes, context: SocketContext) -> gateway_pb2.RouteVerdict:
+        admission: CallAdmission = self._handlers.admission
+        async with admission.call(context) as caller:
+            calls = [call_of(call) for call in gateway_pb2.Route.FromString(request).calls]
+            changed = await self._handlers.calls.check_route(calls, lambda: admission.grant_of(caller))
+            return gateway_pb2.RouteVerdict(
+                calls=[
+                    gateway_pb2.RouteCall(index=position, decision=decision(verdict), permitted=verdict.permits)
+                    for position, verdict in changed
+                ]
+            )
 
     def _write(self, response: gateway_pb2.GatewayResponse) -> None:
         data = response.SerializeToString()

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from fractus_services.mavlink_server.coordinates import valid_coordinates
+from fractus_services.mavlink_server.fence_shapes import FenceItem, FenceShapeError, build_shapes
 from fractus_services.mavlink_server.mission_items import Item, ItemStore, home_item
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fractus_vehicle.earth import Place
-from fractus_vehicle.fence import FenceItem, FenceShapeError, build_shapes
 from fractus_vehicle.state import VehicleState
 
 

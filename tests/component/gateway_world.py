@@ -60,6 +60,18 @@ def certificate(identity: str) -> bytes:
     )
 
 
+def item(command: int, *params: float, altitude_m: float = 0.0, frame: int = 3) -> dict[str, Any]:
+    """Return the fields of a mission item without a place."""
+    values = {f"param{at}": value for at, value in enumerate(params, 1)}
+    return {"command": command, "frame": frame, "z": altitude_m, "autocontinue": 1, **values}
+
+
+def waypoint(x: float, y: float, altitude_m: float = 10.0, *, frame: int = 3, command: int = 16) -> dict[str, Any]:
+    """Return the fields of a mission item at a place, in metres east and north of home."""
+    lat, lon = FRAME.latlon(x, y)
+    return {**item(command, altitude_m=altitude_m, frame=frame), "x": round(lat * 1e7), "y": round(lon * 1e7)}
+
+
 class Program:
     """A MAVLink program with its connection to the gateway."""
 
@@ -129,6 +141,45 @@ class Program:
         assert await self.command(511, mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT, 100_000) == ACCEPTED
         await self.until(lambda: self.place[2] > altitude_m - 0.7)
 
+    async def upload(self, *items: dict[str, Any], kind: int = 0, timeout_s: float = 60.0) -> int:
+        """Upload a list, and return the MAV_MISSION_RESULT. A mission gets home as item 0."""
+        rows = list(items) if kind else [waypoint(0, 0, 0, frame=0), *items]
+        begun = len(self.received)
+        self.send("MISSION_COUNT", count=len(rows), mission_type=kind)
+        sent = 0
+
+        def acknowledged() -> list[int]:
+            nonlocal sent
+            news = [m for m in self.received[begun:] if m.name in {"MISSION_REQUEST", "MISSION_ACK"}]
+            for request in [m for m in news if m.name == "MISSION_REQUEST"][sent:]:
+                sent += 1
+                number = request.integer("seq")
+                self.send("MISSION_ITEM_INT", seq=number, mission_type=kind, **rows[number])
+            return [m.integer("type") for m in news if m.name == "MISSION_ACK"]
+
+        await self.until(acknowledged, timeout_s)
+        return acknowledged()[0]
+
+    async def download(self, kind: int = 0) -> list[Message]:
+        """Return the stored items of a list."""
+        begun = len(self.received)
+
+        def arrived(name: str) -> list[Message]:
+            return [m for m in self.received[begun:] if m.name == name]
+
+        self.send("MISSION_REQUEST_LIST", mission_type=kind)
+        await self.until(lambda: arrived("MISSION_COUNT"))
+        count = arrived("MISSION_COUNT")[0].integer("count")
+        for number in range(count):
+            self.send("MISSION_REQUEST_INT", seq=number, mission_type=kind)
+            await self.until(lambda number=number: len(arrived("MISSION_ITEM_INT")) > number)  # type: ignore[misc]
+        return arrived("MISSION_ITEM_INT")
+
+    @property
+    def reached(self) -> list[int]:
+        """Numbers of the completed mission items."""
+        return [m.integer("seq") for m in self.received if m.name == "MISSION_ITEM_REACHED"]
+
     @property
     def mode(self) -> int:
         return self.latest["HEARTBEAT"].integer("custom_mode") if "HEARTBEAT" in self.latest else -1
@@ -181,7 +232,10 @@ class GatewayWorld:
             tls=directory, mobility=path, listen="", state=directory, audit=directory, lock_timeout=0.0,
             recordings=self.recordings, recordings_mb=10,
         )  # fmt: skip
-        self.gateway = Gateway(path, Callers(time.time), audit, partial(open_recorder, options), time.time)  # type: ignore[arg-type]
+        record = partial(open_recorder, options)
+        missions = directory / "missions"
+        callers = Callers(time.time)
+        self.gateway = Gateway(path, callers, audit, record, missions=missions, expiry=time.time)  # type: ignore[arg-type]
         self._programs = directory / "programs.sock"
         self._certificates: dict[str, bytes] = {}
         self._count = 0

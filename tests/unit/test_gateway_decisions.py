@@ -79,4 +79,4 @@ def test_every_response_and_translation_has_a_handler() -> None:
         session._COMMAND_RESPONSES
     )
     translated = {name for name, decision in DECISIONS.commands.items() if decision == "translate"}
-    assert translated == {*session._COMMANDS, "DO_SET_MODE"}
+    assert translated == {*session._COMMANDS, *session._MISSION_COMMANDS, "DO_SET_MODE"}

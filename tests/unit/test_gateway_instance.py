@@ -78,7 +78,7 @@ class Program:
         self._instance = instance
         self._loop = asyncio.get_running_loop()
         self._endpoint = Endpoint(255, 190)
-        self.session = Session(instance.vehicle, instance.parameters)
+        self.session = Session(instance.vehicle, instance.parameters, instance.missions)
         self.acks: list[tuple[int, int]] = []
         instance.sessions.add(self.session)
 

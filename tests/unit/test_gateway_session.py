@@ -7,72 +7,14 @@ from typing import Any
 
 import pytest
 from fractus_proto.v1 import types_pb2
-from fractus_runtime.mavlink_codec import Endpoint, Message, Parser
-from fractus_services.gateway.parameters import ParameterView
+from fractus_runtime.mavlink_codec import Endpoint, Parser
 from fractus_services.gateway.session import Call, Session
-from fractus_services.gateway.virtual_vehicle import VirtualVehicle
+from gateway_session_world import ARMED, HOME, World
 from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-HOME = (39.36, 22.95, 10.0)
-ARMED = mavlink.MAV_MODE_FLAG_SAFETY_ARMED
 ACCEPTED = mavlink.MAV_RESULT_ACCEPTED
-
-
-class World:
-    """A session of a program that has control. The drone flies 20 m above home, with its nose to the east."""
-
-    def __init__(self, *, granted: bool = True) -> None:
-        self.vehicle = VirtualVehicle(granted=granted)
-        self.parameters = ParameterView()
-        self.parameters.replace({"WPNAV_SPEED": 1000.0, "RTL_ALT": 1500.0, "FS_GCS_ENABLE": 1.0})
-        self.verdicts: list[str] = []
-        self.session = Session(self.vehicle, self.parameters, count=self.verdicts.append)
-        self.program = Endpoint(255, 190)
-        self.now = 100.0
-        self._parser = Parser()
-        self._drone = Endpoint(1, 1)
-        place = {"latitude": round(HOME[0] * 1e7), "longitude": round(HOME[1] * 1e7), "altitude": 10_000}
-        self.report("HEARTBEAT", base_mode=ARMED, custom_mode=mavlink.COPTER_MODE_GUIDED, autopilot=3, type=2)
-        self.report("GPS_GLOBAL_ORIGIN", **place)
-        self.report("HOME_POSITION", **place)
-        self.report(
-            "GLOBAL_POSITION_INT",
-            lat=place["latitude"],
-            lon=place["longitude"],
-            alt=30_000,
-            relative_alt=20_000,
-            hdg=9_000,
-        )
-        self.sent()
-
-    def report(self, name: str, **values: Any) -> None:
-        """Process a message of the real vehicle."""
-        for message in self._parser.feed(self._drone.encode(name, values)):
-            self.vehicle.take(message, self.now)
-
-    def send(self, name: str, **values: Any) -> list[Call]:
-        """Send a message of the program, and return the calls."""
-        return self.session.receive(self.program.encode(name, values), self.now)
-
-    def command(self, number: int, *params: float) -> list[Call]:
-        """Send a COMMAND_LONG."""
-        values = {f"param{at}": value for at, value in enumerate(params, 1)}
-        return self.send("COMMAND_LONG", command=number, target_system=1, target_component=1, **values)
-
-    def sent(self) -> list[Message]:
-        """Return the messages for the program."""
-        self.session.step(self.now)
-        return Parser().feed(self.session.take())
-
-    def results(self) -> list[tuple[int, int]]:
-        """Return command and result of each COMMAND_ACK."""
-        return [(m.integer("command"), m.integer("result")) for m in self.sent() if m.name == "COMMAND_ACK"]
-
-    def texts(self) -> str:
-        """Return the STATUSTEXTs, joined."""
-        return "".join(m.text("text") for m in self.sent() if m.name == "STATUSTEXT")
 
 
 def _local(**values: Any) -> dict[str, Any]:
@@ -229,7 +171,7 @@ def test_mode_becomes_a_call(mode: int, method: str) -> None:
     assert call.request.method == method
 
 
-@pytest.mark.parametrize("mode", [0, 1, 2, 3, 7, 20, 99])
+@pytest.mark.parametrize("mode", [0, 1, 2, 7, 20, 99])
 def test_mode_without_judgement_is_denied(mode: int) -> None:
     world = World()
     assert world.command(176, 1, mode) == []
@@ -321,7 +263,7 @@ def test_requested_stream_contains_only_new_messages_of_the_vehicle() -> None:
 
 def test_streams_are_separate_for_each_session() -> None:
     world = World()
-    other = Session(world.vehicle, world.parameters)
+    other = Session(world.vehicle, world.parameters, world.missions)
     world.command(511, mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT, 100_000)
     other.step(world.now)
     assert {m.name for m in Parser().feed(other.take())} == {"HEARTBEAT"}
@@ -354,12 +296,6 @@ def test_message_for_another_component_is_ignored() -> None:
     assert world.send("COMMAND_LONG", command=400, param1=1.0, target_system=1, target_component=100) == []
     assert world.send("COMMAND_LONG", command=400, param1=1.0, target_system=2, target_component=1) == []
     assert world.results() == []
-
-
-def test_mission_upload_is_refused() -> None:
-    world = World()
-    world.send("MISSION_COUNT", target_system=1, count=3)
-    assert [m.integer("type") for m in world.sent() if m.name == "MISSION_ACK"] == [mavlink.MAV_MISSION_DENIED]
 
 
 def test_file_transfer_is_answered_with_a_nak() -> None:

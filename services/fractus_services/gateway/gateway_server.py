@@ -82,6 +82,7 @@ class Gateway:
         callers: Authenticates the instances by their certificates.
         audit: Audit log of refused messages.
         open_recorder: Returns the recorder of an instance.
+        missions: Directory that keeps the stored missions of the instances.
         expiry: Returns the Unix time at which the certificate expires, or None if it is unknown.
 
     Attributes:
@@ -94,6 +95,8 @@ class Gateway:
         callers: Callers,
         audit: AuditLog,
         open_recorder: Callable[[str], Recorder],
+        *,
+        missions: Path,
         expiry: Callable[[], float | None] = lambda: None,
     ) -> None:
         self.metrics = GatewayMetrics(
@@ -102,6 +105,7 @@ class Gateway:
             lambda: len(self._writers),
             lambda: [instance.connected for instance, _ in self._instances.values()],
         )
+        self._missions = missions
         self._open_recorder = open_recorder
         self._socket = socket
         self._callers = callers
@@ -143,7 +147,9 @@ class Gateway:
         recorder = self._recorders.get(identity)
         if recorder is None:
             recorder = self._recorders[identity] = self._open_recorder(identity)
-        session = Session(instance.vehicle, instance.parameters, recorder.take_sent, self.metrics.count)
+        session = Session(
+            instance.vehicle, instance.parameters, instance.missions, recorder.take_sent, self.metrics.count
+        )
         instance.sessions.add(session)
         self._writers[writer] = identity
         self._ended.clear()
@@ -155,6 +161,7 @@ class Gateway:
             pass
         finally:
             sending.cancel()
+            session.close()
             instance.sessions.discard(session)
             writer.close()
             log.info("gateway: program disconnected (instance=%s)", identity)
@@ -170,7 +177,8 @@ class Gateway:
         if len(self._writers) >= MAX_CONNECTIONS:
             return None
         if entry is None:
-            instance = Instance(identity, self._socket, self.metrics.observe)
+            missions = self._missions / f"{_file_name(identity)}.json"
+            instance = Instance(identity, self._socket, missions, self.metrics.observe)
             instance.certificate = certificate
             task = asyncio.get_running_loop().create_task(instance.run())
             task.add_done_callback(partial(self._close_failed, identity))
@@ -250,7 +258,12 @@ async def _serve(options: GatewayOptions, tls: TlsFiles, stop: asyncio.Event) ->
     clock = Clock()
     audit = AuditLog(options.audit, clock, tls=options.tls)
     gateway = Gateway(
-        options.mobility, Callers(clock), audit, partial(open_recorder, options), BackgroundReader(tls.expires_s)
+        options.mobility,
+        Callers(clock),
+        audit,
+        partial(open_recorder, options),
+        missions=options.state / "missions",
+        expiry=BackgroundReader(tls.expires_s),
     )
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.verify_mode = ssl.CERT_REQUIRED
@@ -321,10 +334,15 @@ def current_problem(socket: Path, tls: TlsFiles, now_s: float) -> str:
 
 def open_recorder(options: GatewayOptions, identity: str) -> Recorder:
     """Return the recorder of an instance. It records what the instance sends and receives around its flights."""
-    parsed = ComponentIdentity.parse(identity)
-    name = f"{parsed.namespace}.{parsed.instance}" if parsed is not None else "unknown"
+    name = _file_name(identity)
     directory = options.recordings / name if options.recordings is not None else None
     return Recorder(segments_in(directory, options.recordings_mb), name, MavlinkDecoder(name))
+
+
+def _file_name(identity: str) -> str:
+    """Return the name of the files of an instance."""
+    parsed = ComponentIdentity.parse(identity)
+    return f"{parsed.namespace}.{parsed.instance}" if parsed is not None else "unknown"
 
 
 def _load(context: ssl.SSLContext, directory: Path) -> None:

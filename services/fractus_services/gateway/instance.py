@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Coroutine, Mapping
 from contextlib import aclosing, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,10 +16,16 @@ from google.protobuf.message import Message as ProtobufMessage
 from google.rpc import code_pb2
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from fractus_services.gateway import translate
+from fractus_services.gateway.mission_flight import fly_mission
+from fractus_services.gateway.mission_route import Place, route_of
+from fractus_services.gateway.missions import MissionLists
 from fractus_services.gateway.mobility_client import CallRefused, MobilityClient
 from fractus_services.gateway.parameters import ParameterView
 from fractus_services.gateway.session import Call, Session
+from fractus_services.gateway.translate import CHECK_MISSION, FLY_MISSION, Request, Untranslatable
 from fractus_services.gateway.virtual_vehicle import VirtualVehicle
+from fractus_services.mavlink_server.stored_mission import Mission
 
 log = logging.getLogger(__name__)
 
@@ -30,6 +36,14 @@ CALL_TIMEOUT_S = 10.0
 ARM_TIMEOUT_S = 20.0
 PARAMETERS_TIMEOUT_S = 200.0
 RETURN_TIMEOUT_S = 5.0
+ROUTE_TIMEOUT_S = 30.0
+
+MISSION_POLL_S = 0.1
+"""Interval at which a mission looks whether the drone is armed, or at rest."""
+
+REST_MPS = 0.3
+REST_TIMEOUT_S = 5.0
+"""Speed below which the next item of a mission begins after a leg, and the maximum time to wait for it."""
 
 CONTROL_WAIT_S = 15.0
 """Time for which arming waits for control. Programs arm as soon as the telemetry looks ready."""
@@ -53,12 +67,23 @@ _REPLIES: Mapping[str, type[ProtobufMessage]] = {
     "SetVelocity": mobility_pb2.SetVelocityResponse,
     "PointGimbal": mobility_pb2.PointGimbalResponse,
 }
+_CHECKED = {
+    "Takeoff": "takeoff",
+    "Land": "land",
+    "Goto": "goto",
+    "ReturnToLaunch": "return_to_launch",
+    "SetSpeed": "set_speed",
+    "PointGimbal": "point_gimbal",
+}
+"""Fields of CheckCallRequest by the method that a mission calls."""
+
 _MOTIONS = frozenset({"Takeoff", "Land", "Goto", "ReturnToLaunch"})
 """Methods whose call lasts until the motion is complete."""
 
 _TIMEOUTS_S = {"Arm": ARM_TIMEOUT_S, **dict.fromkeys(_MOTIONS, 0.0)}
 """Timeouts other than `CALL_TIMEOUT_S`. 0: no timeout."""
 
+_MISSION_METHODS = frozenset({FLY_MISSION, CHECK_MISSION})
 _STEERING = _MOTIONS | {"Hover", "SetVelocity"}
 """Methods that move or stop the drone. A call of one of them ends the previous motion."""
 
@@ -99,21 +124,30 @@ class Instance:
     Args:
         identity: SPIFFE ID.
         socket: Unix socket of the mobility service.
+        missions: File that keeps the stored missions. None: they are kept in memory only.
         observe: Callback that receives the time to the verdict on each call, in seconds.
 
     Attributes:
         certificate: PEM certificate of the latest connection.
         vehicle: Vehicle as the instance sees it.
         parameters: Parameters as the instance sees them.
+        missions: Stored missions, fences and rally points.
         sessions: Sessions of the connections.
     """
 
-    def __init__(self, identity: str, socket: Path, observe: Callable[[float], None] = ignore_duration) -> None:
+    def __init__(
+        self,
+        identity: str,
+        socket: Path,
+        missions: Path | None = None,
+        observe: Callable[[float], None] = ignore_duration,
+    ) -> None:
         self.identity = identity
         self._observe = observe
         self.certificate = b""
         self.vehicle = VirtualVehicle()
         self.parameters = ParameterView()
+        self.missions = MissionLists(self.vehicle, missions, self.send_text)
         self.sessions: set[Session] = set()
         self._socket = socket
         self._loop = asyncio.get_running_loop()
@@ -126,6 +160,8 @@ class Instance:
         self._steering: set[Session] = set()
         self._granted = asyncio.Event()
         self._calls: set[asyncio.Task[None]] = set()
+        self._flight: asyncio.Task[None] | None = None  # of the mission
+        self._in_fence = True
         self._setpoints = {"motion": _Setpoint(), "gimbal": _Setpoint(), "speed": _Setpoint()}
 
     @property
@@ -249,6 +285,7 @@ class Instance:
                 self._control = self._loop.create_task(self._hold_control(client))
             if self._control is not None and self._control.done():
                 self._control = None
+            self._check_fence()
             await asyncio.sleep(SUPERVISE_S)
 
     def _clear_requests(self) -> None:
@@ -291,6 +328,7 @@ class Instance:
             self._report(f"waiting for control: {event.reason}")
 
     def _lose_control(self) -> None:
+        self._stop_flight()
         self.vehicle.granted = False
         self.vehicle.target = None
         self._granted.clear()
@@ -300,8 +338,15 @@ class Instance:
     def start(self, session: Session, call: Call) -> None:
         """Start a call of a session. A setpoint waits for the verdict of the previous one, and replaces a waiting one."""
         steers = call.request.method in _STEERING
-        if steers and self.vehicle.granted:
+        if (steers or call.request.method == FLY_MISSION) and self.vehicle.granted:
             self._steering.add(session)
+        problem = self._fence_problem(call.request)
+        if problem:
+            session.finish(call, mavlink.MAV_RESULT_DENIED, problem, self._loop.time())
+            return
+        if call.request == translate.fly_mission() and self._flies_mission:
+            session.finish(call, mavlink.MAV_RESULT_ACCEPTED, "", self._loop.time())
+            return
         setpoint = self._setpoint(call)
         if setpoint is not None:
             if setpoint.busy:
@@ -317,9 +362,16 @@ class Instance:
             setpoint.busy = True
         elif steers:
             self._setpoints["motion"].pending = None  # sent before this call
-        task = self._loop.create_task(self._run_call(self._client, session, call, setpoint))
+        if steers:
+            self._stop_flight()
+        work = self._run_mission_call if call.request.method in _MISSION_METHODS else self._run_call
+        self._spawn(work(self._client, session, call, setpoint))
+
+    def _spawn(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
+        task = self._loop.create_task(work)
         self._calls.add(task)
         task.add_done_callback(self._calls.discard)
+        return task
 
     def _setpoint(self, call: Call) -> _Setpoint | None:
         if call.parameter:
@@ -350,7 +402,12 @@ class Instance:
             raise
         except CallRefused as refusal:
             result = _RESULTS.get(refusal.status, mavlink.MAV_RESULT_FAILED)
-            if not judged:
+            guided = method == "Hover" and call.request.mode == mavlink.COPTER_MODE_GUIDED
+            if guided and refusal.code == "NotFlying" and self.vehicle.granted:
+                # On the ground, the mode AUTO ends without a motion.
+                self.vehicle.flying_mode = mavlink.COPTER_MODE_GUIDED
+                session.finish(call, mavlink.MAV_RESULT_ACCEPTED, "", self._loop.time())
+            elif not judged:
                 if refusal.code == "Replaced" and call.is_setpoint:
                     return
                 self._observe_verdict(call, began_s)
@@ -380,24 +437,26 @@ class Instance:
 
     def _accept(self, session: Session, call: Call, reply: Any) -> None:
         """Send the result of a call that the mobility service has accepted."""
+        text = self._note(call.request, call.name, reply)
+        session.finish(call, mavlink.MAV_RESULT_ACCEPTED, text, self._loop.time())
+
+    def _note(self, request: Request, name: str, reply: Any) -> str:
+        """Note a request that the mobility service has accepted. Return the sentence about its correction."""
         vehicle = self.vehicle
-        if call.request.mode is not None and vehicle.granted:
-            vehicle.flying_mode = call.request.mode
-        text = ""
+        if request.mode is not None and vehicle.granted:
+            vehicle.flying_mode = request.mode
         corrected = reply.decision.action == types_pb2.Decision.ACTION_CORRECT
-        if call.request.method == "Goto":
+        if request.method == "Goto":
             target = reply.target
             vehicle.target = (target.latitude_deg, target.longitude_deg, target.altitude_m)
             if corrected:
-                text = (
+                return (
                     f"flown to {target.latitude_deg:.6f}, {target.longitude_deg:.6f}, {target.altitude_m:.1f} m: "
                     f"{reply.decision.reason}"
                 )
-        elif call.request.method in _STEERING:
+        elif request.method in _STEERING:
             vehicle.target = None
-        if corrected and not text:
-            text = f"{call.name} corrected: {reply.decision.reason}"
-        session.finish(call, mavlink.MAV_RESULT_ACCEPTED, text, self._loop.time())
+        return f"{name} corrected: {reply.decision.reason}" if corrected else ""
 
     def _free(self, setpoint: _Setpoint | None, flying: ProtobufMessage | None) -> None:
         """Mark that no call waits for its verdict, and start the call of the pending message."""
@@ -409,6 +468,188 @@ class Instance:
         setpoint.pending = None
         if pending is not None:
             self.start(*pending)
+
+    # Missions
+
+    def send_text(self, severity: int, text: str) -> None:
+        """Send a text to all sessions."""
+        for session in self.sessions:
+            session.send_text(severity, text, self._loop.time())
+
+    def report_current(self) -> None:
+        """Report the current item of the mission to all sessions."""
+        for session in self.sessions:
+            session.report_current()
+
+    def report_reached(self, number: int) -> None:
+        """Report a completed item of the mission to all sessions."""
+        for session in self.sessions:
+            session.report_reached(number)
+
+    async def _run_mission_call(
+        self, client: MobilityClient, session: Session, call: Call, _setpoint: _Setpoint | None
+    ) -> None:
+        """Judge an uploaded mission, or the rest of the stored one, and fly it."""
+        flies = call.request.method == FLY_MISSION
+        mission = self.missions.mission if flies else self.missions.with_items(call.request.message)
+        try:
+            first = mission.next_after(0) if not flies else self._first_item(call.request.message)
+            at = self._place()
+            corrections = await self._check_route(client, mission, first, at)
+        except asyncio.CancelledError:
+            reason = "the connection to the mobility service was closed"
+            session.finish(call, mavlink.MAV_RESULT_TEMPORARILY_REJECTED, reason, self._loop.time())
+            raise
+        except Untranslatable as problem:
+            session.finish(call, problem.result, str(problem), self._loop.time())
+            return
+        except CallRefused as refusal:
+            result = _RESULTS.get(refusal.status, mavlink.MAV_RESULT_FAILED)
+            session.finish(call, result, refusal.reason, self._loop.time())
+            return
+        session.finish(call, mavlink.MAV_RESULT_ACCEPTED, corrections, self._loop.time())
+        if flies and first is not None and self.vehicle.granted:
+            self._stop_flight()
+            self.vehicle.flying_mode = mavlink.COPTER_MODE_AUTO
+            self._flight = self._spawn(self._fly_mission(client, first))
+
+    def _first_item(self, number: int | None) -> int | None:
+        """Return the item from which the stored mission is flown. A completed mission starts again."""
+        mission = self.missions.mission
+        if mission.complete:
+            mission.rewind()
+        if number is None:
+            return mission.current if mission.current > 0 else mission.next_after(0)
+        return number
+
+    def _place(self) -> Place:
+        """Return the present place of the drone.
+
+        Raises:
+            Untranslatable: The position is unknown.
+        """
+        pose = self.vehicle.pose(self._loop.time())
+        if pose is None:
+            raise Untranslatable("the drone's position is not known", mavlink.MAV_RESULT_TEMPORARILY_REJECTED)
+        return Place(pose.lat, pose.lon, pose.altitude_m)
+
+    async def _check_route(self, client: MobilityClient, mission: Mission, first: int | None, at: Place) -> str:
+        """Judge the route of a mission. Return a sentence about corrected items.
+
+        Raises:
+            Untranslatable: An item is refused.
+            CallRefused: The mobility service did not judge the route.
+        """
+        if first is None:
+            return ""
+        route = route_of(mission, first, at, on_ground=self.vehicle.on_ground)
+        for number, request in route:
+            problem = self._fence_problem(request)
+            if problem:
+                raise Untranslatable(f"item {number}: {problem}")
+        calls = [mobility_pb2.CheckCallRequest(**{_CHECKED[request.method]: request.message}) for _, request in route]
+        verdict = await client.call(
+            "CheckRoute", gateway_pb2.Route(calls=calls), gateway_pb2.RouteVerdict, ROUTE_TIMEOUT_S
+        )
+        sentences = [f"item {route[call.index][0]}: {call.decision.reason}" for call in verdict.calls]
+        if verdict.calls and not verdict.calls[-1].permitted:
+            raise Untranslatable(sentences[-1])
+        return f"corrected in flight: {sentences[0]}" if sentences else ""
+
+    async def _fly_mission(self, client: MobilityClient, first: int) -> None:
+        mission = self.missions.mission
+        while not self.vehicle.armed:  # noqa: ASYNC110 - the heartbeat may arrive later than the result of arming
+            await asyncio.sleep(MISSION_POLL_S)
+
+        async def perform(request: Request) -> None:
+            await self._perform(client, request)
+
+        try:
+            await fly_mission(mission, first, self._place(), perform, self)
+        except (CallRefused, Untranslatable) as problem:
+            if self.vehicle.in_mission:
+                self.vehicle.flying_mode = mavlink.COPTER_MODE_BRAKE
+            self.send_text(mavlink.MAV_SEVERITY_WARNING, f"Mission stopped at item {mission.current}: {problem}")
+
+    async def _perform(self, client: MobilityClient, request: Request) -> None:
+        """Make one call of the mission, and wait until its motion is complete. Repeat a call that has to wait.
+
+        Raises:
+            CallRefused: The call was refused.
+            Untranslatable: The target is outside the fence.
+        """
+        problem = self._fence_problem(request)
+        if problem:
+            raise Untranslatable(problem)
+        method = request.method
+        while True:
+            noted = False
+            try:
+                timeout_s = _TIMEOUTS_S.get(method, CALL_TIMEOUT_S)
+                stream = client.stream(method, request.message, _REPLIES[method], timeout_s)
+                async with aclosing(stream) as replies:
+                    async for reply in replies:
+                        if not noted:
+                            noted = True
+                            text = self._note(request, "Mission", reply)
+                            if text:
+                                self.send_text(mavlink.MAV_SEVERITY_NOTICE, text)
+            except CallRefused as refusal:
+                if noted or refusal.status not in _PASSING or client.closed.is_set():
+                    raise
+            else:
+                break
+            await asyncio.sleep(RETRY_S)
+        if method == "Goto":
+            await self._come_to_rest()
+
+    async def _come_to_rest(self) -> None:
+        """Wait until the drone does not move, because the next leg of a route was judged from rest."""
+        with suppress(TimeoutError):
+            async with asyncio.timeout(REST_TIMEOUT_S):
+                while self.vehicle.speed_mps > REST_MPS:  # noqa: ASYNC110 - the vehicle has no notification
+                    await asyncio.sleep(MISSION_POLL_S)
+
+    @property
+    def _flies_mission(self) -> bool:
+        return self._flight is not None and not self._flight.done()
+
+    def _stop_flight(self) -> None:
+        """End the flight of the mission. Its current item stays the current one."""
+        if self._flight is not None:
+            self._flight.cancel()
+            self._flight = None
+
+    def _fence_problem(self, request: Request) -> str:
+        """Return why the fence of the program forbids a request, or an empty string."""
+        if request.method != "Goto":
+            return ""
+        target = request.message.target
+        problem = self.missions.fence_problem(target.latitude_deg, target.longitude_deg)
+        return f"the target is {problem}" if problem else ""
+
+    def _check_fence(self) -> None:
+        """Return home when the drone leaves the fence of the program, as ArduCopter does."""
+        pose = self.vehicle.pose(self._loop.time())
+        if pose is None or not (self.vehicle.granted and self.vehicle.armed):
+            return
+        problem = self.missions.fence_problem(pose.lat, pose.lon)
+        left = self._in_fence and bool(problem)
+        self._in_fence = not problem
+        if left and self._client is not None:
+            self.send_text(mavlink.MAV_SEVERITY_NOTICE, "Polygon fence breached: the drone returns home")
+            self._stop_flight()
+            self._setpoints["motion"].pending = None
+            self.vehicle.flying_mode = mavlink.COPTER_MODE_RTL  # refuses the targets that follow
+            self._spawn(self._return_home(self._client))
+
+    async def _return_home(self, client: MobilityClient) -> None:
+        try:
+            await self._perform(client, translate.return_to_launch())
+        except CallRefused as refusal:
+            if self.vehicle.flying_mode == mavlink.COPTER_MODE_RTL:
+                self.vehicle.flying_mode = mavlink.COPTER_MODE_BRAKE
+            self.send_text(mavlink.MAV_SEVERITY_WARNING, f"return after a fence breach ended: {refusal.reason}")
 
 
 def _waits_for_control(call: Call) -> bool:

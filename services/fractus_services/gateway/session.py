@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from fractus_proto.v1 import mobility_pb2
 from fractus_runtime.mavlink_codec import Message, Value, enum_names
@@ -13,6 +13,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from fractus_services.gateway import translate
 from fractus_services.gateway.decisions import DECISIONS
 from fractus_services.gateway.gateway_metrics import Verdict, ignore_verdict
+from fractus_services.gateway.missions import MissionLists
 from fractus_services.gateway.parameters import ParameterView
 from fractus_services.gateway.translate import Request, Untranslatable
 from fractus_services.gateway.virtual_vehicle import DESCENTS, VirtualVehicle
@@ -55,6 +56,9 @@ VERSION = 0x040603FF
 
 CAPABILITIES = (
     mavlink.MAV_PROTOCOL_CAPABILITY_MISSION_FLOAT
+    | mavlink.MAV_PROTOCOL_CAPABILITY_MISSION_INT
+    | mavlink.MAV_PROTOCOL_CAPABILITY_MISSION_FENCE
+    | mavlink.MAV_PROTOCOL_CAPABILITY_MISSION_RALLY
     | mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_FLOAT
     | mavlink.MAV_PROTOCOL_CAPABILITY_COMMAND_INT
     | mavlink.MAV_PROTOCOL_CAPABILITY_SET_POSITION_TARGET_GLOBAL_INT
@@ -96,7 +100,10 @@ class Call:
     @property
     def is_setpoint(self) -> bool:
         """True if the message has no response, so that a later message may replace the call."""
-        return self.command is None and not self.mission_ack and not self.parameter
+        others = {translate.FLY_MISSION, translate.CHECK_MISSION}
+        return (
+            self.command is None and not self.mission_ack and not self.parameter and self.request.method not in others
+        )
 
     @property
     def key(self) -> tuple[Source, int | None]:
@@ -150,6 +157,7 @@ class Session:
     Args:
         vehicle: Vehicle as the instance sees it, shared by the sessions of the instance.
         parameters: Parameters of the instance.
+        missions: Stored missions, fences and rally points of the instance.
         record: Callback that receives each valid frame of the program.
         count: Callback that receives the verdict on each message.
 
@@ -163,9 +171,11 @@ class Session:
         self,
         vehicle: VirtualVehicle,
         parameters: ParameterView,
+        missions: MissionLists,
         record: Callable[[bytes], None] = ignore,
         count: Callable[[Verdict], None] = ignore_verdict,
     ) -> None:
+        self._missions = missions
         self._count = count
         self._decision: Verdict = "respond"
         self._vehicle = vehicle
@@ -248,14 +258,15 @@ class Session:
             case "SET_MODE":
                 custom = message.integer("custom_mode")
                 return self._set_mode(custom, mavlink.MAVLINK_MSG_ID_SET_MODE, "SET_MODE", source, now)
-            case "MISSION_ITEM" | "MISSION_ITEM_INT":
-                return self._guided_item(message, source, now)
+            case "MISSION_ITEM" | "MISSION_ITEM_INT" | "MISSION_COUNT" | "MISSION_SET_CURRENT":
+                return self._mission_message(message, source, now)
             case "PARAM_SET":
                 return self._set_parameter(message, source, now)
             case "GIMBAL_MANAGER_SET_PITCHYAW":
                 pitch_deg = math.degrees(message.real("pitch"))
                 return [Call(translate.gimbal(pitch_deg, math.degrees(message.real("yaw"))), message.name, source)]
             case _:
+                self._require_guided()
                 hold_s = self._velocity.hold_s(now)
                 request = translate.TARGETS[message.name](message, hold_s, self._vehicle, now)
                 return [Call(request, message.name, source)]
@@ -278,9 +289,11 @@ class Session:
                 raise Untranslatable("programs may not send this command")
             if name == "DO_SET_MODE":
                 return self._set_mode(_mode_number(fields), fields.number, name, source, now)
+            if name in _MISSION_COMMANDS:
+                return _MISSION_COMMANDS[name](self, fields, name, source, now)
             request = _COMMANDS[name](self, fields, now)
         except Untranslatable as problem:
-            self._acknowledge(source, fields.number, mavlink.MAV_RESULT_DENIED)
+            self._acknowledge(source, fields.number, problem.result)
             self._refuse(name, str(problem), now)
             return []
         return self._begin(Call(request, name, source, fields.number), now)
@@ -300,16 +313,16 @@ class Session:
         vehicle = self._vehicle
         if mode == mavlink.COPTER_MODE_GUIDED:
             if not vehicle.granted:
-                self.reopen = True
-                self._acknowledge(source, command, mavlink.MAV_RESULT_TEMPORARILY_REJECTED)
-                self.send_text(mavlink.MAV_SEVERITY_WARNING, f"GUIDED: {vehicle.waiting_reason}", now)
+                self._reject_without_control("GUIDED", command, source, now)
                 return []
-            if vehicle.flying_mode in DESCENTS and vehicle.armed:
+            if vehicle.in_mission or (vehicle.flying_mode in DESCENTS and vehicle.armed):
                 stop = Request("Hover", mobility_pb2.HoverRequest(), mavlink.COPTER_MODE_GUIDED)
                 return self._begin(Call(stop, name, source, command), now)
             vehicle.flying_mode = mavlink.COPTER_MODE_GUIDED
             self._acknowledge(source, command, mavlink.MAV_RESULT_ACCEPTED)
             return []
+        if mode == mavlink.COPTER_MODE_AUTO:
+            return self._fly_mission(None, command, name, source, now)
         if mode in translate.RETURN_MODES:
             request = translate.return_to_launch()
         elif mode == mavlink.COPTER_MODE_LAND:
@@ -319,18 +332,104 @@ class Session:
         else:
             title = enum_names("COPTER_MODE").get(mode, str(mode))
             self._acknowledge(source, command, mavlink.MAV_RESULT_DENIED)
-            self._refuse(name, f"mode {title} is not available; use GUIDED, BRAKE, RTL or LAND", now)
+            self._refuse(name, f"mode {title} is not available; use GUIDED, AUTO, BRAKE, RTL or LAND", now)
             return []
         return self._begin(Call(request, name, source, command), now)
+
+    # Missions
+
+    def _mission_message(self, message: Message, source: Source, now: float) -> list[Call]:
+        if message.name == "MISSION_SET_CURRENT":
+            return self._set_current(message.integer("seq"), None, message.name, source, now)
+        if message.name != "MISSION_COUNT" and message.integer("current") in {2, 3}:
+            return self._guided_item(message, source, now)
+        return self._transfer(message, source, now)
+
+    def _require_guided(self) -> None:
+        """Refuse targets while the drone flies its mission, returns or lands, as ArduCopter does.
+
+        Raises:
+            Untranslatable: The mode is AUTO, RTL or LAND.
+        """
+        vehicle = self._vehicle
+        if vehicle.in_mission or (vehicle.granted and vehicle.armed and vehicle.flying_mode in DESCENTS):
+            title = enum_names("COPTER_MODE")[vehicle.flying_mode]
+            raise Untranslatable(f"the mode is {title}; change the mode to GUIDED first")
+
+    def _fly_mission(
+        self, number: int | None, command: int | None, name: str, source: Source, now: float
+    ) -> list[Call]:
+        """Return the call that flies the stored mission from an item on, or from the current item."""
+        if not self._vehicle.granted:
+            self._reject_without_control("AUTO", command, source, now)
+            return []
+        if len(self._missions.mission.items) <= 1:
+            if command is not None:
+                self._acknowledge(source, command, mavlink.MAV_RESULT_FAILED)
+            self.send_text(mavlink.MAV_SEVERITY_WARNING, "Mode change to AUTO failed: there is no mission", now)
+            return []
+        call = Call(translate.fly_mission(number), name, source, command)
+        return [call] if command is None else self._begin(call, now)
+
+    def _reject_without_control(self, mode: str, command: int | None, source: Source, now: float) -> None:
+        self.reopen = True
+        if command is not None:
+            self._acknowledge(source, command, mavlink.MAV_RESULT_TEMPORARILY_REJECTED)
+        self.send_text(mavlink.MAV_SEVERITY_WARNING, f"{mode}: {self._vehicle.waiting_reason}", now)
+
+    def _set_current(self, number: int, command: int | None, name: str, source: Source, now: float) -> list[Call]:
+        """Set the current item of the mission. In flight in AUTO mode, the mission continues there."""
+        mission = self._missions.mission
+        first = mission.first_navigating(number)
+        if not 0 <= number < len(mission.items) or first is None:
+            raise Untranslatable(f"the mission has no item {number} to fly")
+        if self._vehicle.in_mission and self._vehicle.armed:
+            return self._fly_mission(max(number, 1), command, name, source, now)
+        if number == 0 or mission.complete:
+            mission.rewind()
+        mission.current = first
+        if command is not None:
+            self._acknowledge(source, command, mavlink.MAV_RESULT_ACCEPTED)
+        self._report_current(number)
+        return []
+
+    def _transfer(self, message: Message, source: Source, now: float) -> list[Call]:
+        """Process a message of the mission protocol. A mission that has arrived completely is judged."""
+        missions = self._missions
+        missions.update_home()
+        missions.transfers.handle(self._channel, message, now)
+        if missions.problem:
+            self.refusals.append(Refusal(message.name, missions.problem))
+            self.send_text(mavlink.MAV_SEVERITY_WARNING, f"Mission: {missions.problem}", now)
+            missions.problem = ""
+        uploaded = missions.take_uploaded()
+        if uploaded is None:
+            return []
+        return [Call(Request(translate.CHECK_MISSION, uploaded), "Mission", source)]
+
+    def close(self) -> None:
+        """End the transfers of the connection."""
+        self._missions.transfers.detach(self._channel)
+
+    def report_reached(self, number: int) -> None:
+        """Report that an item of the mission is complete."""
+        self._channel.send("MISSION_ITEM_REACHED", {"seq": number})
+
+    def report_current(self) -> None:
+        """Report the current item of the mission."""
+        self._report_current(self._missions.mission.current)
+
+    def _report_current(self, number: int) -> None:
+        """Report the state of the mission. Clients expect the number that they have set."""
+        report = self._missions.mission.report(self._vehicle.mode)
+        self._channel.send("MISSION_CURRENT", {**report, "seq": number})
 
     def _guided_item(self, message: Message, source: Source, now: float) -> list[Call]:
         """Return the call for a MISSION_ITEM with `current` 2 (target) or 3 (altitude)."""
         current = message.integer("current")
-        if current not in {2, 3}:
-            self._refuse_mission(message, now)
-            return []
         item = item_from(message)
         try:
+            self._require_guided()
             if item.command != mavlink.MAV_CMD_NAV_WAYPOINT:
                 raise Untranslatable("a guided target must be a NAV_WAYPOINT")
             x, y = item.x, item.y
@@ -376,6 +475,12 @@ class Session:
             del self._in_progress[call.key]
         accepted = result == mavlink.MAV_RESULT_ACCEPTED
         self._count(_verdict(accepted, text))
+        if call.request.method == translate.CHECK_MISSION:
+            self._missions.conclude(call.request.message, "" if accepted else text)
+            if not accepted:
+                self.refusals.append(Refusal(call.name, text))
+        elif call.request.method == translate.FLY_MISSION and accepted and call.request.message is not None:
+            self._report_current(call.request.message)
         if call.command is not None:
             self._acknowledge(call.source, call.command, result)
         elif call.mission_ack:
@@ -387,7 +492,7 @@ class Session:
             self._report_parameter(call.parameter)
         if text and accepted:
             self.send_text(mavlink.MAV_SEVERITY_NOTICE, text, now)
-        elif text and (call.command is not None or call.mission_ack):
+        elif text and not call.is_setpoint and not call.parameter:
             self.send_text(mavlink.MAV_SEVERITY_WARNING, f"{call.name}: {text}", now)
         elif text:
             self._refuse(call.name, text, now, audited=False)
@@ -400,11 +505,14 @@ class Session:
             if progress.call.request.method == "Arm" and now >= progress.report_due_s:
                 progress.report_due_s = now + IN_PROGRESS_S
                 self._acknowledge(progress.call.source, progress.call.command or 0, mavlink.MAV_RESULT_IN_PROGRESS)
+        self._missions.transfers.step(now)
         connected = self._vehicle.connected(now)
         for name in self._channel.due(now):
             if name == "HEARTBEAT":
                 if connected:
                     self._channel.send(name, self._vehicle.heartbeat())
+            elif name == "MISSION_CURRENT":
+                self.report_current()
             elif self._vehicle.received_at.get(name, -math.inf) > self._sent_at.get(name, -math.inf):
                 self._send_latest(name)
         parameters = self._channel.parameters
@@ -510,40 +618,9 @@ class Session:
     def _send_version(self, _message: Message, _now: float) -> None:
         self._channel.send("AUTOPILOT_VERSION", {"capabilities": CAPABILITIES, "flight_sw_version": VERSION})
 
-    def _refuse_mission(self, message: Message, now: float) -> None:
-        mission_type = message.integer("mission_type") if message.has("mission_type") else 0
-        self._send_mission_ack((message.sysid, message.compid), mavlink.MAV_MISSION_DENIED, mission_type)
-        raise Untranslatable("missions, fences and rally points are not supported; send guided targets")
-
-    def _count_mission(self, message: Message, _now: float) -> None:
-        """Report a mission that contains only home, like an autopilot without a mission."""
-        mission_type = message.integer("mission_type")
-        home = mission_type == mavlink.MAV_MISSION_TYPE_MISSION and self._vehicle.home() is not None
-        values: dict[str, Value] = {"count": int(home), "mission_type": mission_type}
-        self._channel.send(
-            "MISSION_COUNT", values | {"target_system": message.sysid, "target_component": message.compid}
-        )
-
-    def _send_home_item(self, message: Message, now: float) -> None:
-        home = self._vehicle.home()
-        mission_type = message.integer("mission_type")
-        if home is None or message.integer("seq") != 0 or mission_type != mavlink.MAV_MISSION_TYPE_MISSION:
-            source = (message.sysid, message.compid)
-            self._send_mission_ack(source, mavlink.MAV_MISSION_INVALID_SEQUENCE, mission_type)
-            return
-        integers = message.name == "MISSION_REQUEST_INT"
-        lat, lon, amsl_m = home
-        values: dict[str, Value] = {
-            "target_system": message.sysid,
-            "target_component": message.compid,
-            "command": mavlink.MAV_CMD_NAV_WAYPOINT,
-            "frame": mavlink.MAV_FRAME_GLOBAL,
-            "autocontinue": 1,
-            "x": round(lat * 1e7) if integers else lat,
-            "y": round(lon * 1e7) if integers else lon,
-            "z": amsl_m,
-        }
-        self._channel.send("MISSION_ITEM_INT" if integers else "MISSION_ITEM", values)
+    def _handle_transfer(self, message: Message, now: float) -> None:
+        """Process a message of the mission protocol that cannot complete an upload."""
+        self._transfer(message, (message.sysid, message.compid), now)
 
     def _refuse_file_transfer(self, message: Message) -> None:
         """Send a NAK with the error "file not found". Without it, clients repeat their request many times."""
@@ -581,6 +658,8 @@ class Session:
         name = _message_name(fields.params[0])
         if name == "HEARTBEAT":
             self._channel.send(name, self._vehicle.heartbeat())
+        elif name == "MISSION_CURRENT":
+            self.report_current()
         elif name == "AUTOPILOT_VERSION":
             self._channel.send(name, {"capabilities": CAPABILITIES, "flight_sw_version": VERSION})
         elif name is None or not self._send_latest(name):
@@ -593,6 +672,12 @@ class Session:
         self._channel.send("AUTOPILOT_VERSION", {"capabilities": CAPABILITIES, "flight_sw_version": VERSION})
         return mavlink.MAV_RESULT_ACCEPTED
 
+    def _enable_fence(self, fields: _CommandFields, _now: float) -> int:
+        if fields.params[0] not in {0.0, 1.0}:
+            return mavlink.MAV_RESULT_FAILED
+        enabled = self._missions.enable_fence(fields.params[0] == 1.0)
+        return mavlink.MAV_RESULT_ACCEPTED if enabled else mavlink.MAV_RESULT_FAILED
+
     def _get_home(self, _fields: _CommandFields, _now: float) -> int:
         sent = self._send_latest("HOME_POSITION")
         self._send_latest("GPS_GLOBAL_ORIGIN")
@@ -601,6 +686,7 @@ class Session:
     # Commands that become calls
 
     def _take_off(self, fields: _CommandFields, _now: float) -> Request:
+        self._require_guided()
         if fields.frame is not None and fields.frame not in RELATIVE_FRAMES:
             raise Untranslatable(
                 "the altitude of a takeoff must be relative to home; use MAV_FRAME_GLOBAL_RELATIVE_ALT"
@@ -614,11 +700,16 @@ class Session:
             raise Untranslatable("programs may not arm or disarm by force")
         if fields.params[0] not in {0.0, 1.0}:
             raise Untranslatable("the first parameter must be 1 (arm) or 0 (disarm)")
+        if fields.params[0] and self._vehicle.in_mission:
+            raise Untranslatable("AUTO mode is not armable; arm in GUIDED mode", mavlink.MAV_RESULT_FAILED)
         if fields.params[0]:
             return Request("Arm", mobility_pb2.ArmRequest())
         return Request("Disarm", mobility_pb2.DisarmRequest())
 
     def _reposition(self, fields: _CommandFields, _now: float) -> Request:
+        flags = fields.params[1]
+        if not (math.isfinite(flags) and int(flags) & mavlink.MAV_DO_REPOSITION_FLAGS_CHANGE_MODE):
+            self._require_guided()
         if fields.frame is None:
             raise Untranslatable("send DO_REPOSITION as COMMAND_INT, because COMMAND_LONG holds no accurate position")
         request = translate.place_target(fields.frame, int(fields.x), int(fields.y), fields.z)
@@ -632,16 +723,35 @@ class Session:
         return translate.set_speed(fields.params[1])
 
     def _turn(self, fields: _CommandFields, now: float) -> Request:
+        self._require_guided()
         angle_deg, _, direction, relative = fields.params
         return translate.turn(angle_deg, direction, relative == 1.0, self._vehicle, now)
 
-    def _pause(self, fields: _CommandFields, _now: float) -> Request:
-        if fields.params[0] != 0.0:
-            raise Untranslatable("there is no mission to continue")
-        return translate.hover()
+    def _pause(self, fields: _CommandFields, name: str, source: Source, now: float) -> list[Call]:
+        """Stop at the present position, or continue the mission. A paused mission stays in AUTO mode, as on ArduCopter."""
+        if fields.params[0] not in {0.0, 1.0}:
+            raise Untranslatable("the first parameter must be 0 (pause) or 1 (continue)")
+        if fields.params[0] == 1.0:
+            if len(self._missions.mission.items) <= 1:
+                raise Untranslatable("there is no mission to continue")
+            return self._fly_mission(None, fields.number, name, source, now)
+        request = translate.hover()
+        if self._vehicle.in_mission:
+            request = replace(request, mode=mavlink.COPTER_MODE_AUTO)
+        return self._begin(Call(request, name, source, fields.number), now)
 
-    def _start_mission(self, _fields: _CommandFields, _now: float) -> Request:
-        raise Untranslatable("missions are not supported; send guided targets")
+    def _start_mission(self, fields: _CommandFields, name: str, source: Source, now: float) -> list[Call]:
+        if fields.params[:2] != (0.0, 0.0):
+            raise Untranslatable("only the whole mission can be started; the first two parameters must be 0")
+        return self._fly_mission(None, fields.number, name, source, now)
+
+    def _set_mission_current(self, fields: _CommandFields, name: str, source: Source, now: float) -> list[Call]:
+        number = fields.params[0]
+        if not math.isfinite(number):
+            raise Untranslatable("the number of the item is not a number")
+        if fields.params[1] == 1.0:
+            self._missions.mission.rewind()
+        return self._set_current(int(number), fields.number, name, source, now)
 
     def _point_mount(self, fields: _CommandFields, _now: float) -> Request:
         if int(fields.z if math.isfinite(fields.z) else 0) != mavlink.MAV_MOUNT_MODE_MAVLINK_TARGETING:
@@ -695,14 +805,12 @@ _RESPONSES: Mapping[str, Callable[[Session, Message, float], None]] = {
     "PARAM_REQUEST_LIST": Session._request_parameters,
     "PARAM_REQUEST_READ": Session._read_parameter,
     "REQUEST_DATA_STREAM": Session._request_stream,
-    "MISSION_REQUEST_LIST": Session._count_mission,
-    "MISSION_REQUEST": Session._send_home_item,
-    "MISSION_REQUEST_INT": Session._send_home_item,
-    "MISSION_REQUEST_PARTIAL_LIST": Session._refuse_mission,
-    "MISSION_COUNT": Session._refuse_mission,
-    "MISSION_CLEAR_ALL": Session._refuse_mission,
-    "MISSION_WRITE_PARTIAL_LIST": Session._refuse_mission,
-    "MISSION_SET_CURRENT": Session._refuse_mission,
+    "MISSION_REQUEST_LIST": Session._handle_transfer,
+    "MISSION_REQUEST": Session._handle_transfer,
+    "MISSION_REQUEST_INT": Session._handle_transfer,
+    "MISSION_REQUEST_PARTIAL_LIST": Session._handle_transfer,
+    "MISSION_CLEAR_ALL": Session._handle_transfer,
+    "MISSION_WRITE_PARTIAL_LIST": Session._handle_transfer,
     "TIMESYNC": Session._answer_timesync,
     "PING": Session._answer_ping,
     "LOG_REQUEST_LIST": Session._answer_log_list,
@@ -715,6 +823,7 @@ _COMMAND_RESPONSES: Mapping[str, Callable[[Session, _CommandFields, float], int]
     "REQUEST_MESSAGE": Session._request_message,
     "REQUEST_AUTOPILOT_CAPABILITIES": Session._request_capabilities,
     "GET_HOME_POSITION": Session._get_home,
+    "DO_FENCE_ENABLE": Session._enable_fence,
 }
 
 _COMMANDS: Mapping[str, Callable[[Session, _CommandFields, float], Request]] = {
@@ -726,8 +835,12 @@ _COMMANDS: Mapping[str, Callable[[Session, _CommandFields, float], Request]] = {
     "DO_CHANGE_SPEED": Session._change_speed,
     "CONDITION_YAW": Session._turn,
     "DO_REPOSITION": Session._reposition,
-    "DO_PAUSE_CONTINUE": Session._pause,
-    "MISSION_START": Session._start_mission,
     "DO_MOUNT_CONTROL": Session._point_mount,
     "DO_GIMBAL_MANAGER_PITCHYAW": Session._point_gimbal,
+}
+
+_MISSION_COMMANDS: Mapping[str, Callable[[Session, _CommandFields, str, Source, float], list[Call]]] = {
+    "DO_PAUSE_CONTINUE": Session._pause,
+    "MISSION_START": Session._start_mission,
+    "DO_SET_MISSION_CURRENT": Session._set_mission_current,
 }

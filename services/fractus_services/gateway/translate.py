@@ -31,7 +31,20 @@ HOVER_MODES = frozenset({mavlink.COPTER_MODE_BRAKE, mavlink.COPTER_MODE_LOITER, 
 
 
 class Untranslatable(Exception):
-    """The contents of a message cannot be translated to a call. The text is one sentence for the program."""
+    """The contents of a message cannot be translated to a call. The text is one sentence for the program.
+
+    Attributes:
+        result: MAV_RESULT for the acknowledgement of a command.
+    """
+
+    def __init__(self, reason: str, result: int = mavlink.MAV_RESULT_DENIED) -> None:
+        super().__init__(reason)
+        self.result = result
+
+
+FLY_MISSION = "FlyMission"
+CHECK_MISSION = "CheckMission"
+"""Requests that the gateway carries out by several calls: fly the stored mission, and judge an uploaded mission."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,8 +52,9 @@ class Request:
     """A call of the mobility service.
 
     Attributes:
-        method: Method of MobilityService.
-        message: Request message of the method.
+        method: Method of MobilityService, `FLY_MISSION` or `CHECK_MISSION`.
+        message: Request message of the method. For `FLY_MISSION` the number of the first item, or None to continue; for
+            `CHECK_MISSION` the items.
         mode: Virtual mode after the call was accepted; None if the call does not change the mode.
     """
 
@@ -62,6 +76,11 @@ def land() -> Request:
 def return_to_launch() -> Request:
     """Return a call that brings the drone home."""
     return Request("ReturnToLaunch", mobility_pb2.ReturnToLaunchRequest(), mavlink.COPTER_MODE_RTL)
+
+
+def fly_mission(number: int | None = None) -> Request:
+    """Return a request that flies the stored mission from an item on, or from the current item."""
+    return Request(FLY_MISSION, number, mavlink.COPTER_MODE_AUTO)
 
 
 def goto(lat: float, lon: float, altitude_m: float, reference: int, yaw_deg: float | None = None) -> Request:

@@ -37,7 +37,7 @@ class VirtualVehicle:
     Attributes:
         granted: True while the instance may command the drone.
         waiting_reason: Reason why control is not granted.
-        flying_mode: Mode of the motion that the instance requested: GUIDED, BRAKE, RTL or LAND.
+        flying_mode: Mode of the motion that the instance requested: GUIDED, AUTO, BRAKE, RTL or LAND.
         target: Latest target of a Goto: latitude, longitude in degrees, and metres above home.
         latest: Latest message of the vehicle by name.
         received_at: Time of arrival of the latest messages.
@@ -54,12 +54,13 @@ class VirtualVehicle:
 
     def take(self, message: Message, now: float) -> None:
         """Store a message of the vehicle."""
+        was_armed = self.armed
         self.latest[message.name] = message
         self.received_at[message.name] = now
         if message.name == "HEARTBEAT" and self.granted:
             if self.armed:
                 self.flown = True
-            elif self.flying_mode in DESCENTS:
+            elif self.flying_mode in DESCENTS or (was_armed and self.in_mission):
                 self.flying_mode = mavlink.COPTER_MODE_GUIDED
 
     def connected(self, now: float) -> bool:
@@ -71,6 +72,18 @@ class VirtualVehicle:
         """True if the motors of the vehicle are armed."""
         heartbeat = self.latest.get("HEARTBEAT")
         return heartbeat is not None and bool(heartbeat.integer("base_mode") & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
+
+    @property
+    def on_ground(self) -> bool:
+        """True if the vehicle is disarmed, or reports that it stands on the ground."""
+        state = self.latest.get("EXTENDED_SYS_STATE")
+        reported = state is not None and state.integer("landed_state") == mavlink.MAV_LANDED_STATE_ON_GROUND
+        return reported or not self.armed
+
+    @property
+    def in_mission(self) -> bool:
+        """True in the virtual mode AUTO: the instance flies, has paused or has completed its mission."""
+        return self.granted and self.flying_mode == mavlink.COPTER_MODE_AUTO
 
     @property
     def mode(self) -> int:
@@ -112,6 +125,14 @@ class VirtualVehicle:
             position.integer("alt") / 1e3,
             heading / 100.0 if heading < 36_000 else 0.0,
         )
+
+    @property
+    def speed_mps(self) -> float:
+        """Speed of the latest position report in m/s; 0 if there is none."""
+        position = self.latest.get("GLOBAL_POSITION_INT")
+        if position is None:
+            return 0.0
+        return math.hypot(*(position.integer(axis) for axis in ("vx", "vy", "vz"))) / 100.0
 
     def origin(self) -> tuple[float, float, float] | None:
         """Return latitude, longitude and altitude above sea level of the origin of MAV_FRAME_LOCAL_NED; None if unknown."""

@@ -152,8 +152,8 @@ class Transfers:
             self._send_text(mavlink.MAV_SEVERITY_WARNING, f"Only {MAX_ITEMS[store.kind]} items are supported")
             self._ack(channel, message, store.kind, mavlink.MAV_MISSION_NO_SPACE)
         elif not item_range:
-            verdict = self._replace(store, [])
-            self._report(channel, message, store.kind, mavlink.MAV_MISSION_ACCEPTED if verdict is None else verdict)
+            emptied = self._replace(store, [])
+            self._report(channel, message, store.kind, mavlink.MAV_MISSION_ACCEPTED if emptied is None else emptied)
         else:
             kept = list(store.items)
             if message.name == "MISSION_COUNT":
@@ -207,9 +207,9 @@ class Transfers:
             self._request_next(up)
             return
         up.complete = True
-        verdict = self._replace(store, up.items)
-        if verdict is not None:
-            self.conclude(store.kind, verdict)
+        stored = self._replace(store, up.items)
+        if stored is not None:
+            self.conclude(store.kind, stored)
 
     def conclude(self, kind: int, verdict: int) -> None:
         """Acknowledge a complete list that the vehicle has accepted or refused."""

@@ -1,0 +1,181 @@
+"""Calls of the mobility service that fly the items of a mission. Each function is pure."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from fractus_proto.v1 import mobility_pb2, types_pb2
+from fractus_runtime.mavlink_codec import enum_name
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from fractus_services.gateway import translate
+from fractus_services.gateway.translate import Request, Untranslatable
+from fractus_services.mavlink_server.coordinates import ABSOLUTE_FRAMES, RELATIVE_FRAMES, TERRAIN_FRAMES
+from fractus_services.mavlink_server.mission_items import LANDINGS, PLACED, TAKEOFFS, Item
+from fractus_services.mavlink_server.stored_mission import Mission
+
+MAX_STEPS = 1000
+"""Maximum number of items of a route, with repetitions. The request to the mobility service has a limited size."""
+
+JUDGED_REPETITIONS = 2
+"""Number of times that a jump is judged. Further repetitions fly the same legs as the second one."""
+
+_LEGS = frozenset(
+    {
+        mavlink.MAV_CMD_NAV_WAYPOINT,
+        mavlink.MAV_CMD_NAV_SPLINE_WAYPOINT,
+        mavlink.MAV_CMD_NAV_LOITER_UNLIM,
+        mavlink.MAV_CMD_NAV_LOITER_TIME,
+        mavlink.MAV_CMD_NAV_LOITER_TO_ALT,
+    }
+)
+_JUMPS = frozenset({mavlink.MAV_CMD_DO_JUMP, mavlink.MAV_CMD_DO_JUMP_TAG})
+_WITHOUT_CALL = _JUMPS | {mavlink.MAV_CMD_JUMP_TAG, mavlink.MAV_CMD_DO_LAND_START, mavlink.MAV_CMD_NAV_DELAY}
+_ENDS = LANDINGS | {mavlink.MAV_CMD_NAV_RETURN_TO_LAUNCH}
+_GIMBAL = frozenset({mavlink.MAV_CMD_DO_MOUNT_CONTROL, mavlink.MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW})
+AVAILABLE = _LEGS | TAKEOFFS | _ENDS | _WITHOUT_CALL | _GIMBAL | {mavlink.MAV_CMD_DO_CHANGE_SPEED}
+"""Commands that a mission may contain."""
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """A place in degrees, and metres above the altitude reference."""
+
+    lat: float
+    lon: float
+    altitude_m: float
+    reference: int = types_pb2.ALTITUDE_REFERENCE_HOME
+
+
+class ItemRefused(Exception):
+    """An item is not available to programs. The text is one sentence for the program.
+
+    Attributes:
+        result: MAV_MISSION_RESULT.
+    """
+
+    def __init__(self, result: int, reason: str) -> None:
+        super().__init__(reason)
+        self.result = result
+
+
+def check_item(item: Item) -> None:
+    """Check an item that ArduCopter accepts.
+
+    Raises:
+        ItemRefused: The item is not available.
+    """
+    name = enum_name("MAV_CMD", item.command)
+    if item.command not in AVAILABLE:
+        raise ItemRefused(mavlink.MAV_MISSION_UNSUPPORTED, f"{name} is not available in missions of programs")
+    if item.command in PLACED and item.frame in TERRAIN_FRAMES:
+        reason = f"{name}: altitudes above terrain are not supported; use MAV_FRAME_GLOBAL_RELATIVE_ALT"
+        raise ItemRefused(mavlink.MAV_MISSION_UNSUPPORTED_FRAME, reason)
+    if item.command in TAKEOFFS and item.frame not in RELATIVE_FRAMES:
+        reason = "the altitude of a takeoff is above home; use MAV_FRAME_GLOBAL_RELATIVE_ALT"
+        raise ItemRefused(mavlink.MAV_MISSION_UNSUPPORTED_FRAME, reason)
+    speed_types = {mavlink.SPEED_TYPE_AIRSPEED, mavlink.SPEED_TYPE_GROUNDSPEED}
+    if item.command == mavlink.MAV_CMD_DO_CHANGE_SPEED and item.param1 not in speed_types:
+        raise ItemRefused(mavlink.MAV_MISSION_INVALID_PARAM1, "only the ground speed can be changed")
+    targeting = mavlink.MAV_MOUNT_MODE_MAVLINK_TARGETING
+    if item.command == mavlink.MAV_CMD_DO_MOUNT_CONTROL and item.z != targeting:
+        reason = "only MAV_MOUNT_MODE_MAVLINK_TARGETING is supported"
+        raise ItemRefused(mavlink.MAV_MISSION_INVALID_PARAM7, reason)
+
+
+def lands(item: Item) -> bool:
+    """Return True if a mission ends with this item, because the motors then stop."""
+    return item.command in _ENDS
+
+
+def requests_of(item: Item, at: Place) -> tuple[list[Request], Place]:
+    """Return the calls that fly an item, and the place to which they lead.
+
+    Args:
+        item: Item that `check_item` accepts.
+        at: Place at which the item begins. Items without coordinates or altitude keep it.
+    """
+    if item.command in _LEGS:
+        at = _target(item, at)
+        return [_goto(at)], at
+    if item.command in LANDINGS and item.has_place:
+        # The drone flies to the place at its present altitude, and lands there.
+        at = replace(at, lat=item.x / 1e7, lon=item.y / 1e7)
+        return [_goto(at), _automatic(translate.land())], at
+    request: Request | None = None
+    match item.command:
+        case mavlink.MAV_CMD_NAV_TAKEOFF | mavlink.MAV_CMD_NAV_VTOL_TAKEOFF:
+            request = _automatic(Request("Takeoff", mobility_pb2.TakeoffRequest(altitude_m=item.z)))
+            at = Place(at.lat, at.lon, item.z)
+        case mavlink.MAV_CMD_NAV_LAND | mavlink.MAV_CMD_NAV_VTOL_LAND:
+            request = _automatic(translate.land())
+        case mavlink.MAV_CMD_NAV_RETURN_TO_LAUNCH:
+            request = _automatic(translate.return_to_launch())
+        case mavlink.MAV_CMD_DO_CHANGE_SPEED if item.param2 > 0.0:
+            request = translate.set_speed(item.param2)
+        case mavlink.MAV_CMD_DO_MOUNT_CONTROL:
+            request = translate.gimbal(item.param1, item.param3)
+        case mavlink.MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW:
+            request = translate.gimbal(item.param1, item.param2)
+    return [] if request is None else [request], at
+
+
+def route_of(mission: Mission, first: int, at: Place, *, on_ground: bool) -> list[tuple[int, Request]]:
+    """Return the calls that fly a mission, with the number of the item of each call.
+
+    Args:
+        mission: Mission. Its state does not change.
+        first: Number of the first item.
+        at: Present place of the drone.
+        on_ground: True if the drone has to take off. If the mission does not begin with a takeoff, the route begins with
+            a takeoff to the altitude of its first leg.
+
+    Raises:
+        Untranslatable: The route has too many steps.
+    """
+    probe = Mission()
+    probe.store.items = [_limited(item) for item in mission.items]
+    route: list[tuple[int, Request]] = []
+    number: int | None = first
+    for _ in range(MAX_STEPS):
+        if number is None:
+            return route
+        item = probe.items[number]
+        requests, at = requests_of(item, at)
+        if on_ground and item.navigates and item.command != mavlink.MAV_CMD_NAV_DELAY:
+            on_ground = False
+            if item.command not in TAKEOFFS and at.reference == types_pb2.ALTITUDE_REFERENCE_HOME:
+                takeoff = Request("Takeoff", mobility_pb2.TakeoffRequest(altitude_m=at.altitude_m))
+                requests = [takeoff, *requests]
+        route += [(number, request) for request in requests]
+        if lands(item):
+            return route
+        number = probe.next_after(number)
+    raise Untranslatable(f"the mission has more than {MAX_STEPS} steps; use fewer items or jumps")
+
+
+def _target(item: Item, at: Place) -> Place:
+    """Return the target of a leg. As on ArduCopter, an altitude of 0 keeps the altitude."""
+    lat = item.x / 1e7 if item.has_place else at.lat
+    lon = item.y / 1e7 if item.has_place else at.lon
+    if item.z == 0.0:
+        return replace(at, lat=lat, lon=lon)
+    absolute = item.frame in ABSOLUTE_FRAMES
+    reference = types_pb2.ALTITUDE_REFERENCE_AMSL if absolute else types_pb2.ALTITUDE_REFERENCE_HOME
+    return Place(lat, lon, item.z, reference)
+
+
+def _goto(place: Place) -> Request:
+    return _automatic(translate.goto(place.lat, place.lon, place.altitude_m, place.reference))
+
+
+def _automatic(request: Request) -> Request:
+    return replace(request, mode=mavlink.COPTER_MODE_AUTO)
+
+
+def _limited(item: Item) -> Item:
+    """Return an item with a limited number of repetitions of a jump."""
+    if item.command not in _JUMPS:
+        return item
+    endless = item.param2 < 0.0
+    return replace(item, param2=JUDGED_REPETITIONS if endless else min(item.param2, JUDGED_REPETITIONS))

@@ -1,0 +1,114 @@
+"""Calls that fly the items of a mission, and the items that a mission may contain."""
+
+from __future__ import annotations
+
+import pytest
+from fractus_proto.v1 import types_pb2
+from fractus_services.gateway.mission_route import MAX_STEPS, ItemRefused, Place, check_item, requests_of, route_of
+from fractus_services.gateway.translate import Request, Untranslatable
+from fractus_services.mavlink_server.mission_items import Item
+from fractus_services.mavlink_server.stored_mission import Mission
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+HERE = Place(39.36, 22.95, 7.0)
+HOME = Item(mavlink.MAV_CMD_NAV_WAYPOINT, frame=mavlink.MAV_FRAME_GLOBAL)
+
+
+def _waypoint(lat: float, altitude_m: float = 10.0, **changes: int) -> Item:
+    return Item(mavlink.MAV_CMD_NAV_WAYPOINT, x=round(lat * 1e7), y=229_500_000, z=altitude_m, **changes)
+
+
+def _jump(number: int, times: int) -> Item:
+    return Item(mavlink.MAV_CMD_DO_JUMP, param1=number, param2=times)
+
+
+def _route(*items: Item, on_ground: bool = False) -> list[tuple[int, Request]]:
+    mission = Mission()
+    mission.store.items = [HOME, *items]
+    return route_of(mission, 1, HERE, on_ground=on_ground)
+
+
+def _place(request: Request) -> tuple[float, float, int]:
+    target = request.message.target
+    return round(target.latitude_deg, 6), target.altitude_m, target.altitude_reference
+
+
+def test_waypoint_without_place_or_altitude_keeps_them() -> None:
+    (request,), at = requests_of(Item(mavlink.MAV_CMD_NAV_WAYPOINT, z=20.0), HERE)
+    assert _place(request) == (39.36, 20.0, types_pb2.ALTITUDE_REFERENCE_HOME)
+    (request,), _ = requests_of(_waypoint(39.37, 0.0), at)
+    assert _place(request) == (39.37, 20.0, types_pb2.ALTITUDE_REFERENCE_HOME)
+
+
+def test_altitude_above_sea_level_is_passed_on() -> None:
+    (request,), _ = requests_of(_waypoint(39.37, 50.0, frame=mavlink.MAV_FRAME_GLOBAL), HERE)
+    assert _place(request) == (39.37, 50.0, types_pb2.ALTITUDE_REFERENCE_AMSL)
+
+
+def test_landing_with_a_place_flies_there_at_the_present_altitude() -> None:
+    requests, _ = requests_of(Item(mavlink.MAV_CMD_NAV_LAND, x=393_700_000, y=229_500_000), HERE)
+    assert [request.method for request in requests] == ["Goto", "Land"]
+    assert _place(requests[0]) == (39.37, 7.0, types_pb2.ALTITUDE_REFERENCE_HOME)
+
+
+def test_route_ends_with_a_landing() -> None:
+    route = _route(_waypoint(39.37), Item(mavlink.MAV_CMD_NAV_RETURN_TO_LAUNCH), _waypoint(39.38))
+    assert [request.method for _, request in route] == ["Goto", "ReturnToLaunch"]
+
+
+def test_route_on_the_ground_begins_with_a_takeoff() -> None:
+    route = _route(_waypoint(39.37, 12.0), on_ground=True)
+    assert [request.method for _, request in route] == ["Takeoff", "Goto"]
+    assert route[0][1].message.altitude_m == 12.0
+    route = _route(Item(mavlink.MAV_CMD_NAV_TAKEOFF, z=9.0), _waypoint(39.37), on_ground=True)
+    assert [request.method for _, request in route] == ["Takeoff", "Goto"]
+
+
+@pytest.mark.parametrize("times", [-1, 2, 100])
+def test_jump_is_judged_twice(times: int) -> None:
+    route = _route(_waypoint(39.37), _waypoint(39.38), _jump(1, times), _waypoint(39.39))
+    assert [number for number, _ in route] == [1, 2, 1, 2, 1, 2, 4]
+
+
+def test_jump_without_repetition_is_not_judged() -> None:
+    route = _route(_waypoint(39.37), _waypoint(39.38), _jump(1, 0), _waypoint(39.39))
+    assert [number for number, _ in route] == [1, 2, 4]
+
+
+def test_route_with_too_many_steps_is_refused() -> None:
+    nested = [*[_waypoint(39.37) for _ in range(300)], _jump(1, 9), _jump(1, 9)]
+    with pytest.raises(Untranslatable, match=f"more than {MAX_STEPS} steps"):
+        _route(*nested)
+
+
+def test_speed_and_camera_items_become_calls() -> None:
+    route = _route(
+        Item(mavlink.MAV_CMD_DO_CHANGE_SPEED, param1=1.0, param2=3.0),
+        Item(mavlink.MAV_CMD_DO_CHANGE_SPEED, param1=1.0, param2=-1.0),
+        Item(mavlink.MAV_CMD_DO_MOUNT_CONTROL, param1=-90.0, z=2.0),
+    )
+    assert [request.method for _, request in route] == ["SetSpeed", "PointGimbal"]
+    assert route[0][1].message.speed_mps == 3.0
+    assert route[1][1].message.pitch_deg == -90.0
+
+
+@pytest.mark.parametrize(
+    ("item", "result"),
+    [
+        (Item(mavlink.MAV_CMD_DO_SET_SERVO), mavlink.MAV_MISSION_UNSUPPORTED),
+        (Item(mavlink.MAV_CMD_DO_SET_HOME), mavlink.MAV_MISSION_UNSUPPORTED),
+        (Item(mavlink.MAV_CMD_NAV_GUIDED_ENABLE), mavlink.MAV_MISSION_UNSUPPORTED),
+        (Item(mavlink.MAV_CMD_DO_PARACHUTE), mavlink.MAV_MISSION_UNSUPPORTED),
+        (_waypoint(39.37, frame=mavlink.MAV_FRAME_GLOBAL_TERRAIN_ALT), mavlink.MAV_MISSION_UNSUPPORTED_FRAME),
+        (
+            Item(mavlink.MAV_CMD_NAV_TAKEOFF, frame=mavlink.MAV_FRAME_GLOBAL, z=50.0),
+            mavlink.MAV_MISSION_UNSUPPORTED_FRAME,
+        ),
+        (Item(mavlink.MAV_CMD_DO_CHANGE_SPEED, param1=2.0, param2=3.0), mavlink.MAV_MISSION_INVALID_PARAM1),
+        (Item(mavlink.MAV_CMD_DO_MOUNT_CONTROL, z=0.0), mavlink.MAV_MISSION_INVALID_PARAM7),
+    ],
+)
+def test_item_that_is_not_available_is_refused(item: Item, result: int) -> None:
+    with pytest.raises(ItemRefused) as refused:
+        check_item(item)
+    assert refused.value.result == result

@@ -225,7 +225,7 @@ class TelemetryFeed:
     async def _report_contact(self, stub: MobilityServiceStub) -> None:
         """Report the contact with the API server if a report is due. To the service, a failed report is missing contact."""
         age_s = self._contact_age_s()
-        # The interval is a little shorter than that of the telemetry, so that no message is skipped.
+        # The interval is a little shorter than the interval of the telemetry, so that no message is skipped.
         due = time.monotonic() - self._reported_s >= 0.9 * CONTACT_INTERVAL_S
         if not (due and math.isfinite(age_s)):
             return

@@ -176,7 +176,7 @@ def _placement(placement: Body) -> Iterator[str]:
 
 
 def _lifetimes(spec: Body) -> dict[str, Any]:
-    """Return the components that end with the flight and those that outlive it, and the time after the landing in seconds."""
+    """Return the components that end with the flight, the components that continue to run, and the time after the landing in seconds."""
     ends: dict[str, list[str]] = {"flight": [], "application": []}
     for component in spec.get("components") or ():
         ends[component.get("endsWith") or default_lifetime(component["placement"])].append(component["name"])

@@ -31,7 +31,7 @@ class ActivePlans:
 
     Args:
         applications: All Applications. `application_changed` must be called for each change.
-        wake: Wakes an Application that shares the flight of another one whose plan changed.
+        wake: Wakes an Application after the plan of the Application whose flight it shares has changed.
         listener: Notified of each change of an active plan.
         on_requests: Called with the label key of an Application and the requests of its active plan when either changes.
     """

@@ -276,7 +276,7 @@ class ApplicationController:
         return await self._finish(observed, flown, ends)
 
     def _next_mission_begins(self, application: Application, flown: DeploymentPlanSpec) -> bool:
-        """Return True if the Application has another mission, and nothing of the last one must continue to run."""
+        """Return True if the Application has another mission, and no component of the last mission must continue to run."""
         if not mission_changed(application, flown):
             return False
         return (
@@ -431,7 +431,7 @@ class ApplicationController:
         others = await self._objects.remove(key, kinds.DEPLOYMENT, *_AFTER_PODS, keeps=ends.keeps)
         pods = await self._finished_pods.remove(key, ends.instances)
         if drone is not None and self._finished_pods.run_on(key, drone):
-            # A program of the last mission must not use the Grants of the next one.
+            # A program of the last mission must not use the Grants of the next mission.
             return True
         plan = await self._objects.remove(key, kinds.DEPLOYMENT_PLAN)
         self._cache.forget(key)

@@ -21,7 +21,7 @@ NAME = "fractus-ca"
 
 
 async def open_authority(store: Store, namespace: str) -> Authority:
-    """Read the certificate authority, or create it. Two operators that start at the same time use the same one.
+    """Read the certificate authority, or create it. Two operators that start at the same time use the same authority.
 
     Raises:
         BrokenAuthority: Its Secret is damaged.

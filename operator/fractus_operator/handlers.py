@@ -162,7 +162,7 @@ def _uid(body: kopf.Body) -> str:
 
 
 class _NoDiffBase(kopf.DiffBaseStorage):
-    """Storage that never reports a difference between the last handled object and the current one.
+    """Storage that never reports a difference between the last handled object and the current object.
 
     No handler uses the difference, and storing it in an annotation would cost a write.
     """

@@ -103,7 +103,7 @@ def owned_object(kind: Kind, application: Application, name: str, extra_labels: 
         kind: Kind of the object.
         application: Owner of the object.
         name: Name of the object.
-        extra_labels: Labels in addition to those that every object of the Application has.
+        extra_labels: Labels in addition to the labels of every object of the Application.
         content: Fields of the object other than its metadata.
     """
     namespace, _ = application.key

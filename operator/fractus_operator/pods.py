@@ -285,7 +285,7 @@ def _requests(spec: Body) -> dict[str, float]:
     """Return the effective requests of a Pod, as the scheduler counts them.
 
     They are the maximum of the containers that run at the same time, or the requests of the pod itself, plus the overhead.
-    An init container with restartPolicy Always, such as the proxy of a service mesh, continues to run with the later ones.
+    An init container with restartPolicy Always, such as the proxy of a service mesh, continues to run beside the later containers.
     """
     total: dict[str, float] = {"pods": 1.0}
     maximum: dict[str, float] = {}

@@ -147,7 +147,7 @@ class Rollout:
     async def keep_plan(self, submitted: Submitted, plan: DeploymentPlanSpec) -> None:
         """Store the plan of a finished mission, which records its outcome.
 
-        If the manifest describes the same mission, the plan becomes that of the Application's current generation.
+        If the manifest describes the same mission, the plan becomes the plan of the Application's current generation.
 
         Raises:
             NameTaken: An object of another owner has its name.

@@ -236,7 +236,7 @@ class Subscriptions:
             subscription.wake(urgent=urgent)
 
     def wake_waiting(self) -> None:
-        """Wake every Application without a suitable plan, because another one released resources."""
+        """Wake every Application without a suitable plan, because another Application released resources."""
         for label in self._by_application.keys() - self._placed:
             for subscription in self._by_application[label]:
                 subscription.wake()

@@ -261,7 +261,7 @@ def camera() -> None:
 @_option(
     "--keep-total-mb",
     2000,
-    "Maximum size of all images in megabytes; those of components without a Grant are removed first.",
+    "Maximum size of all images in megabytes; images of components without a Grant are removed first.",
     _COUNT,
 )
 @click.option(

@@ -144,7 +144,7 @@ def volume_object(node: str, number: int) -> tuple[str, Json]:
 
 
 def volume_place(volume: Json) -> tuple[str, int] | None:
-    """Return node and number of a PersistentVolume of `volume_object`, or None if it is another one."""
+    """Return node and number of a PersistentVolume of `volume_object`, or None if it is a different volume."""
     labels = volume["metadata"].get("labels") or {}
     node, _, number = volume["metadata"]["name"].rpartition("-")
     return (node, int(number)) if labels.items() >= _OURS.items() else None

@@ -185,7 +185,7 @@ def _battery_refusals(v: VehicleState) -> Iterator[str]:
 
 
 def _mission_refusals(v: VehicleState) -> Iterator[str]:
-    """Check that the mission contains the items of ARMING_MIS_ITEMS. Only the first missing one is reported."""
+    """Check that the mission contains the items of ARMING_MIS_ITEMS. Only the first missing item is reported."""
     required = int(v.params["ARMING_MIS_ITEMS"])
     if not _checks(v, Check.MISSION):
         return

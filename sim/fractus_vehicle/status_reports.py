@@ -137,7 +137,7 @@ def mission_item_reached(v: VehicleState) -> Values:
 
 
 def relay_status(v: VehicleState) -> Values:
-    """Build RELAY_STATUS: bit masks of the enabled relays and of those that are on."""
+    """Build RELAY_STATUS: bit masks of the enabled relays, and of the relays that are on."""
     present = relays_present(v)
     return {
         "time_boot_ms": boot_ms(v),

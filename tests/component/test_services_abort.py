@@ -141,9 +141,7 @@ def test_aborted_drone_returns_home_if_its_place_becomes_illegal_in_flight(tmp_p
             world.grants.put(spec(aborting(), covered, zone("barrier", "ignore", *barrier)))
             world.plane.trace.clear()
             assert math.hypot(*await landed(world)) < 1.5
-            assert clearance_m(world, *barrier) > 1, (
-                "the return flight avoids the zone that appeared with the other one"
-            )
+            assert clearance_m(world, *barrier) > 1, "the return flight avoids the zone barrier"
             assert clearance_m(world, 70, -60, 90, -40) > 0
 
     fly(flight)

@@ -235,7 +235,7 @@ class PodNamespaces:
         return self._open.values()
 
     def list_connections(self, services: Collection[Endpoint]) -> Iterator[tuple[TcpSockets, TcpConnection]]:
-        """Yield the connections to some services. Unreadable namespaces are skipped, such as those of ending pods."""
+        """Yield the connections to some services. Unreadable namespaces are skipped, such as namespaces of ending pods."""
         for sockets in self.refresh():
             try:
                 connections = sockets.list_connections(services)

@@ -1,6 +1,6 @@
 """Text of the agent's nftables tables, and the `nft` commands that create and remove them.
 
-The chains hook at priority -150, before those of kube-proxy. On a node with clients they hook on prerouting (for pods)
+The chains hook at priority -150, before the chains of kube-proxy. On a node with clients they hook on prerouting (for pods)
 and on output (for programs in the host network). On a node that serves, they hook on prerouting, for traffic from
 paired nodes. A connection whose first packet matches an element of `targets` goes to the direct address. Without an
 element it falls through to kube-proxy, and so to the cloud path. Elements time out, so that traffic returns to the

@@ -133,7 +133,7 @@ class Volume4D:
             return None
         x, y = shapely.get_coordinates(shapely.shortest_line(mine, theirs))[0].tolist()
         lat, lon = self.frame.latlon(x, y)
-        # Within the tolerance, the lower bound of one volume may be above the upper bound of the other one.
+        # Within the tolerance, the lower bound of one volume may be above the upper bound of the other volume.
         lower_m, upper_m = sorted((max(self.lower_m, other.lower_m), min(self.upper_m, other.upper_m)))
         return Overlap(lat, lon, lower_m, upper_m, max(self.begin_s, other.begin_s), min(self.end_s, other.end_s))
 

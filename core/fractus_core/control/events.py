@@ -132,7 +132,7 @@ class MotionCancelled:
 
 @dataclass(frozen=True, slots=True)
 class MotionStopped:
-    """Another motion of the same flight replaces the current one. The caller receives the reason."""
+    """Another motion of the same flight replaces the current motion. The caller receives the reason."""
 
     code: str
     reason: str

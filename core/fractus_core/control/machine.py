@@ -238,7 +238,7 @@ def _count_waypoints(update: StateUpdate, event: WaypointsDone) -> None:
 def _open_stream(update: StateUpdate, event: StreamOpened) -> None:
     """Create a lease for the driver or refuse its stream.
 
-    A second stream of the same driver is refused while the first one is open. Otherwise two processes of one driver
+    A second stream of the same driver is refused while the first stream is open. Otherwise two processes of one driver
     would take the vehicle from each other without end.
     """
     mission = update.mission(event.key, event.identity)

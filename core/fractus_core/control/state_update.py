@@ -142,7 +142,7 @@ class StateUpdate:
     # The system
 
     def start(self, kind: TaskKind, *, begun_by_others: bool = False) -> None:
-        """Start a system task in place of the current one.
+        """Start a system task in place of the current task.
 
         If the task brings the vehicle down, the vehicle counts as returning from now on. Otherwise the monitor or the
         supervisor could intervene before the task runs.

@@ -11,7 +11,7 @@ from fractus_core.linking.values import LearnedRange, LinkSettings, LocalPositio
 def predict(track: Track, settings: LinkSettings) -> list[LocalPosition]:
     """Return the positions at each step of the horizon, starting with the current one.
 
-    With waypoints, the drone flies from one to the next with its speed and stays at the last one (path navigation,
+    With waypoints, the drone flies from waypoint to waypoint with its speed, and stays at the last waypoint (path navigation,
     thesis 8.6). Without waypoints, it keeps its velocity for `region_trust_s` and then stays (region navigation).
     """
     steps = round(settings.horizon_s / settings.step_s)

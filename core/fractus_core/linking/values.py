@@ -94,7 +94,7 @@ class LearnedRange:
 
     Attributes:
         range_factor: Real range divided by the declared range.
-        rate_factor: Measured bandwidth divided by the declared one, well inside the range.
+        rate_factor: Measured divided by declared bandwidth, well inside the range.
         last_beacon_s: Time of the last beacon on the clock of `now_s`, negative infinity before the first.
         failures: Failed attempts to connect since the link last worked.
         last_failure_s: Time of the last failed attempt, on the same clock.
@@ -152,7 +152,7 @@ class LinkDecision:
 
     Attributes:
         peer: Name of the peer, empty for no link.
-        changes: True if the peer differs from that of the current link.
+        changes: True if the peer differs from the peer of the current link.
         code: Reason in CamelCase, for programs.
         reason: Reason in one sentence, for people.
         plan: Expected links over the horizon.
@@ -171,7 +171,7 @@ class PathDecision:
 
     Attributes:
         direct: True for the direct link, False for the cloud path.
-        changes: True if the path differs from the current one.
+        changes: True if the path differs from the current path.
         planned: True if the old path still works, so that connections may finish on it.
         code: Reason in CamelCase, for programs.
         reason: Reason in one sentence, for people.

@@ -97,7 +97,7 @@ class DroneFacts:
     """Properties that rank a suitable drone.
 
     Attributes:
-        used: True if the application would share the flight of another one.
+        used: True if the application would share the flight of another application.
         charging: True if the drone is charging.
         remaining_min: Flight time in minutes with the present charge.
         needed_min: Flight time of the mission in minutes; 0 for a shared flight.

@@ -120,7 +120,7 @@ class RouteJudge:
 
         Args:
             drone: Drone that flies.
-            mission: Estimated flight, or None if the application shares the flight of another one.
+            mission: Estimated flight, or None if the application shares the flight of another application.
         """
         home = home_of(drone, self._inventory.depots)
         leader = self._application.spec.leader

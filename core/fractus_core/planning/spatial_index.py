@@ -152,7 +152,7 @@ class SpatialIndex:
     def near_area(self, frame: LocalFrame, shape: BaseGeometry, margin_m: float) -> tuple[list[str], _Floats]:
         """Return the points in an area or within a margin around it.
 
-        Distances are those of the frame: within 0.1 % of geodesic ones up to 50 km from its origin.
+        Distances are measured in the frame. Up to 50 km from its origin, they differ by at most 0.1 % from geodesic distances.
 
         Returns:
             Names in alphabetical order, and positions in metres east and north in the frame, shape (n, 2).

@@ -147,7 +147,7 @@ class Home:
 
 @dataclass(frozen=True, slots=True)
 class Airframe:
-    """Motion parameters of the autopilot. The defaults are those of ArduCopter.
+    """Motion parameters of the autopilot. The defaults are the defaults of ArduCopter.
 
     Attributes:
         accel_mps2: Horizontal acceleration when braking.

@@ -1,6 +1,6 @@
 """Fields of view from camera descriptions.
 
-For each lens model, the view is that of a pinhole which contains every ray of a picture.
+For each lens model, the view is the view of a pinhole camera that contains every ray of a picture.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def bounding_lens(camera: CameraFeatures | None) -> Lens | None:
     mount = camera.mount
     error_deg = MOUNT_ERROR_DEG + (OFF_AXIS_DEG if camera.lens is None else 0.0)
     if mount.gimbal:
-        # The attitude of a gimbal is that of the camera, so no mounting angle applies.
+        # The attitude of a gimbal is the attitude of the camera, so no mounting angle applies.
         return Lens(wide, tall, 0.0, 0.0, False, error_deg)
     return Lens(wide, tall, mount.pitch, mount.yaw, mount.stabilised, error_deg)
 

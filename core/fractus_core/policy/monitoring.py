@@ -71,7 +71,7 @@ def monitor(
     """Return what the system must do about a flying drone now.
 
     The check covers the path from the present position to the point where the drone comes to rest if it is commanded to
-    stop now, with the position error around the path. This margin is smaller than that of permitted legs, so that a leg
+    stop now, with the position error around the path. This margin is smaller than the margin of permitted legs, so that a leg
     flown as permitted never triggers the monitor.
 
     Args:

@@ -24,7 +24,7 @@ MAX_LEGS_TESTED = 3000
 """A search gives up after this number of legs, about half a second of work."""
 
 MAX_EXCESS = 1.2
-"""Maximum ratio of the length of a route to that of the shortest route. A higher ratio makes the search quicker.
+"""Maximum ratio of the length of a route to the length of the shortest route. A higher ratio makes the search quicker.
 Usually the route is only a percent or two longer than the shortest route."""
 
 QUICK_MAX_LEGS_TESTED = 250
@@ -307,7 +307,7 @@ class _Search:
     def _learn(self, obstacles: list[PolicyZone | int], begin: XY, space: FreeSpace) -> None:
         """Add the obstacles that block a leg: all areas to stay in, and the nearest zone.
 
-        A route around the nearest zone meets the next one.
+        A route around the nearest zone meets the next zone.
         """
 
         def key(obstacle: PolicyZone | int) -> tuple[int, int]:

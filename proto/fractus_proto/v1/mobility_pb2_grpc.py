@@ -137,7 +137,7 @@ class MobilityServiceServicer(object):
     def GetControl(self, request, context):
         """Blocks until the drone is at the caller's next control point, then sends GRANTED. The stream is the control lease: it stays
         open while the caller has control. If it breaks, the system hovers and then flies the drone home. A second stream of the same
-        caller waits while the first one is open, and is refused (ControlHeld) after 6 s.
+        caller waits while the first stream is open, and is refused (ControlHeld) after 6 s.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')

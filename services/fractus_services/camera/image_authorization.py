@@ -90,7 +90,7 @@ class ImageAuthorizer:
     ) -> tuple[FilterPlan, Verdict]:
         """Return the filters to apply to an image, and the verdict. If a fallback filter is used, its reason is added to the verdict.
 
-        The verdict is recorded if its filters or policies differ from those in `recorded`.
+        The verdict is recorded if its filters or policies differ from `recorded`.
 
         Args:
             call: Method and arguments.

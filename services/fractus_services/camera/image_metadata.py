@@ -138,7 +138,7 @@ def _bearing_deg(degrees: float, digits: int) -> float:
 def _direction_deg(pose: Pose) -> float | None:
     """Return the direction of the image, clockwise from true north, or None if it is unknown.
 
-    The direction is that of the camera. If the camera looks steeply down or up, it is that of the top or the bottom of the image.
+    The direction is the camera's direction. If the camera looks steeply down or up, it is the direction of the top or bottom of the image.
     """
     if pose.lens is None or pose.attitude is None:
         return None

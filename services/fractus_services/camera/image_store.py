@@ -305,4 +305,4 @@ def _file_sizes(paths: Iterable[Path]) -> list[int]:
 
 
 def _not_found(name: str) -> NoSuchImage:
-    return NoSuchImage(f"this component has no image {name[:64]!r}; ListImages returns the existing ones")
+    return NoSuchImage(f"this component has no image {name[:64]!r}; ListImages returns the existing images")

@@ -110,7 +110,7 @@ class PoseHistory:
         now: Returns monotonic seconds.
         lens: Lens of the camera, or None if it is unknown.
         relief_m: Maximum depth of the surrounding ground below home, in metres.
-        gimbal: True if the attitudes are those of a gimbal.
+        gimbal: True if the attitudes were measured by a gimbal.
     """
 
     fixed = False

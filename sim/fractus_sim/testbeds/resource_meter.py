@@ -38,7 +38,7 @@ class ProgramUsage:
 class ResourceMeter:
     """Measures running programs a few times per second.
 
-    The processor time after the last measurement, and that of child processes that nobody waits for, is not included.
+    Processor time after the last measurement, and of child processes that nobody waits for, is not included.
     """
 
     def __init__(self) -> None:

@@ -124,7 +124,7 @@ async def forges_identity(drone: fractus.Mobility) -> None:
 
 
 def _forged_certificates(real: Endpoint, scratch: Path) -> Mapping[str, Path]:
-    """Return directories with forged certificates of this instance and of another one."""
+    """Return directories with forged certificates of this instance and of another instance."""
     own = (
         "spiffe://fractus.dev/ns/{FRACTUS_NAMESPACE}/app/{FRACTUS_APPLICATION}/component/{FRACTUS_COMPONENT}/instance/"
     )

@@ -77,6 +77,6 @@ def _read(path: Path) -> ActiveGrant | None:
     except FileNotFoundError:
         return None
     except Exception:
-        # No content may prevent the start of the service in flight. The drone then returns on the path it flew.
+        # The service must start in flight, whatever the file contains. Without a Grant, the drone returns on the path that it flew.
         log.exception("grants: cannot read the flown Grant (path=%s)", path)
         return None

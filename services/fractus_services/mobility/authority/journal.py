@@ -136,7 +136,7 @@ class Journal:
             self.failure = f"the journal {self._path} was not written within {timeout_s:g} s"
 
     def save_soon(self, record: JournalContent) -> asyncio.Task[None]:
-        """Write in the background. At most one write runs and one waits. The waiting one writes the latest record."""
+        """Write in the background. At most one write runs and one write waits. The waiting write stores the latest record."""
         self.record = record
         if self._queued is None:
             self._queued = asyncio.get_running_loop().create_task(self._save())

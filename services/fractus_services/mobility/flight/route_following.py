@@ -175,7 +175,7 @@ async def _first_leg(
 
 
 def limited_mps(speed_mps: float, leg: GotoArgs, now: Situation, grant: CompiledGrant) -> float:
-    """Return the highest speed to command under the limits along a leg, at most the requested one.
+    """Return the highest speed to command under the limits along a leg, at most the requested speed.
 
     Minimum speeds are ignored, and no limit refuses the leg, because the system must return even from where a driver may not fly.
 

@@ -185,7 +185,7 @@ class AutopilotLink:
         heartbeat_sent_at = -math.inf
         try:
             while not self._broken.is_set():
-                # The failsafe that heartbeats hold off counts seconds of the vehicle's clock.
+                # Heartbeats prevent the autopilot's failsafe, whose timeout follows the vehicle's clock.
                 if self.now - heartbeat_sent_at >= HEARTBEAT_S / self.timing.pace - PROBE_S / 2:
                     heartbeat_sent_at = self.now
                     self.send_heartbeat()

@@ -247,7 +247,7 @@ class MavlinkAutopilot(AutopilotLink):
         stack: Firmware of the autopilot.
         alive, on_found, on_heartbeat, sysid, known_vehicle, received, sent: See `AutopilotLink`.
         on_parameter: Callback invoked with the name of a parameter that another station changed.
-        expected_position: File with the expected position while the reported one is not trusted.
+        expected_position: File with the expected position while the reported position is not trusted.
 
     Attributes:
         starting: Lock held while the start of the motors is being prepared.

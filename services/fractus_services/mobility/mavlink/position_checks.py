@@ -257,7 +257,7 @@ class PositionChecks:
             self._estimator_problem = problem
 
     def take_estimator_switch(self, now: float) -> None:
-        """Process a status text that reports another estimator in use. Its position may differ from that of the former one."""
+        """Process a status text that reports a change of the estimator. The position of the new estimator may differ."""
         self._see("the autopilot has switched to another estimator (EKF lane)", now)
 
     def take_position(self, reported: ReportedPosition, error_m: float, now: float, *, moves: bool) -> bool:

@@ -83,7 +83,7 @@ class Vehicle(VehicleState):
         gps_at: Time of the last GPS message.
         fence_enabled: True if the vehicle's fence is enabled; None if it has no fence. Reported at `checks_at`.
         started_at: Time of the first heartbeat that reported running motors.
-        stopping_at: Time since which all heartbeats have reported stopped motors in flight; infinite if the last one did not.
+        stopping_at: Time since which all heartbeats have reported stopped motors in flight; infinite if the last heartbeat reported running motors.
         gimbal_limits: Smallest and largest pitch and yaw of the gimbal, degrees; None until they are reported.
         position_checks: Signs of a wrong position.
         second_error_m: Position error of the second GPS receiver; 0 without one or if it has no fix.
@@ -228,7 +228,7 @@ def _position(vehicle: Vehicle, message: Message, now: float) -> None:
 
 def _attitude(vehicle: Vehicle, message: Message, now: float) -> None:
     angles = [math.degrees(message.real(name)) for name in ("roll", "pitch", "yaw")]
-    # An attitude that was overtaken by a later one is outdated.
+    # An attitude that was overtaken by a later attitude is outdated.
     if all(map(math.isfinite, angles)) and now >= vehicle.attitude_at:
         vehicle.roll_deg = angles[0]
         vehicle.pitch_deg = angles[1]

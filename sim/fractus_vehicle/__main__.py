@@ -200,7 +200,7 @@ def _parameters(_context: click.Context, _option: click.Parameter, texts: tuple[
 @click.option(
     "--lockstep",
     metavar="HOST:PORT",
-    help="Advance time for a TCP client only. It sends the number of 10 ms steps per line, and gets the total number.",
+    help="Advance time only on request of a TCP client. Each line of the client contains a number of 10 ms steps; the reply is the total.",
 )
 @click.option("--duration", type=float, callback=_finite, help="Exit after this many simulated seconds.")
 def vehicle(

@@ -1,4 +1,4 @@
-"""A running autopilot gets all settings of its owner back, or the difference is named and the settings stay on disk."""
+"""All settings of the owner are restored in a running autopilot. Otherwise the difference is reported, and they stay on disk."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from vehicle_process import HOME, running_vehicle
 
 @pytest.fixture(scope="module")
 def link() -> Iterator[str]:
-    """Return the link of a vehicle with the settings of its owner. Each test gives them back."""
+    """Return the link of a vehicle with the settings of its owner. Each test restores them."""
     address = f"tcp:127.0.0.1:{free_port()}"
     with running_vehicle("--ready-after", "2", *parameter_arguments(), links=(address,)):
         upload_lists(address, HOME[:2])

@@ -147,7 +147,7 @@ def test_cordoned_drone_is_kept_in_flight_and_replaced_on_ground(
     wait_for(lambda: "drone-3" in {g["spec"]["node"] for g in world.grants(namespace)}, "the Grants of drone-3")
 
 
-# Unit tests plan both counts (test_plan_changes.py).
+# Unit tests plan with both numbers of instances (test_plan_changes.py).
 @pytest.mark.parametrize("count", ["*", pytest.param(3, marks=pytest.mark.slow)])
 def test_new_node_scales_up_the_plan(world: World, operator: OperatorProcess, namespace: str, count: Any) -> None:
     viewer = component("GroundViewer", "edge", locations=[{"center": at(40, 30), "radius": 15, "instances": count}])

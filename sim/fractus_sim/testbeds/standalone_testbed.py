@@ -88,7 +88,7 @@ class StandaloneTestbed(Testbed):
             self._start_program(each, addresses)
 
     def reissue(self, grants: Iterable[GrantSpec]) -> None:
-        """Sign Grants of the drones of this experiment, and replace those of the same instances."""
+        """Sign Grants of the drones of this experiment, and replace earlier Grants of the same instances."""
         for spec in grants:
             if spec.node in self._drones.drones:
                 self._identities[spec.component] = self._drones.grant(grant_manifest(spec))

@@ -31,7 +31,7 @@ MAX_CORRECTION_MARGIN_M = 1.0
 LANDED_WITHIN_M = 3.0
 MIN_PICTURES = 4
 TAKEOVER_DELAY_S = 0.5
-"""Time after a takeover. Calls may still be executed within it."""
+"""Time after a takeover in which calls may still be executed."""
 
 
 def evaluate_run(site: FieldSite, run: Evidence) -> list[Expectation]:

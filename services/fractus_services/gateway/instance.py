@@ -39,11 +39,11 @@ RETURN_TIMEOUT_S = 5.0
 ROUTE_TIMEOUT_S = 30.0
 
 MISSION_POLL_S = 0.1
-"""Interval at which a mission looks whether the drone is armed, or at rest."""
+"""Interval at which the flight of a mission checks if the drone is armed, or at rest."""
 
 REST_MPS = 0.3
 REST_TIMEOUT_S = 5.0
-"""Speed below which the next item of a mission begins after a leg, and the maximum time to wait for it."""
+"""Speed below which the next item of a mission begins after a leg, and the maximum time to wait for this speed."""
 
 CONTROL_WAIT_S = 15.0
 """Time for which arming waits for control. Programs arm as soon as the telemetry looks ready."""
@@ -489,7 +489,7 @@ class Instance:
     async def _run_mission_call(
         self, client: MobilityClient, session: Session, call: Call, _setpoint: _Setpoint | None
     ) -> None:
-        """Judge an uploaded mission, or the rest of the stored one, and fly it."""
+        """Judge an uploaded mission, or judge and fly the rest of the stored mission."""
         flies = call.request.method == FLY_MISSION
         mission = self.missions.mission if flies else self.missions.with_items(call.request.message)
         try:
@@ -572,7 +572,7 @@ class Instance:
             self.send_text(mavlink.MAV_SEVERITY_WARNING, f"Mission stopped at item {mission.current}: {problem}")
 
     async def _perform(self, client: MobilityClient, request: Request) -> None:
-        """Make one call of the mission, and wait until its motion is complete. Repeat a call that has to wait.
+        """Make one call of the mission, and wait until its motion is complete. Repeat a call that the service defers.
 
         Raises:
             CallRefused: The call was refused.
@@ -604,7 +604,7 @@ class Instance:
             await self._come_to_rest()
 
     async def _come_to_rest(self) -> None:
-        """Wait until the drone does not move, because the next leg of a route was judged from rest."""
+        """Wait until the drone is at rest, because the next leg was judged for a drone at rest."""
         with suppress(TimeoutError):
             async with asyncio.timeout(REST_TIMEOUT_S):
                 while self.vehicle.speed_mps > REST_MPS:  # noqa: ASYNC110 - the vehicle has no notification
@@ -615,7 +615,7 @@ class Instance:
         return self._flight is not None and not self._flight.done()
 
     def _stop_flight(self) -> None:
-        """End the flight of the mission. Its current item stays the current one."""
+        """End the flight of the mission. The current item does not change."""
         if self._flight is not None:
             self._flight.cancel()
             self._flight = None

@@ -34,7 +34,7 @@ async def fly_mission(
     perform: Callable[[Request], Awaitable[None]],
     reports: MissionReports,
 ) -> None:
-    """Fly a mission from an item on, until it is complete.
+    """Fly a mission, beginning with a given item, until it is complete.
 
     An upload during the flight replaces the items. The mission then continues with the next number.
 

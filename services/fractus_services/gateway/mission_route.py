@@ -18,7 +18,7 @@ MAX_STEPS = 1000
 """Maximum number of items of a route, with repetitions. The request to the mobility service has a limited size."""
 
 JUDGED_REPETITIONS = 2
-"""Number of times that a jump is judged. Further repetitions fly the same legs as the second one."""
+"""Number of repetitions of a jump that are judged. Further repetitions fly the same legs as the second repetition."""
 
 _LEGS = frozenset(
     {
@@ -72,7 +72,7 @@ def check_item(item: Item) -> None:
         reason = f"{name}: altitudes above terrain are not supported; use MAV_FRAME_GLOBAL_RELATIVE_ALT"
         raise ItemRefused(mavlink.MAV_MISSION_UNSUPPORTED_FRAME, reason)
     if item.command in TAKEOFFS and item.frame not in RELATIVE_FRAMES:
-        reason = "the altitude of a takeoff is above home; use MAV_FRAME_GLOBAL_RELATIVE_ALT"
+        reason = "the altitude of a takeoff must be relative to home; use MAV_FRAME_GLOBAL_RELATIVE_ALT"
         raise ItemRefused(mavlink.MAV_MISSION_UNSUPPORTED_FRAME, reason)
     speed_types = {mavlink.SPEED_TYPE_AIRSPEED, mavlink.SPEED_TYPE_GROUNDSPEED}
     if item.command == mavlink.MAV_CMD_DO_CHANGE_SPEED and item.param1 not in speed_types:
@@ -93,7 +93,7 @@ def requests_of(item: Item, at: Place) -> tuple[list[Request], Place]:
 
     Args:
         item: Item that `check_item` accepts.
-        at: Place at which the item begins. Items without coordinates or altitude keep it.
+        at: Place at which the item begins. It replaces missing coordinates and a missing altitude of the item.
     """
     if item.command in _LEGS:
         at = _target(item, at)

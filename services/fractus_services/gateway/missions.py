@@ -103,7 +103,7 @@ class MissionLists:
         self.transfers.conclude(_MISSION, mavlink.MAV_MISSION_DENIED if problem else mavlink.MAV_MISSION_ACCEPTED)
 
     def with_items(self, items: list[Item]) -> Mission:
-        """Return a mission that consists of other items, at its beginning."""
+        """Return a mission with other items that has not begun."""
         mission = Mission()
         mission.store.items = items
         return mission
@@ -156,7 +156,7 @@ class MissionLists:
         return "outside the fence that the program has uploaded" if outside else ""
 
     def enable_fence(self, enabled: bool) -> bool:
-        """Switch the fence. Return False if there is no fence to enable."""
+        """Enable or disable the fence. Return False if there is no fence to enable."""
         if enabled and not self._shapes:
             return False
         self.fence_enabled = enabled

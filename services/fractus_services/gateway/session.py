@@ -420,7 +420,7 @@ class Session:
         self._report_current(self._missions.mission.current)
 
     def _report_current(self, number: int) -> None:
-        """Report the state of the mission. Clients expect the number that they have set."""
+        """Report the state of the mission. Clients wait for the item number that they have set."""
         report = self._missions.mission.report(self._vehicle.mode)
         self._channel.send("MISSION_CURRENT", {**report, "seq": number})
 

@@ -245,7 +245,7 @@ class CallAuthorizer:
     async def check_route(
         self, calls: Sequence[Call], grant_of: Callable[[], ActiveGrant]
     ) -> list[tuple[int, Verdict]]:
-        """Judge calls that would be made one after the other, each from rest at the place to which the call before leads.
+        """Judge calls that would be made one after the other, each for a drone at rest at the place to which the previous call leads.
 
         Args:
             calls: Calls in order.

@@ -18,7 +18,12 @@ from fractus_agent.agent_metrics import AgentMetrics
 from fractus_agent.grant_synchronizer import GrantDirectory, GrantSynchronizer, GrantVerifier
 from fractus_agent.identity import NodeIdentity
 from fractus_agent.links.link_manager import LinkManager
-from fractus_agent.registration.diagnostics import read_audit_heads, read_gateway_problem, read_recording_problems
+from fractus_agent.registration.diagnostics import (
+    read_audit_heads,
+    read_gateway_problem,
+    read_picture_counts,
+    read_recording_problems,
+)
 from fractus_agent.registration.node_object_file import NodeObjectFile
 from fractus_agent.registration.node_status import NodeObservation, StatusReporter
 from fractus_agent.registration.registration import Registration
@@ -50,6 +55,7 @@ class Agent:
             node,
             GrantVerifier(settings.tls).verify,
             refresh_authority=self._identity.refresh_authority,
+            pictures=partial(read_picture_counts, settings.state),
         )
         self._certificate_serial = 0
         self._object_file = NodeObjectFile(settings.node_object)

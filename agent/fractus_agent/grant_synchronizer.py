@@ -12,7 +12,16 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from fractus_core.api.grants import ENDED, MAX_MESSAGE, Grant, GrantPhase, GrantSpec, ReportedGrant, ReportedWaypoints
+from fractus_core.api.grants import (
+    ENDED,
+    MAX_MESSAGE,
+    Grant,
+    GrantPhase,
+    GrantSpec,
+    ReportedGrant,
+    ReportedPictures,
+    ReportedWaypoints,
+)
 from fractus_core.api.model import InvalidObject
 from fractus_core.control import Outcome, OutcomeKind, WaypointCounts
 from fractus_core.policy.grant_signatures import BadSignature, UnknownAuthority, read_authorities, verify
@@ -114,13 +123,16 @@ def mission_outcome(grant: Grant, missions: Mapping[str, Outcome]) -> tuple[Gran
     return (_OUTCOMES[outcome.kind], outcome.reason) if outcome is not None else None
 
 
-def grant_report(grant: Grant, missions: Mapping[str, Outcome], problem: str | None) -> ReportedGrant:
+def grant_report(
+    grant: Grant, missions: Mapping[str, Outcome], problem: str | None, pictures: ReportedPictures | None = None
+) -> ReportedGrant:
     """Return the report of a Grant.
 
     Args:
         grant: The Grant.
         missions: Outcomes of missions by mission key.
         problem: Reason why the Grant is not stored, otherwise None.
+        pictures: Pictures of the Application with the camera of this node. None if it requested no picture.
     """
     phase, message = mission_outcome(grant, missions) or ("Active", "")
     if problem is not None:
@@ -128,10 +140,12 @@ def grant_report(grant: Grant, missions: Mapping[str, Outcome], problem: str | N
         message = problem
     report = _report(grant.metadata.model_dump(by_alias=True), phase, message)
     outcome = missions.get(grant.spec.mission_key)
-    if phase not in ENDED or outcome is None or outcome.waypoints == WaypointCounts():
+    if phase not in ENDED or outcome is None:
         return report
-    counts = ReportedWaypoints.model_validate(asdict(outcome.waypoints))
-    return report.model_copy(update={"waypoints": counts})
+    waypoints = None
+    if outcome.waypoints != WaypointCounts():
+        waypoints = ReportedWaypoints.model_validate(asdict(outcome.waypoints))
+    return report.model_copy(update={"waypoints": waypoints, "pictures": pictures})
 
 
 def keep_final_phase(report: ReportedGrant, reported: ReportedGrant | None) -> ReportedGrant:
@@ -194,6 +208,7 @@ class GrantSynchronizer:
         node: Name of the node.
         check: Raises BadSignature or UnknownAuthority for a Grant that must not be stored.
         refresh_authority: Called when the authority that the node trusts may be outdated.
+        pictures: Returns the numbers of taken and refused pictures by mission key.
         monotonic: Returns seconds of a monotonic clock.
     """
 
@@ -205,6 +220,7 @@ class GrantSynchronizer:
         check: Callable[[Grant], None],
         *,
         refresh_authority: Callable[[], None] = lambda: None,
+        pictures: Callable[[], Mapping[str, tuple[int, int]]] = dict,
         monotonic: Callable[[], float] = time.monotonic,
     ) -> None:
         self._store = store
@@ -212,6 +228,7 @@ class GrantSynchronizer:
         self._node = node
         self._check = check
         self._refresh_authority = refresh_authority
+        self._pictures = pictures
         self._monotonic = monotonic
         self._unverified: dict[str, tuple[Object, float]] = {}
         self._grants: dict[str, Grant] = {}
@@ -295,8 +312,12 @@ class GrantSynchronizer:
 
     async def report_once(self) -> None:
         """Report all Grants if a report has changed."""
+        pictures = self._pictures_by_application() if self._missions else {}
         current = {
-            name: grant_report(grant, self._missions, self._unstored.get(name)) for name, grant in self._grants.items()
+            name: grant_report(
+                grant, self._missions, self._unstored.get(name), pictures.get(grant.spec.application.uid)
+            )
+            for name, grant in self._grants.items()
         } | self._unusable
         reports = {
             report.uid: keep_final_phase(report, self._reported.get(report.uid))
@@ -311,6 +332,20 @@ class GrantSynchronizer:
                 log.info("grants: reported (grant=%s phase=%s): %s", report.name, report.phase, report.message or "-")
         self._reported_generation = self._generation
         self._reported = reports
+
+    def _pictures_by_application(self) -> dict[str, ReportedPictures]:
+        """Return the pictures that were requested under the present Grants, by uid of their Application."""
+        counted = self._pictures()
+        pictures: dict[str, ReportedPictures] = {}
+        for grant in self._grants.values():
+            counts = counted.get(grant.spec.mission_key)
+            if counts is None:
+                continue
+            before = pictures.get(grant.spec.application.uid, ReportedPictures(taken=0, refused=0))
+            pictures[grant.spec.application.uid] = ReportedPictures(
+                taken=before.taken + counts[0], refused=before.refused + counts[1]
+            )
+        return pictures
 
     def _put(self, body: Object) -> None:
         name = body["metadata"]["name"]

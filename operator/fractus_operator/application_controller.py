@@ -288,7 +288,9 @@ class ApplicationController:
         """Return the record of a mission that is over according to its Grants, or None."""
         outcome = mission_outcome(observed.uid, observed.grants) or shared_flight_outcome(flown, observed.host[1])
         if outcome is not None:
-            return status.mission_record(outcome, observed.pods)
+            return status.mission_record(
+                outcome, observed.pods, status.reported_pictures(observed.uid, observed.grants)
+            )
         # Earlier releases recorded the outcome only in the status. Anyone could have edited the status, so the mission counts as
         # over only if nothing remains that could fly it.
         if flown.drone is not None and flown.drone.shared_with is None:

@@ -9,7 +9,7 @@ from typing import Any, Literal, assert_never
 
 from fractus_core.api import Condition, Drone, Grant
 from fractus_core.api.conditions import ConditionUpdate
-from fractus_core.api.grants import ReportedWaypoints
+from fractus_core.api.grants import ReportedPictures, ReportedWaypoints
 from fractus_core.api.plans import DeploymentPlanSpec, MissionRecord
 from fractus_core.control import Outcome, OutcomeKind, WaypointCounts
 
@@ -174,17 +174,27 @@ def reports_outcome(uid: str | None, grant: Grant) -> bool:
     return spec.application.uid == uid and (spec.class_ == "driver" or bool(spec.tour))
 
 
-def mission_record(outcome: Outcome, pods: Sequence[PodView] = ()) -> MissionRecord:
+def reported_pictures(uid: str | None, grants: Iterable[Grant]) -> ReportedPictures | None:
+    """Return the pictures of the Application with this uid, which the node that reports its outcome has counted."""
+    reports = (grant.status for grant in grants if reports_outcome(uid, grant))
+    return next((report.pictures for report in reports if report is not None and report.pictures is not None), None)
+
+
+def mission_record(
+    outcome: Outcome, pods: Sequence[PodView] = (), pictures: ReportedPictures | None = None
+) -> MissionRecord:
     """Return the record of a mission that is over.
 
     Args:
         outcome: Outcome of the mission.
         pods: Pods of the Application. After an incomplete mission, their problems are recorded because the pods are deleted now.
+        pictures: Pictures that the Application requested, if any.
     """
     problems = "" if outcome.kind is OutcomeKind.COMPLETE else _problems(pods)
-    message = "; ".join(filter(None, (outcome.reason, str(outcome.waypoints), problems)))
+    photographed = f"{pictures.taken} pictures taken, {pictures.refused} refused" if pictures is not None else ""
+    message = "; ".join(filter(None, (outcome.reason, str(outcome.waypoints), photographed, problems)))
     counts = ReportedWaypoints(**asdict(outcome.waypoints)) if str(outcome.waypoints) else None
-    return MissionRecord(outcome=_OUTCOMES[outcome.kind], message=message, waypoints=counts)
+    return MissionRecord(outcome=_OUTCOMES[outcome.kind], message=message, waypoints=counts, pictures=pictures)
 
 
 def _counts(reported: ReportedWaypoints | None) -> WaypointCounts:

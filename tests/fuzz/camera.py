@@ -26,13 +26,14 @@ with atheris.instrument_imports(include=["fractus_services.camera"]):
     from fractus_services.camera.image_authorization import ImageAuthorizer
     from fractus_services.camera.image_capture import ImageCapture
     from fractus_services.camera.image_store import ImageStore
-    from fractus_services.camera.stored_images import StoredImages
+    from fractus_services.camera.picture_counts import PictureCounts
 import numpy as np
 from camera_world import Drone, Finder, active_grant, private
 from fractus_proto.v1 import camera_pb2, camera_pb2_grpc
 from fractus_services.camera.camera_properties import CameraProperties
 from fractus_services.camera.drivers.driver import CameraFailed, CaptureRequest
 from fractus_services.camera.pixels import Pixels, limit_width
+from fractus_services.camera.stored_images import StoredImages
 from fractus_services.grant_files import ActiveGrant
 from fractus_services.grpc_server import CallAdmission
 from mobility_world import Grants
@@ -91,7 +92,7 @@ class Service:
         admission = CallAdmission(self.grants, time.time)  # type: ignore[arg-type]
         handlers = CameraHandlers(
             ImageCapture(self.drone, self.shutter, CameraProperties((64, 48)), capture_queue=FairQueue(4, 8), **shared),  # type: ignore[arg-type]
-            StoredImages(self.drone, **shared), admission,
+            StoredImages(self.drone, **shared), admission, PictureCounts(FOLDER / "picture-counts.json", tuple),
         )  # fmt: skip
         registry = Registry(admission)
         camera_pb2_grpc.add_CameraServiceServicer_to_server(handlers, registry)

@@ -217,6 +217,8 @@ async def test_later_policy_applies_to_stored_pictures(rig: Rig) -> None:
     assert (status, why.code) == (grpc.StatusCode.PERMISSION_DENIED, "PrivacyZone")
     status, why = await denied(capture(camera))
     assert (status, why.code, list(why.policies)) == (grpc.StatusCode.PERMISSION_DENIED, "PrivacyZone", ["privacy"])
+    counts = json.loads((rig.directory / "pictures" / "picture-counts.json").read_text())
+    assert list(counts.values()) == [[2, 1]], "taken and refused pictures"
 
 
 @pytest.fixture

@@ -18,7 +18,7 @@ from fractus_agent.grant_synchronizer import (
     serialize_grant,
 )
 from fractus_agent.store import GrantList, KubeError, Store
-from fractus_core.api.grants import Grant, ReportedGrant, ReportedWaypoints, pack
+from fractus_core.api.grants import Grant, ReportedGrant, ReportedPictures, ReportedWaypoints, pack
 from fractus_core.control import Outcome, OutcomeKind, WaypointCounts
 from fractus_core.policy.grant_signatures import BadSignature, UnknownAuthority
 from fractus_runtime.backoff import Backoff
@@ -425,6 +425,24 @@ async def test_stored_grant_survives_unknown_authority_and_agent_restart(
     await resigned.report_once()
     assert on_disk(tmp_path) == {"g1.json"}
     assert store.phases()[-1] == "Active"
+
+
+async def test_report_of_an_ended_mission_contains_pictures_of_all_instances_of_the_application(
+    store: FakeStore, tmp_path: Path
+) -> None:
+    viewer = manifest("g2", uid="u2", spec={"component": "Viewer", "instance": "app-viewer"})
+    other = manifest("g3", uid="u3", spec={"application": {"namespace": "default", "name": "other", "uid": "b"}})
+    key = Grant.from_body(viewer).spec.mission_key
+    foreign = Grant.from_body(other).spec.mission_key
+    counts = {KEY: (2, 0), key: (5, 1), foreign: (7, 7), "removed": (9, 9)}
+    synchronizer = GrantSynchronizer(store, GrantDirectory(tmp_path), "drone-1", accept, pictures=lambda: counts)
+    synchronizer.apply(grant_list(manifest("g1"), viewer, other))
+    await synchronizer.report_once()
+    synchronizer.set_missions({KEY: COMPLETE})
+    await synchronizer.report_once()
+    reported = [{name: report.pictures for name, report in reports.items()} for reports in store.reports]
+    assert reported[0] == {"g1": None, "g2": None, "g3": None}
+    assert reported[1] == {"g1": ReportedPictures(taken=7, refused=1), "g2": None, "g3": None}
 
 
 async def test_grants_stay_stored_while_the_api_server_is_unreachable_for_a_month(

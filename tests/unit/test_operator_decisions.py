@@ -329,6 +329,17 @@ def test_completed_status_contains_waypoint_counts_of_the_grant() -> None:
     assert [c.type for c in update.conditions] == ["Ready", "MissionComplete"]
 
 
+def test_completed_status_contains_counts_of_pictures() -> None:
+    body = grant("Complete").to_dict()
+    body["status"]["pictures"] = {"taken": 12, "refused": 3}
+    granted = [Grant.from_body(body)]
+    outcome = mission_outcome("u1", granted)
+    assert outcome is not None
+    record = status.mission_record(outcome, pictures=status.reported_pictures("u1", granted))
+    assert status.over(record, "d", None).message == "because; 12 pictures taken, 3 refused"
+    assert status.reported_pictures("other", granted) is None
+
+
 def test_completed_mission_with_skipped_waypoints_is_partial() -> None:
     outcome = Outcome(OutcomeKind.COMPLETE, "done", WaypointCounts(reached=3, skipped=1))
     update = status.over(status.mission_record(outcome), "d", None)

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 from fractus_core.api import grants
-from fractus_core.api.grants import NODE_GRANTS_NAMESPACE, ReportedGrant, unpack
+from fractus_core.api.grants import NODE_GRANTS_NAMESPACE, ReportedGrant, ReportedPictures, unpack
 from fractus_operator import kinds
 from fractus_operator.cache import ClusterCache
 from fractus_operator.kinds import Body, Kind
@@ -34,6 +34,11 @@ def report(phase: Any, message: str = "", generation: int = 1, uid: str = "u") -
             {"phase": "Active", "message": "", "observedGeneration": 1, "conditions": []},
             report("Complete", "flown", 2),
             {"phase": "Complete", "message": "flown", "observedGeneration": 2},
+        ),
+        (
+            None,
+            report("Complete").model_copy(update={"pictures": ReportedPictures(taken=2, refused=1)}),
+            {"phase": "Complete", "message": "", "pictures": {"taken": 2, "refused": 1}, "observedGeneration": 1},
         ),
         ({"phase": "Complete", "message": "flown", "observedGeneration": 1}, report("Active"), None),
         (

@@ -1,4 +1,4 @@
-"""Diagnostics that the node's services leave in files: heads of audit logs, recording problems, and problems of the gateway."""
+"""Diagnostics that the node's services leave in files: heads of audit logs, recording problems, problems of the gateway, and counts of pictures."""
 
 from __future__ import annotations
 
@@ -38,6 +38,18 @@ def read_recording_problems(state: Path) -> list[str]:
         if problem:
             problems.append(f"{path_text(path.parent.name)}: {problem}")
     return problems
+
+
+def read_picture_counts(state: Path) -> dict[str, tuple[int, int]]:
+    """Return the numbers of taken and refused pictures by key of the Grant, from the file of the node's camera service.
+
+    The result is empty if there is no valid file.
+    """
+    try:
+        counts = read_json(state / "camera" / "picture-counts.json", _MAX_BYTES)
+        return {str(key): (max(0, int(taken)), max(0, int(refused))) for key, (taken, refused) in counts.items()}
+    except (OSError, ValueError, TypeError, AttributeError):
+        return {}
 
 
 def read_gateway_problem(state: Path) -> str:

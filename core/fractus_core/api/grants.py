@@ -206,6 +206,16 @@ class ReportedWaypoints(OpenModel):
 _WAYPOINTS = "Numbers of reached, skipped and corrected waypoints, after the end of the mission. Missing if the service has not reported them."
 
 
+class ReportedPictures(OpenModel):
+    """Numbers of pictures that the components of an Application requested from the camera of the drone."""
+
+    taken: int = Field(ge=0, description="Pictures that were taken.")
+    refused: int = Field(ge=0, description="Requests that a policy or the rights of the component refused.")
+
+
+_PICTURES = "Pictures that the Application requested from the drone's camera until the end of the mission. Missing without a request."
+
+
 class GrantStatus(OpenModel):
     """State of the Grant on its node."""
 
@@ -215,6 +225,7 @@ class GrantStatus(OpenModel):
     )
     message: str | None = Field(default=None, description="Human-readable explanation.")
     waypoints: ReportedWaypoints | None = Field(default=None, description=_WAYPOINTS)
+    pictures: ReportedPictures | None = Field(default=None, description=_PICTURES)
     observed_generation: ObservedGeneration = None
     conditions: Conditions = ()
 
@@ -273,6 +284,7 @@ class ReportedGrant(OpenModel):
     phase: GrantPhase = Field(description="Pending until the node has stored the Grant; then the state of its mission.")
     message: str = Field(default="", max_length=MAX_MESSAGE, description="Human-readable explanation.")
     waypoints: ReportedWaypoints | None = Field(default=None, description=_WAYPOINTS)
+    pictures: ReportedPictures | None = Field(default=None, description=_PICTURES)
     observed_generation: Annotated[
         int, Field(ge=0, description="metadata.generation of the Grant that this state describes.")
     ]

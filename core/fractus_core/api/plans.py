@@ -11,7 +11,7 @@ from fractus_core.api.components import (
     Placement,
 )
 from fractus_core.api.geometry import Position
-from fractus_core.api.grants import ReportedWaypoints
+from fractus_core.api.grants import ReportedPictures, ReportedWaypoints
 from fractus_core.api.model import AGE, Model, Resource
 
 Role = Literal["drone", "static", "hybrid-edge", "hybrid-drone", "cloud"]
@@ -136,6 +136,10 @@ class MissionRecord(Model):
     waypoints: ReportedWaypoints | None = Field(
         default=None,
         description="Numbers of reached, skipped and corrected waypoints. Missing if the node has not reported them.",
+    )
+    pictures: ReportedPictures | None = Field(
+        default=None,
+        description="Pictures that the Application requested from the drone's camera. Missing without a request.",
     )
     landed: bool = Field(
         default=False, description="True if the drone was on the ground at the outcome, or has landed since."

@@ -69,6 +69,8 @@ def reported_status(observed: Body, report: ReportedGrant) -> Body | None:
     status: Body = {"phase": report.phase, "message": report.message}
     if report.waypoints is not None:
         status["waypoints"] = report.waypoints.model_dump(mode="json", by_alias=True)
+    if report.pictures is not None:
+        status["pictures"] = report.pictures.model_dump(mode="json", by_alias=True)
     if known.get("phase") in ENDED:
         status = {"phase": known["phase"], "message": known.get("message") or ""}
     status["observedGeneration"] = report.observed_generation

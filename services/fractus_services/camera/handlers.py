@@ -16,9 +16,10 @@ from grpc.aio import ServicerContext
 from fractus_services.auth import Caller
 from fractus_services.camera.image_capture import ImageCapture
 from fractus_services.camera.image_store import ImageRecord, NoSuchImage, owner_of
+from fractus_services.camera.picture_counts import PictureCounts
 from fractus_services.camera.stored_images import StoredImages
 from fractus_services.error_details import decision
-from fractus_services.errors import ResourceExhausted
+from fractus_services.errors import PolicyDenied, ResourceExhausted
 from fractus_services.grpc_server import CallAdmission
 
 CHUNK_BYTES = 256 * 1024
@@ -28,10 +29,13 @@ READ_BYTES = 4 * CHUNK_BYTES
 class CameraHandlers(camera_pb2_grpc.CameraServiceServicer):
     """Servicer of `CameraService`. Methods are documented in camera.proto."""
 
-    def __init__(self, capture: ImageCapture, stored: StoredImages, admission: CallAdmission) -> None:
+    def __init__(
+        self, capture: ImageCapture, stored: StoredImages, admission: CallAdmission, counts: PictureCounts
+    ) -> None:
         self._capture = capture
         self._stored = stored
         self._admission = admission
+        self._counts = counts
 
     @asynccontextmanager
     async def _call(self, context: ServicerContext) -> AsyncIterator[Caller]:
@@ -48,7 +52,12 @@ class CameraHandlers(camera_pb2_grpc.CameraServiceServicer):
         async with self._call(context) as caller:
             grant = self._admission.grant_of(caller)
             args = CaptureArgs(request.width, request.height)
-            verdict, record = await self._capture.capture(grant, args, lambda: self._admission.grant_of(caller))
+            try:
+                verdict, record = await self._capture.capture(grant, args, lambda: self._admission.grant_of(caller))
+            except PolicyDenied:
+                self._counts.count(grant.key, refused=True)
+                raise
+            self._counts.count(grant.key, refused=False)
             located = self._stored.locates(self._admission.grant_of(caller), record)
             return camera_pb2.CaptureImageResponse(decision=decision(verdict), image=_image_info(record, located))
 

@@ -27,6 +27,7 @@ from fractus_services.camera.handlers import CameraHandlers
 from fractus_services.camera.image_authorization import ImageAuthorizer
 from fractus_services.camera.image_capture import ImageCapture
 from fractus_services.camera.image_store import ImageStore, owner_of
+from fractus_services.camera.picture_counts import PictureCounts
 from fractus_services.camera.pose import FixedPose, PoseProvider
 from fractus_services.camera.pose_history import PoseHistory
 from fractus_services.camera.settings import CameraSettings
@@ -86,6 +87,7 @@ class _Components:
     grants: GrantFiles
     authorizer: ImageAuthorizer
     store: ImageStore
+    counts: PictureCounts
     pose_metrics: _PoseMetrics
 
 
@@ -125,7 +127,8 @@ async def run(settings: CameraSettings, stop: asyncio.Event) -> None:
         on_added=recorder.take_picture,
     )
     authorizer = ImageAuthorizer(audit, create_detector(settings))
-    components = _Components(settings, node, clock, tls, grants, authorizer, store, _PoseMetrics())
+    counts = PictureCounts(settings.picture_counts, lambda: [grant.key for grant in grants.active.values()])
+    components = _Components(settings, node, clock, tls, grants, authorizer, store, counts, _PoseMetrics())
     metrics.add_callback(
         partial(common_metrics, BackgroundReader(tls.expires_s), grants, audit, lambda: recorder.problem)
     )
@@ -197,7 +200,8 @@ async def _serve(components: _Components, description: NodeDescription, stop: as
         authorizer=components.authorizer,
         clock=clock,
     )
-    register = partial(camera_pb2_grpc.add_CameraServiceServicer_to_server, CameraHandlers(capture, stored, admission))
+    handlers = CameraHandlers(capture, stored, admission, components.counts)
+    register = partial(camera_pb2_grpc.add_CameraServiceServicer_to_server, handlers)
     parts.append(serve_grpc("camera", settings.listen, components.tls, register, admission, node=components.node))
     await run_until(ended, *parts)
     shutter.close()

@@ -49,3 +49,8 @@ class CameraSettings(ServiceOptions):
     max_unrecorded_images: int = 16
     telemetry_interval_s: float = 0.1
     telemetry_retry_s: float = 1.0
+
+    @property
+    def picture_counts(self) -> Path:
+        """File with the numbers of taken and refused pictures of each Grant. The agent reads it."""
+        return self.state / "picture-counts.json"

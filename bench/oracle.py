@@ -22,6 +22,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "component"))
 
 from harness import Progress, Report, parser
+from mavlink_requests import MavlinkRequests
 from parameter_faults import parameter_faults
 from policy_flights import Tally, flights
 from position_fault_flights import PositionFaultFlights
@@ -40,6 +41,12 @@ def main() -> int:
     arguments = parser(__doc__, quick="3,000 cases")
     arguments.add_argument("--cases", type=int, default=1_000_000, help="number of requests to evaluate and fly")
     arguments.add_argument("--seed", type=int, default=1, help="seed of the first batch of drones; each batch adds one")
+    arguments.add_argument(
+        "--mavlink",
+        action="store_true",
+        help="send the requests as MAVLink messages in random frames and masks through the gateway, and compare each request"
+        " with the meaning of its message",
+    )
     options = arguments.parse_args()
     cases = 3000 if options.quick else options.cases
     progress = Progress(cases)
@@ -49,9 +56,14 @@ def main() -> int:
     while total.requests < cases:
         returns = ReturnFlights(seed, HOME_EVERY)
         faults = PositionFaultFlights(seed, FAULT_EVERY)
+        source = MavlinkRequests() if options.mavlink else None
         batch = flights(
-            seed, DRONES, requests=REQUESTS, watch_every=WATCH_EVERY, watched=WATCHED, returns=returns, faults=faults
-        )
+            seed, DRONES, requests=REQUESTS, watch_every=WATCH_EVERY, watched=WATCHED, returns=returns, faults=faults,
+            source=source,
+        )  # fmt: skip
+        if source is not None:
+            batch.wrong += source.wrong
+            batch.requests += source.refused
         batch.wrong += parameter_faults(seed, VEHICLES)
         vehicles += VEHICLES
         total.add(batch)

@@ -648,6 +648,7 @@ def flights(
     watched: int = 1,
     returns: Returns | None = None,
     faults: Faults | None = None,
+    source: Source | None = None,
 ) -> Tally:
     """Fly a fleet through random scenes, each drone with several requests, and report violations.
 
@@ -660,6 +661,7 @@ def flights(
         watched: The monitor checks every `watched`-th drone.
         returns: Return flights, or None.
         faults: Faults of the position, or None.
+        source: Source of the requests. None for random requests of the SDK.
     """
     rng = np.random.default_rng(seed)
     scenes = [s for s in (scene(rng) for _ in range(math.ceil(count / shared))) for _ in range(shared)][:count]
@@ -671,7 +673,7 @@ def flights(
     for turn in range(requests):
         if turn:
             _change(fleet, tally, permitted, exempt, generator)
-        flown = _request_all(fleet, tally, permitted, rng, watched if watch_every else 0)
+        flown = _request_all(fleet, tally, permitted, rng, watched if watch_every else 0, source)
         called_s = (
             fleet.time_s + generator.uniform(1.5, 8.0) if returns is not None and turn == requests - 1 else math.inf
         )
@@ -714,6 +716,13 @@ class Faults(Protocol):
 
     def fly(self, fleet: Fleet, exempt: Flags, tally: Tally) -> None:
         """Let the position of some flying drones fail."""
+
+
+class Source(Protocol):
+    """Source of random requests."""
+
+    def request(self, rng: np.random.Generator, place: Scene, now: Situation) -> Call | None:
+        """Return a request of a drone, or None for no request."""
 
 
 class Returns(Protocol):
@@ -765,15 +774,24 @@ def measured(fleet: Fleet, tally: Tally, flown: Flown, exempt: Flags) -> None:
             tally.stopped.append(f"{fleet.time_s:.2f} s, drone {i}: {verdict} at {now} after {request}")
 
 
-def _request_all(fleet: Fleet, tally: Tally, permitted: list[str], rng: np.random.Generator, watched: int) -> Flown:
+def _request_all(
+    fleet: Fleet, tally: Tally, permitted: list[str], rng: np.random.Generator, watched: int, source: Source | None
+) -> Flown:
     """Make one request per drone. Return the drones to monitor, except those that the monitor would stop already."""
     flown: Flown = {}
     legs: list[tuple[int, GotoArgs]] = []
     near = vicinity(fleet).any(axis=1)
     for i, place in enumerate(fleet.scenes):
-        call = fleet.last_calls[i] = _repeated(rng, fleet.last_calls[i]) or _request(rng, place)
+        call: Call | None = None
+        if source is None:
+            call = _repeated(rng, fleet.last_calls[i]) or _request(rng, place)
         measured = bool(rng.random() < 0.5)
         now = fleet.situation(i, measured=measured)
+        if source is not None:
+            call = source.request(rng, place, now)
+        if call is None:
+            continue
+        fleet.last_calls[i] = call
         verdict = judge(call, now, place.grant)
         tally.requests += 1
         tally.permitted += verdict.permits

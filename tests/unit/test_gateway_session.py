@@ -338,6 +338,23 @@ def test_each_message_is_counted_with_its_verdict() -> None:
     assert len(world.verdicts) == 8
 
 
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"x": math.nan, "y": HOME[1]},
+        {"x": HOME[0], "y": math.inf},
+        {"x": 1e30, "y": HOME[1]},
+        {"x": HOME[0], "y": HOME[1], "frame": mavlink.MAV_FRAME_MISSION},
+    ],
+)
+def test_guided_item_without_usable_place_is_refused(values: dict[str, Any]) -> None:
+    world = World()
+    item = {"current": 2, "command": mavlink.MAV_CMD_NAV_WAYPOINT, "frame": 3, "z": 20.0, "target_system": 1}
+    assert world.send("MISSION_ITEM", **item | values) == []
+    (ack,) = (m for m in world.sent() if m.name == "MISSION_ACK")
+    assert ack.integer("type") == mavlink.MAV_MISSION_DENIED
+
+
 # Hostile input
 
 _KINDS = sorted(mavlink.mavlink_map.values(), key=lambda kind: kind.id)

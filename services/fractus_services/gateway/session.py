@@ -19,7 +19,6 @@ from fractus_services.gateway.translate import Request, Untranslatable
 from fractus_services.gateway.virtual_vehicle import DESCENTS, VirtualVehicle
 from fractus_services.mavlink_server.channel import PARAMETERS_PER_TICK, Channel
 from fractus_services.mavlink_server.coordinates import RELATIVE_FRAMES
-from fractus_services.mavlink_server.mission_items import item_from
 from fractus_services.mavlink_server.stream_groups import ALL_GROUPS, GROUPS
 
 MAX_FRAMES_PER_S = 1000.0
@@ -427,18 +426,18 @@ class Session:
     def _guided_item(self, message: Message, source: Source, now: float) -> list[Call]:
         """Return the call for a MISSION_ITEM with `current` 2 (target) or 3 (altitude)."""
         current = message.integer("current")
-        item = item_from(message)
         try:
             self._require_guided()
-            if item.command != mavlink.MAV_CMD_NAV_WAYPOINT:
+            if message.integer("command") != mavlink.MAV_CMD_NAV_WAYPOINT:
                 raise Untranslatable("a guided target must be a NAV_WAYPOINT")
-            x, y = item.x, item.y
-            if current == 3:
+            if current == 2:
+                x, y = _coordinates_e7(message)
+            else:
                 pose = self._vehicle.pose(now)
                 if pose is None:
                     raise Untranslatable("the drone's position is not known")
                 x, y = round(pose.lat * 1e7), round(pose.lon * 1e7)
-            request = translate.place_target(item.frame, x, y, message.real("z"))
+            request = translate.place_target(message.integer("frame"), x, y, message.real("z"))
         except Untranslatable:
             self._send_mission_ack(source, mavlink.MAV_MISSION_DENIED)
             raise
@@ -781,6 +780,16 @@ def _fields_of(message: Message) -> _CommandFields:
     x, y, z = (message.real(field_name) for field_name in place)
     frame = message.integer("frame") if message.name == "COMMAND_INT" else None
     return _CommandFields(message.integer("command"), (params[0], params[1], params[2], params[3]), x, y, z, frame)
+
+
+def _coordinates_e7(message: Message) -> tuple[int, int]:
+    """Return latitude and longitude of a MISSION_ITEM or MISSION_ITEM_INT in 1e-7 degrees."""
+    lat, lon = message.real("x"), message.real("y")
+    if message.name == "MISSION_ITEM":
+        lat, lon = lat * 1e7, lon * 1e7
+    if not (math.isfinite(lat) and math.isfinite(lon)):
+        raise Untranslatable("latitude or longitude is not a number")
+    return round(lat), round(lon)
 
 
 def _mode_number(fields: _CommandFields) -> int:

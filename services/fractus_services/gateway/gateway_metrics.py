@@ -42,7 +42,7 @@ class GatewayMetrics:
         self._instances = instances
         self._messages = Counter(
             "fractus_gateway_messages_total",
-            "Messages of programs: verdict on the call (allow, correct, deny), or decision of the gateway (respond, consume, refuse). A target that a later one replaces before its verdict is not counted.",
+            "Messages of programs: verdict on the call (allow, correct, deny), or decision of the gateway (respond, consume, refuse). A target that is replaced by a later target before its verdict is not counted.",
             ["verdict"],
             registry=None,
         )

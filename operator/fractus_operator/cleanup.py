@@ -290,7 +290,7 @@ def owned_by(uids: Collection[str], body: Body) -> bool:
 
 
 def _of_instances(instances: Collection[str]) -> Callable[[Body], bool]:
-    """Return a test if an object belongs to one of the instances."""
+    """Return a function that returns True if an object belongs to one of the instances."""
     return lambda body: body["metadata"]["labels"].get(INSTANCE_LABEL) in instances
 
 

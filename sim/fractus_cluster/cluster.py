@@ -180,7 +180,7 @@ class Cluster:
         Raises:
             PrerequisiteError: The machine lacks a requirement.
             ClusterError: A part did not start, and the message names its log. Or a vehicle whose arguments changed is
-                armed, and nothing was changed.
+                armed. Nothing is changed in the second case.
         """
         started = time.monotonic()
         check_root()

@@ -110,7 +110,7 @@ def spawn(
             raise ClusterError(f"cannot start {words[0]}: {error}") from error
     # The child is not reaped yet, so its pid cannot be reused.
     record = record_of(process.pid)
-    process.returncode = 0  # prevents subprocess from waiting for the process, and from a ResourceWarning
+    process.returncode = 0  # subprocess then neither waits for the process nor emits a ResourceWarning
     if record is None:
         raise ClusterError(f"{words[0]} ended immediately; see {log}")
     return record

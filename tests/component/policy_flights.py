@@ -308,7 +308,7 @@ class Fleet:
     rng: np.random.Generator
     scenes: list[Scene]
     place: Floats = field(init=False)
-    """East, north and up in metres, in the position controller."""
+    """Position in the vehicle's position controller: metres east, north and up."""
     speed: Floats = field(init=False)
     accel: Floats = field(init=False)
     airframes: list[Airframe] = field(init=False)

@@ -1,7 +1,7 @@
 """Positions of the nodes of an inventory: spatial queries, drones by depot, cloud hosts.
 
-The operator keeps these indexes with its inventory and updates them for each changed node. So a plan examines few of many
-nodes.
+The operator keeps these indexes with its inventory and updates them for each changed node. Planning therefore examines only
+a few of many nodes.
 """
 
 from __future__ import annotations

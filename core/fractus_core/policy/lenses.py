@@ -65,11 +65,11 @@ def _corner(angle: float, aspect: float) -> tuple[float, float] | None:
 
 
 def _any_lens(half: float, aspect: float) -> tuple[float, float] | None:
-    """Return bounds for every rotationally symmetric lens that shows at its corners at most as much as an orthographic fisheye.
+    """Return bounds for every rotationally symmetric lens whose corners show at most as much as an orthographic fisheye.
 
-    Of all lenses with the same angle at their sides, an orthographic fisheye compresses the outer parts most. The
-    bounds therefore cover pinholes, the other fisheyes (stereographic, equidistant, equisolid) and real lenses in the
-    Brown-Conrady model. Only the angle of rays closer to the middle is known: it is smaller than that of the sides.
+    Of all lenses with the same angle at their sides, an orthographic fisheye has the largest angle at its corners. The bounds
+    therefore also apply to pinholes, to the other fisheyes (stereographic, equidistant, equisolid) and to real lenses in the
+    Brown-Conrady model. Of rays closer to the middle, only an upper bound of the angle is known: the angle at the sides.
     """
     sine = math.sin(half) * math.hypot(1.0, aspect)
     corner = _corner(math.asin(sine), aspect) if sine < 1.0 else None

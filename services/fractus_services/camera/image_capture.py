@@ -216,7 +216,7 @@ class ImageCapture:
             if verdict.filters:
                 # The metadata of a filtered image would disclose where it was taken.
                 return data
-            # For other lenses than a pinhole, the pose contains an upper bound of the field of view, which gives no focal length.
+            # For other lenses than a pinhole, the pose contains only an upper bound of the field of view. The focal length is unknown.
             view_px = full_size[0] if camera.pinhole else None
             return with_metadata(
                 data, poses[-1], time_s=time_s, camera=camera.model, view_width_px=view_px, located=located

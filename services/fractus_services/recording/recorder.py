@@ -303,7 +303,7 @@ class Recorder:
         self._lost = 0
         self._problem = ""
         self._problem_file = problem_file
-        # Remove the problem of an earlier process.
+        # Remove the problem file of an earlier process.
         self._set_problem("")
         self._busy_since_s: float | None = None
         self._retry_at_s = 0.0

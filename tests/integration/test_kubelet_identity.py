@@ -9,7 +9,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
-from control_plane import ControlPlane
+from control_plane import ControlPlane, wait_for
 from fractus_core.api import KINDS
 from fractus_core.identity.authority import Authority
 from fractus_runtime.kubernetes import BlockingClient, KubeError, with_certificate
@@ -37,6 +37,16 @@ def pod_on(world: World, namespace: str) -> Callable[..., Body]:
     return make
 
 
+def permitted(attempt: Callable[[], object]) -> bool:
+    """Return True if the API server permits a request. It receives pods through a watch, with a delay."""
+    try:
+        attempt()
+    except KubeError as error:
+        assert error.status in (403, 404), error
+        return False
+    return True
+
+
 def test_kubelet_has_no_access_to_objects_of_fractus(world: World, kubelet: BlockingClient, namespace: str) -> None:
     for kind in KINDS:
         scope = f"/namespaces/{namespace}" if kind.NAMESPACED else ""
@@ -60,7 +70,7 @@ def test_kubelet_reads_only_certificates_of_its_pods(
         world.api.apply(f"{secrets}/{name}", secret)
     for name, node in (("mine", "drone-1"), ("theirs", "edge-1")):
         pod_on(node, volumes=[{"name": "tls", "secret": {"secretName": name}}])
-    assert kubelet.get(f"{secrets}/mine") is not None
+    wait_for(lambda: permitted(lambda: kubelet.get(f"{secrets}/mine")), "the API server to receive the pod of drone-1")
     denied(lambda: kubelet.get(f"{secrets}/theirs"), "no relationship found")
     denied(lambda: kubelet.get(f"/api/v1/namespaces/{SYSTEM}/secrets/fractus-ca"), "no relationship found")
     denied(lambda: kubelet.list(secrets), "cannot list")
@@ -76,7 +86,7 @@ def test_kubelet_gets_only_tokens_of_its_agent(
 
     own_pod, other_pod = (pod_on(node, SYSTEM, serviceAccountName="fractus-node") for node in ("drone-1", "edge-1"))
     operator = pod_on("cloud-1", SYSTEM, serviceAccountName="fractus-operator")
-    assert token("fractus-node", own_pod)
+    wait_for(lambda: permitted(lambda: token("fractus-node", own_pod)), "the API server to receive the pod of drone-1")
     denied(lambda: token("fractus-node", other_pod), "pod")
     denied(lambda: token("fractus-operator", operator), "forbidden")
     denied(lambda: token("fractus-operator", own_pod), "forbidden")

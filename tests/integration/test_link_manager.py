@@ -160,7 +160,7 @@ def test_instances_are_isolated_without_a_radio(world: World) -> None:
     edge.plan(link)
     edge.start()
     until(lambda: not drone.reaches(edge.pod, VIP.port), "the agent to block the node's access to the pod", world)
-    assert edge.condition("app-d1-e1", "PeerReady")["reason"] == "DeviceMissing"
+    until(lambda: edge.condition("app-d1-e1", "PeerReady").get("reason") == "DeviceMissing", "DeviceMissing", world)
     edge.regain_radio()
     drone.plan(link)
     drone.start()
@@ -198,10 +198,10 @@ def test_second_drone_waits_for_a_busy_edge_node(world: World) -> None:
     until(lambda: second.status("app-d2-e1").get("reason") == "PairingFailed", "the reason PairingFailed", world)
     assert clients[1].last_server == "cloud"
     assert clients[0].last_server == "e1"
-    assert edge.condition("app-d2-e1", "PeerReady")["reason"] == "Busy"
+    until(lambda: edge.condition("app-d2-e1", "PeerReady").get("reason") == "Busy", "the reason Busy", world)
     first.plan()
     until(lambda: clients[1].last_server == "e1", "the second drone's response over the link", world)
-    assert clients[0].last_server == "cloud"
+    until(lambda: clients[0].last_server == "cloud", "the first drone's response from the cloud", world)
     assert not [client.failed for client in clients if client.failed]
     check_restored(world, before)
 
@@ -281,7 +281,7 @@ while True:
 """
 
 
-@pytest.mark.parametrize("changes", [30, pytest.param(100, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("changes", [15, pytest.param(100, marks=pytest.mark.slow)])
 def test_quick_changes_of_the_radio_end_in_the_last_state(world: World, changes: int) -> None:
     edge = world.edge("e1", 20.0)
     drone = world.drone()

@@ -42,13 +42,20 @@ def roles(control_plane: Any) -> Iterator[World]:
     world = World(control_plane)
     for body in chart_roles().values():
         world.api.apply(path_of(body), body)
-    with bound(world, "edit", "t-settled"):
-        wait_for(lambda: may(world, "t-settled", "create", "applications"), "the built-in roles to be aggregated")
-    with bound(world, "view", "t-settled"):
-        wait_for(lambda: all(may(world, "t-settled", "get", kind) for kind in KINDS.values()), "view is aggregated")
+    for role in ("view", "edit", "admin"):
+        with bound(world, role, f"t-settled-{role}"):
+            wait_for(lambda role=role: aggregated(world, role), f"the built-in role {role} to be aggregated")
     yield world
     for body in chart_roles().values():
         world.api.delete(path_of(body))
+
+
+def aggregated(world: World, role: str) -> bool:
+    """Return True if Kubernetes has added the rules of the chart to a built-in role that is bound to a group."""
+    verbs = READ if role == "view" else (*READ, *WRITE, *ALL)
+    return all(may(world, f"t-settled-{role}", "get", kind) for kind in KINDS.values()) and all(
+        may(world, f"t-settled-{role}", verb, KINDS["application"]) for verb in verbs
+    )
 
 
 @contextmanager

@@ -14,10 +14,11 @@ from fractus_core.geo import LocalFrame
 from pydantic import ValidationError
 
 from fractus_radio.follower import Follower, parse_address
-from fractus_radio.layout import Layout, Place, StationEntry
+from fractus_radio.layout import Layout, NetworkEntry, Place, StationEntry, mac_address
 from fractus_radio.medium import Medium, Position, Station
 from fractus_radio.propagation import Propagation
 from fractus_radio.radio import Radio
+from fractus_radio.shared_network import Member, SharedNetwork
 from fractus_radio.taps import Tap
 from fractus_radio.uplink import Uplink
 
@@ -59,7 +60,36 @@ def make_radio(layout: Layout) -> tuple[Radio, list[Follower]]:
         near, far = (Tap(end.namespace, end.device, None) for end in (uplink.near, uplink.far))
         up, down = (Uplink(uplink.rate_bps, uplink.delay_s) for _ in range(2))
         radio.add_uplink(uplink.name, (near, far), (up, down))
+    for number, network in enumerate(layout.networks):
+        followers += _add_network(radio, network, frame, layout.seed + number)
     return radio, followers
+
+
+def _add_network(radio: Radio, entry: NetworkEntry, frame: Frame, seed: int) -> list[Follower]:
+    """Add a simple network, and return the followers of its moving members."""
+    network = SharedNetwork(
+        range_m=entry.range_m, loss=entry.loss, delay_s=entry.delay_s, rate_bps=entry.rate_bps, seed=seed
+    )
+    taps = {}
+    followers = []
+    for each in entry.members:
+        place = each.place
+        address = mac_address(f"{entry.name} {each.name}")
+        member = network.add(
+            each.name, address, None if place is None else frame.position(place.lat, place.lon, place.alt)
+        )
+        taps[each.name] = Tap(each.namespace, each.device, address)
+        if each.vehicle is not None:
+            followers.append(_member_follower(each.vehicle, member, frame))
+    radio.add_network(network, taps)
+    return followers
+
+
+def _member_follower(vehicle: str, member: Member, frame: Frame) -> Follower:
+    def moved(lat: float, lon: float, alt: float) -> None:
+        member.position = frame.position(lat, lon, alt)
+
+    return Follower(Path("/proc/self/ns/net"), parse_address(vehicle), moved)
 
 
 def _follower(entry: StationEntry, vehicle: str, station: Station, frame: Frame) -> Follower:
@@ -72,7 +102,7 @@ def _follower(entry: StationEntry, vehicle: str, station: Station, frame: Frame)
 @click.command()
 @click.argument("layout", type=click.Path(path_type=Path, dir_okay=False, exists=True))
 def radio(layout: Path) -> None:
-    """Carry frames between the nodes of a LAYOUT file over the simulated air and uplinks."""
+    """Carry frames between the nodes of a LAYOUT file over the simulated air, uplinks and networks."""
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
     try:
         carrier, followers = make_radio(Layout.model_validate_json(layout.read_bytes()))

@@ -1,4 +1,4 @@
-"""Layout file of a radio: stations, their positions, and uplinks."""
+"""Layout file of a radio: stations, their positions, uplinks, and simple networks."""
 
 from __future__ import annotations
 
@@ -44,8 +44,13 @@ class StationEntry(_Value):
 
     @property
     def address(self) -> bytes:
-        """MAC address: locally administered, derived from the name."""
-        return b"\x02" + hashlib.sha256(self.name.encode()).digest()[:5]
+        """MAC address of the station."""
+        return mac_address(self.name)
+
+
+def mac_address(name: str) -> bytes:
+    """Return a locally administered MAC address that is derived from a name."""
+    return b"\x02" + hashlib.sha256(name.encode()).digest()[:5]
 
 
 class EndEntry(_Value):
@@ -73,6 +78,44 @@ class UplinkEntry(_Value):
     delay_s: Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
 
+class MemberEntry(_Value):
+    """A member of a simple network.
+
+    Attributes:
+        name: Name of the node.
+        namespace: Network namespace of the node.
+        device: Network device in the namespace. If it does not exist, the radio creates it.
+        place: Position, or initial position of a moving node. None: the range does not apply to this node.
+        vehicle: MAVLink server (`tcp:HOST:PORT`, in the namespace of the radio) of the vehicle that carries the node, if any.
+    """
+
+    name: str
+    namespace: Path
+    device: Annotated[str, Field(max_length=15)]
+    place: Place | None = None
+    vehicle: str | None = None
+
+
+class NetworkEntry(_Value):
+    """A simple network with the same properties between all its members.
+
+    Attributes:
+        name: Name of the network.
+        range_m: Maximum distance between members, metres. None: unlimited.
+        loss: Share of frames that are lost.
+        delay_s: Delay in seconds.
+        rate_bps: Bits per second that each member can send.
+        members: Members.
+    """
+
+    name: str
+    range_m: Positive | None = None
+    loss: Annotated[float, Field(ge=0, lt=1, allow_inf_nan=False)] = 0.0
+    delay_s: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
+    rate_bps: Positive = 1e9
+    members: tuple[MemberEntry, ...] = ()
+
+
 class Layout(_Value):
     """Configuration of a radio.
 
@@ -80,7 +123,7 @@ class Layout(_Value):
         control: Path of the command socket.
         origin: Origin of the metric positions in commands.
         fading: Shape of Nakagami fading. None: no fading, so that no frame arrives beyond the range.
-        seed: Random seed of fading.
+        seed: Random seed of fading and of losses.
     """
 
     control: Path
@@ -89,3 +132,4 @@ class Layout(_Value):
     seed: int = 1
     stations: tuple[StationEntry, ...] = ()
     uplinks: tuple[UplinkEntry, ...] = ()
+    networks: tuple[NetworkEntry, ...] = ()

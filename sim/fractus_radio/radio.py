@@ -1,4 +1,4 @@
-"""Radio process: connects the TAP devices of all nodes by the simulated air and uplinks, and executes commands.
+"""Radio process: connects the TAP devices of all nodes by the simulated air, uplinks and networks, and executes commands.
 
 A command is a JSON object in one datagram on a Unix socket. This command changes attributes of a station:
 `{"station": "drone-1", "position": [0, 0, 20], "off": false, "silent": false, "loss_db": 0, "network": "fleet"}`
@@ -17,10 +17,12 @@ import socket
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from fractus_radio.medium import Medium, Station
+from fractus_radio.shared_network import SharedNetwork
 from fractus_radio.taps import Tap
 from fractus_radio.uplink import Uplink
 
@@ -61,6 +63,7 @@ class Radio:
         self._clock = clock
         self._taps: dict[str, Tap] = {}
         self._wires: dict[str, Wire] = {}
+        self._networks: list[tuple[SharedNetwork, Mapping[str, Tap]]] = []
         self._selector = selectors.DefaultSelector()
         self._control = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
         control.unlink(missing_ok=True)
@@ -79,10 +82,20 @@ class Radio:
         for tap, uplink in zip(ends, directions, strict=True):
             self._forward_from(tap, uplink.offer)
 
+    def add_network(self, network: SharedNetwork, taps: Mapping[str, Tap]) -> None:
+        """Add a simple network with the device of each member."""
+        self._networks.append((network, taps))
+        for name, tap in taps.items():
+            self._forward_from(tap, partial(network.offer, name))
+
     def step(self, max_wait_s: float = 0.5) -> None:
         """Wait for the next event and handle all due events."""
         due_s = min(
-            (self._medium.next_s, *(u.next_s for wire in self._wires.values() for u in wire.directions)),
+            (
+                self._medium.next_s,
+                *(uplink.next_s for wire in self._wires.values() for uplink in wire.directions),
+                *(network.next_s for network, _ in self._networks),
+            ),
             default=math.inf,
         )
         wait_s = min(max(due_s - self._clock(), 0.0), max_wait_s)
@@ -95,6 +108,9 @@ class Radio:
             for uplink, end in zip(wire.directions, reversed(wire.ends), strict=True):
                 for frame in uplink.advance(now_s):
                     end.write(frame)
+        for network, taps in self._networks:
+            for arrival in network.advance(now_s):
+                taps[arrival.station].write(arrival.frame)
 
     def _forward_from(self, tap: Tap, offer: Callable[[bytes, float], None]) -> None:
         """Pass the frames of a device to `offer` until the device is removed. Other devices are not affected."""
@@ -147,7 +163,9 @@ class Radio:
 
     def close(self) -> None:
         """Remove all devices."""
-        for tap in (*self._taps.values(), *(tap for wire in self._wires.values() for tap in wire.ends)):
+        wired = [tap for wire in self._wires.values() for tap in wire.ends]
+        members = [tap for _, taps in self._networks for tap in taps.values()]
+        for tap in (*self._taps.values(), *wired, *members):
             tap.close()
         self._control.close()
         self._selector.close()

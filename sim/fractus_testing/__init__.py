@@ -18,6 +18,9 @@ from fractus_testing.flight_plan import no_fly as no_fly
 from fractus_testing.flight_plan import no_photo as no_photo
 from fractus_testing.flight_plan import polygon as polygon
 from fractus_testing.flight_plan import stay_inside as stay_inside
+from fractus_testing.network import LTE as LTE
+from fractus_testing.network import WIFI as WIFI
+from fractus_testing.network import Network as Network
 from fractus_testing.results import ABORTED as ABORTED
 from fractus_testing.results import FAILED as FAILED
 from fractus_testing.results import RUNNING as RUNNING
@@ -27,9 +30,11 @@ from fractus_testing.results import Violation as Violation
 from fractus_testing.scene import SITL as SITL
 from fractus_testing.scene import Ardupilot as Ardupilot
 from fractus_testing.scene import Builtin as Builtin
+from fractus_testing.scene import NetSim as NetSim
 from fractus_testing.scene import Scene as Scene
 from fractus_testing.scene import VirtualController as VirtualController
 from fractus_testing.scene import VirtualDrone as VirtualDrone
+from fractus_testing.scene import VirtualNode as VirtualNode
 from fractus_testing.scene import app as app
 from fractus_testing.scene import autopilot as autopilot
 from fractus_testing.scene import runtime as runtime

@@ -16,11 +16,13 @@ class App:
             to the file of the test.
         params: Environment variables. Values other than text are passed as JSON.
         component: Component of the manifests that the program implements. Only needed with `set_manifests`.
+        port: Port at which the program listens. It is passed as PORT, and other programs get the address by the component.
     """
 
     command: tuple[str, ...]
     params: Mapping[str, object] = field(default_factory=dict)
     component: str | None = None
+    port: int | None = None
 
     @property
     def environment(self) -> dict[str, str]:
@@ -31,7 +33,7 @@ class App:
         }
 
 
-def app_of(program: App | str, params: Mapping[str, object], component: str | None) -> App:
+def app_of(program: App | str, params: Mapping[str, object], component: str | None, port: int | None = None) -> App:
     """Return an App with additional parameters. A text is the path of a Python program."""
     base = App(("python", program)) if isinstance(program, str) else program
-    return App(base.command, {**base.params, **params}, component or base.component)
+    return App(base.command, {**base.params, **params}, component or base.component, port or base.port)

@@ -11,6 +11,7 @@ from typing import Any
 
 from fractus_runtime.audit_chain import entries
 from fractus_sim.errors import ExperimentError
+from fractus_sim.experiment.checks import DataLevel
 from fractus_sim.report.audit_log_reader import read_audit_logs
 from fractus_sim.report.flight_record import AUDIT, OBJECTS, FlightRecord
 from fractus_sim.report.report_files import RESULTS
@@ -36,6 +37,7 @@ class RunRecord:
         entries: Audit log entries by drone, in order. Each has its time in the field `time_s`.
         programs: Exit codes by program. None while a program runs, or if it had to be stopped.
         usages: Resources by program.
+        data_sent: Bytes that each drone or node sent, by level. Unmeasured levels are missing.
         phases: Phase of each Application, by drone. Only known for clusters.
         audit_problems: First violation of the hash chain, by log. Empty if the log is valid.
     """
@@ -45,6 +47,7 @@ class RunRecord:
     entries: Mapping[str, Sequence[Entry]] = field(default_factory=dict)
     programs: Mapping[str, int | None] = field(default_factory=dict)
     usages: Mapping[str, ProgramUsage] = field(default_factory=dict)
+    data_sent: Mapping[str, Mapping[DataLevel, int]] = field(default_factory=dict)
     phases: Mapping[str, str] = field(default_factory=dict)
     audit_problems: Mapping[str, str] = field(default_factory=dict)
 
@@ -64,6 +67,7 @@ def record_of_run(run: ExperimentRun) -> RunRecord:
         {drone: [_timed(entry, run.in_experiment_time) for entry in log] for drone, log in logs.items()},
         programs,
         dict(findings.usages),
+        dict(findings.data_sent),
         audit_problems=problems,
     )
 
@@ -105,6 +109,7 @@ def _read_experiment(folder: Path, recording: Path) -> RunRecord:
         {drone: [_timed(entry, clock.run_time) for entry in log] for drone, log in logs.items()},
         results.get("programs", {}),
         usages,
+        results.get("data_sent", {}),
         audit_problems=problems,
     )
 

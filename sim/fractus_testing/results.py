@@ -18,7 +18,7 @@ from typing import Any, Literal, Self
 from fractus_core.api.model import InvalidObject, quantity
 from fractus_core.control.state import TaskKind
 from fractus_sim.errors import ExperimentError
-from fractus_sim.experiment.checks import Check
+from fractus_sim.experiment.checks import Check, DataLevel
 from fractus_sim.experiment.definition import NamedZone
 from fractus_sim.report.flight_record import JudgedCall, judged_call
 from fractus_sim.report.track import Place, Track
@@ -208,6 +208,26 @@ class Results:
             sum(usage.peak_memory_mib for usage in usages),
         )
 
+    def get_data_sent(self, drone: str, level: DataLevel = "app") -> int:
+        """Return the bytes that a drone or node sent so far.
+
+        Args:
+            drone: Drone or node.
+            level: `app`: Ethernet frames that the programs sent. `runtime`: Ethernet frames that the services sent to the
+                programs. Both need a network of `NetSim`. `autopilot`: MAVLink that the autopilot sent to the services.
+
+        Raises:
+            ExperimentError: The level was not measured.
+        """
+        record = self._read()
+        name = next((name for name in record.data_sent if name.lower() == drone.lower()), None)
+        sent = record.data_sent[name].get(level) if name is not None else None
+        if sent is None:
+            raise ExperimentError(
+                f"the data that {drone} sent at level {level} was not measured; add the drone to a NetSim before start_app()"
+            )
+        return sent
+
     def compare(self, value: object, expected: object, tolerance: float = 0.1) -> None:
         """Require that a value equals the expected value. Numbers may differ by a share of the expected number.
 
@@ -247,7 +267,12 @@ class Results:
         if zone is not None and zone not in self._zones:
             raise ExperimentError(f"unknown zone {zone}; known: {', '.join(sorted(self._zones)) or 'none'}")
         calls = [entry for log in record.entries.values() for entry in log if entry.get("kind") in JUDGED_KINDS]
-        findings = Findings(dict(record.programs), calls=calls, audit_problems=dict(record.audit_problems))
+        findings = Findings(
+            dict(record.programs),
+            data_sent={name: dict(sent) for name, sent in record.data_sent.items()},
+            calls=calls,
+            audit_problems=dict(record.audit_problems),
+        )
         for verdict in evaluate_check(parsed, Evidence(record.flights, zones=self._zones, findings=findings)):
             if not verdict.holds:
                 raise AssertionError(f"{verdict.vehicle or 'run'}: {verdict.check} does not hold: {verdict.observed}")
@@ -294,6 +319,24 @@ class Results:
         observed = self.get_app_status(drone)
         if observed != status:
             raise AssertionError(f"{drone}: expected application status {status}, observed {observed}")
+
+    def check_data_sent(self, drone: str, level: DataLevel = "app", *, max: int | None = None, min: int = 0) -> None:
+        """Require that a drone sent an amount of data within limits.
+
+        Args:
+            drone: Drone.
+            level: app, runtime or autopilot, as in `get_data_sent`.
+            max: Maximum number of bytes. None: unlimited.
+            min: Minimum number of bytes.
+
+        Raises:
+            AssertionError: The amount is outside of the limits.
+            ExperimentError: The level was not measured.
+        """
+        __tracebackhide__ = True
+        self.get_data_sent(drone, level)
+        limits = {"min": min} if max is None else {"min": min, "max": max}
+        self.check("dataSent", drone, level=level, **limits)
 
     def check_landed(self, drone: str, near_home: float | None = None) -> None:
         """Require that the drone flew, and is landed and disarmed.

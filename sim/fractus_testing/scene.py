@@ -16,17 +16,21 @@ it to `experiment.yaml` of its folder, so `fractus experiment run` repeats the f
 from __future__ import annotations
 
 import itertools
+import math
 import re
 import shutil
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
+from unittest import SkipTest
 
 import yaml
 from fractus_cli.manifests import Manifests
 from fractus_core.api import Application
+from fractus_core.api.geometry import Point
 from fractus_core.api.model import InvalidObject
+from fractus_core.geo import geodesic_m
 from fractus_sim.errors import ExperimentError
 from fractus_sim.experiment import parse
 from fractus_sim.experiment.definition import NamedZone, Program
@@ -35,6 +39,7 @@ from fractus_sim.report.flight_record import policy_decisions
 from fractus_sim.report.track import Sample
 from fractus_sim.runner import ExperimentRun, Outcome
 from fractus_sim.runner.telemetry_recording import Flight
+from fractus_sim.testbeds.node_networks import NetworksUnavailable, require_networks
 from fractus_sim.testbeds.standalone_testbed import planned_grants, read_all_manifests
 
 from fractus_testing.applications import App, app_of
@@ -50,6 +55,7 @@ from fractus_testing.flight_plan import (
     merged,
     no_fly,
 )
+from fractus_testing.network import Network
 from fractus_testing.records import record_of_run
 from fractus_testing.results import Results
 from fractus_testing.triggers import Trigger
@@ -125,7 +131,11 @@ class VirtualDrone:
         self.manifests = tuple(self._scene.base / path for path in paths)
 
     def set_app(
-        self, program: App | str, params: Mapping[str, object] | None = None, component: str | None = None
+        self,
+        program: App | str,
+        params: Mapping[str, object] | None = None,
+        component: str | None = None,
+        port: int | None = None,
     ) -> None:
         """Set a program under test. It runs as a component of the application, with the environment of its pod.
 
@@ -133,9 +143,10 @@ class VirtualDrone:
             program: Path of a Python program, relative to the file of the test, or an App.
             params: Environment variables of the program. Values other than text are passed as JSON.
             component: Component that the program implements. Only needed with `set_manifests`.
+            port: Port at which the program listens. Programs of other nodes get the address by the component.
         """
         self._scene.require_not_started("set_app")
-        self.apps.append(app_of(program, params or {}, component))
+        self.apps.append(app_of(program, params or {}, component, port))
 
     def set_task(self, *steps: dict[str, Any]) -> None:
         """Let a ground station fly the vehicle alone, without services and programs.
@@ -245,10 +256,74 @@ class VirtualDrone:
         return self._scene.run.now_s
 
 
+class VirtualNode:
+    """An edge node or the cloud, with programs that other programs can call. It has no services of Fractus.
+
+    Attributes:
+        name: Name in the test.
+        node: Name of the node: the name in lower case.
+        place: Latitude and longitude in degrees, metres above mean sea level. None: ranges do not apply, as for the cloud.
+    """
+
+    def __init__(self, scene: Scene, name: str, place: tuple[float, float, float] | None) -> None:
+        self.name = name
+        self.node = name.lower()
+        self.place = place
+        self.apps: list[App] = []
+        self._scene = scene
+
+    def set_app(
+        self,
+        program: App | str,
+        component: str,
+        params: Mapping[str, object] | None = None,
+        port: int | None = None,
+    ) -> None:
+        """Add a program.
+
+        Args:
+            program: Path of a Python program, relative to the file of the test, or an App.
+            component: Name under which programs of other nodes find the program: the variable `FRACTUS_SERVICE_COMPONENT`.
+            params: Environment variables of the program. Values other than text are passed as JSON.
+            port: Port at which the program listens, also in the variable PORT.
+        """
+        self._scene.require_not_started("set_app")
+        self.apps.append(app_of(program, params or {}, component, port))
+
+    def start_app(self) -> None:
+        """Start the programs of this node. The first call of any `start_app` starts all drones.
+
+        Raises:
+            ExperimentError: A program or a drone did not start.
+        """
+        self._scene.start()
+        for program in self._scene.programs(self):
+            self._scene.run.begin(program)
+
+
+class NetSim:
+    """A simulated network between participants."""
+
+    def __init__(self, scene: Scene, network: Network) -> None:
+        self.network = network
+        self.participants: list[VirtualDrone | VirtualNode | VirtualController] = []
+        self._scene = scene
+
+    def add_participants(self, *participants: VirtualDrone | VirtualNode | VirtualController) -> None:
+        """Add drones, nodes or the controller.
+
+        Programs of drones and nodes reach only each other over networks, and the services of their drone. The
+        controller reaches a drone only within the range.
+        """
+        self._scene.require_not_started("add_participants")
+        self.participants += participants
+
+
 class VirtualController:
     """A virtual controller: it plans the flights, signs Grants, and changes restrictions during flights."""
 
     def __init__(self, scene: Scene) -> None:
+        self.place: tuple[float, float, float] | None = None
         self._scene = scene
         self._restrictions: tuple[Restriction, ...] = ()
         self._silent_until_s: dict[str, float] = {}
@@ -259,6 +334,10 @@ class VirtualController:
         """Select logs for failed tests. The controller has the log `runtime` only: the events of the test."""
         if set(logs) - {runtime}:
             raise ExperimentError("set_logs: the controller has only the log runtime")
+
+    def set_pos(self, place: tuple[float, float, float]) -> None:
+        """Set the position: latitude, longitude, metres above mean sea level. Without it, ranges of networks do not apply."""
+        self.place = place
 
     def update_restrictions(self, *restrictions: Restriction, at: Trigger | None = None) -> None:
         """Replace the restrictions that this controller has issued. Restrictions of flight plans stay.
@@ -339,7 +418,8 @@ class VirtualController:
             self._issue(back)
 
     def _silent(self, node: str) -> bool:
-        return self._scene.run.now_s < self._silent_until_s.get(node, 0.0)
+        lost = self._scene.run.now_s < self._silent_until_s.get(node, 0.0)
+        return lost or not self._scene.controller_reaches(self, node)
 
     def _issue(self, nodes: Iterable[str]) -> None:
         reachable = {node for node in nodes if not self._silent(node)}
@@ -375,6 +455,8 @@ class Scene:
         self.seed = seed
         self.lines: list[str] = []
         self._drones: list[VirtualDrone] = []
+        self._nodes: list[VirtualNode] = []
+        self._networks: list[NetSim] = []
         self._controllers: list[VirtualController] = []
         self._run: ExperimentRun | None = None
         self._outcome: Outcome | None = None
@@ -438,6 +520,38 @@ class Scene:
             raise ExperimentError(f"the drone name {name} is used twice; names must be unique in lower case")
         self._drones.append(drone)
         return drone
+
+    def vNode(self, name: str, pos: tuple[float, float, float] | None = None) -> VirtualNode:  # noqa: N802 - term of the field
+        """Add an edge node, or the cloud.
+
+        Args:
+            name: Name of the node.
+            pos: Latitude and longitude in degrees, metres above mean sea level. None: the ranges of networks do not apply.
+
+        Raises:
+            ExperimentError: The name is used twice.
+        """
+        self.require_not_started("vNode")
+        node = VirtualNode(self, name, pos)
+        if node.node in (*self.nodes, *(other.node for other in self._nodes)):
+            raise ExperimentError(f"the name {name} is used twice; names must be unique in lower case")
+        self._nodes.append(node)
+        return node
+
+    def NetSim(self, network: Network) -> NetSim:  # noqa: N802 - term of the field
+        """Add a simulated network.
+
+        Raises:
+            SkipTest: This machine or user cannot simulate networks. pytest then skips the test with the reason.
+        """
+        self.require_not_started("NetSim")
+        try:
+            require_networks()
+        except NetworksUnavailable as error:
+            raise SkipTest(str(error)) from None
+        simulation = NetSim(self, network)
+        self._networks.append(simulation)
+        return simulation
 
     def set_wind(self, speed: float, direction: float = 270.0, turbulence: float = 0.0) -> None:
         """Set the wind: speed in m/s, direction in degrees that it comes from, turbulence in m/s (1 sigma)."""
@@ -529,8 +643,8 @@ class Scene:
         self._run.start()
         self._began = True
 
-    def programs(self, drone: VirtualDrone) -> list[Program]:
-        """Return the programs that the experiment runs for a drone."""
+    def programs(self, drone: VirtualDrone | VirtualNode) -> list[Program]:
+        """Return the programs that the experiment runs for a drone or node."""
         names = {f"{drone.node}-{number}" for number in range(len(drone.apps))}
         return [program for program in self.run.experiment.programs if program.name in names]
 
@@ -614,6 +728,21 @@ class Scene:
         grants = [spec for spec in planned_grants(planned, read_all_manifests(paths)) if spec.node in chosen]
         self.run.testbed.reissue(grants)
 
+    def controller_reaches(self, controller: VirtualController, node: str) -> bool:
+        """Return True if a drone is in range of the controller in a common network, or if the controller has no network."""
+        drone = next(drone for drone in self._drones if drone.node == node)
+        networks = [each for each in self._networks if controller in each.participants]
+        ranges = [each.network.range for each in networks if drone in each.participants]
+        if not networks or any(limit is None for limit in ranges):
+            return True
+        if controller.place is None or drone.home is None or not drone.samples:
+            return bool(ranges)
+        place = drone.samples[-1].place
+        lat, lon, alt = controller.place
+        ground_m = geodesic_m(place.ground, Point(lat=lat, lon=lon))
+        distance_m = math.hypot(ground_m, drone.home[2] + place.alt_m - alt)
+        return any(limit is not None and distance_m <= limit for limit in ranges)
+
     def manifest_waypoints(self) -> tuple[Waypoint, ...]:
         """Return the waypoints of the first driver in the manifests of the drones."""
         paths = [path for drone in self._drones for path in drone.manifests]
@@ -640,6 +769,15 @@ class Scene:
         if not alone:
             content["manifests"] = self._manifests()
             content["programs"] = [program for drone in self._drones for program in self._program_entries(drone)]
+            content["programs"] += [
+                {**self._program_entry(node, number, program), "node": node.node, "background": True}
+                for node in self._nodes
+                for number, program in enumerate(node.apps)
+            ]
+            content["nodes"] = [_node_entry(node) for node in self._nodes]
+            content["networks"] = _network_entries(self._networks)
+        elif self._networks:
+            raise ExperimentError("NetSim: vehicles that set_task() flies alone have no programs; use set_app()")
         return {name: value for name, value in content.items() if value not in ({}, [])}
 
     def _vehicle(self, drone: VirtualDrone) -> dict[str, Any]:
@@ -686,10 +824,15 @@ class Scene:
             component = _component(drone) if drone.plan is not None else program.component
             if component is None:
                 raise ExperimentError(f"{drone.name}: set_app() needs `component` with set_manifests()")
-            command = [self._absolute(word) for word in program.command]
-            entry = {"name": f"{drone.node}-{number}", "component": component, "command": command}
-            entries.append({**entry, "environment": program.environment})
+            entries.append({**self._program_entry(drone, number, program), "component": component})
         return entries
+
+    def _program_entry(self, owner: VirtualDrone | VirtualNode, number: int, program: App) -> dict[str, Any]:
+        entry: dict[str, Any] = {
+            "name": f"{owner.node}-{number}", "component": program.component,
+            "command": [self._absolute(word) for word in program.command], "environment": program.environment,
+        }  # fmt: skip
+        return entry if program.port is None else {**entry, "port": program.port}
 
     def _absolute(self, word: str) -> str:
         """Return the absolute path of a file of the test, or any other word unchanged."""
@@ -735,6 +878,25 @@ def _require_replaceable(folder: Path) -> None:
     """
     if folder.exists() and any(folder.iterdir()) and not (folder / DEFINITION).exists():
         raise ExperimentError(f"{folder} contains other files than an earlier test; specify a new folder")
+
+
+def _node_entry(node: VirtualNode) -> dict[str, Any]:
+    if node.place is None:
+        return {"name": node.node}
+    lat, lon, alt = node.place
+    return {"name": node.node, "place": {"lat": lat, "lon": lon, "alt": alt}}
+
+
+def _network_entries(networks: Sequence[NetSim]) -> list[dict[str, Any]]:
+    """Return the networks with drones and nodes. The controller runs in the process of the test."""
+    entries = []
+    for number, each in enumerate(networks, 1):
+        names = [
+            participant.node for participant in each.participants if not isinstance(participant, VirtualController)
+        ]
+        if names:
+            entries.append({"name": f"network-{number}", "participants": names, **each.network.to_dict()})
+    return entries
 
 
 def _component(drone: VirtualDrone) -> str:

@@ -97,6 +97,38 @@ INVALID: dict[str, tuple[dict[str, Any], str]] = {
         {"speedup": 0, "programs": [{"name": "p", "command": ["p"], "vehicle": "d"}]},
         "lockstep",
     ),
+    "network without services": (
+        {"networks": [{"name": "wifi", "participants": ["d"]}]},
+        "networks: are only supported in mode standalone",
+    ),
+    "unknown participant": (
+        {"mode": "standalone", "manifests": ["m"], "networks": [{"name": "wifi", "participants": ["d", "edge"]}]},
+        "networks[0].participants: unknown vehicle or node edge; known: d",
+    ),
+    "node with the name of a vehicle": (
+        {"mode": "standalone", "manifests": ["m"], "nodes": [{"name": "d"}]},
+        "nodes: the name d is used twice",
+    ),
+    "program on an unknown node": (
+        {
+            "mode": "standalone",
+            "manifests": ["m"],
+            "programs": [{"name": "p", "command": ["p"], "component": "C", "node": "edge"}],
+        },
+        "programs[0].node: unknown node edge; known: none",
+    ),
+    "loss of all packets": (
+        {
+            "mode": "standalone",
+            "manifests": ["m"],
+            "networks": [{"name": "wifi", "participants": ["d"], "loss": 1}],
+        },
+        "networks[0].loss",
+    ),
+    "data of programs without networks": (
+        {"mode": "standalone", "manifests": ["m"], "checks": [{"check": "dataSent", "level": "app"}]},
+        "checks[0].level: app is only measured with `networks`",
+    ),
     "task of a drone with services": (
         {
             "mode": "standalone",

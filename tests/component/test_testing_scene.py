@@ -4,14 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from unittest import SkipTest
+from unittest.mock import Mock
 
+import fractus_testing.scene
 import pytest
 from fractus_core.api import Grant
 from fractus_sim.experiment import load
+from fractus_sim.testbeds.node_networks import NetworksUnavailable
 from fractus_sim.testbeds.standalone_testbed import grant_manifest, planned_grants, read_all_manifests
 from fractus_testing import (
+    LTE,
+    WIFI,
     ExperimentError,
     FlightPlan,
+    Network,
     Resources,
     Results,
     Scene,
@@ -195,3 +202,43 @@ def test_configuration_cannot_change_after_the_start(scene: Scene) -> None:
     drone.start_app()
     with pytest.raises(ExperimentError, match=r"set_pos\(\) must be called before the first start_app\(\)"):
         drone.set_pos(HOME)
+
+
+def test_networks_are_written_to_the_experiment(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fractus_testing.scene, "require_networks", lambda: None)
+    controller = scene.vController()
+    drone = scene.vDrone("vDrone-1")
+    drone.set_pos(HOME)
+    drone.set_plan(FlightPlan(path=PATH))
+    drone.set_app("pilot.py")
+    edge = scene.vNode("Edge-1", HOME)
+    edge.set_app("collector.py", component="Collector", port=7000)
+    scene.NetSim(Network(range=50, loss=0.1)).add_participants(controller, drone, edge)
+    scene.NetSim(LTE).add_participants(controller)
+    with pytest.raises(ExperimentError, match="the name edge-1 is used twice"):
+        scene.vNode("edge-1")
+    monkeypatch.setattr(fractus_testing.scene, "ExperimentRun", lambda *_arguments, **_options: Mock())
+    scene.start()
+    experiment = load(scene.folder / "experiment.yaml")
+    (network,) = experiment.networks
+    assert (network.participants, network.range, network.loss) == (("vdrone-1", "edge-1"), 50, 0.1)
+    assert [(program.node, program.port) for program in experiment.programs] == [(None, None), ("edge-1", 7000)]
+    assert controller.place is None
+
+
+def test_test_is_skipped_if_networks_cannot_be_simulated(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse() -> None:
+        raise NetworksUnavailable("simulated networks need Linux, root and iproute2")
+
+    monkeypatch.setattr(fractus_testing.scene, "require_networks", refuse)
+    with pytest.raises(SkipTest, match="need Linux, root and iproute2"):
+        scene.NetSim(WIFI)
+
+
+def test_data_sent_without_a_network_is_refused_with_a_remedy(scene: Scene) -> None:
+    drone = scene.vDrone("vDrone-1")
+    drone.set_pos(HOME)
+    drone.set_task(*TASK)
+    drone.start_app()
+    with pytest.raises(ExperimentError, match=r"was not measured; add the drone to a NetSim before start_app\(\)"):
+        scene.results().get_data_sent("vDrone-1")

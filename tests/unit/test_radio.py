@@ -11,6 +11,7 @@ import random
 import pytest
 from fractus_radio.medium import ATTEMPTS, QUEUE_FRAMES, Medium, Station, airtime_s
 from fractus_radio.propagation import Propagation
+from fractus_radio.shared_network import SharedNetwork
 from fractus_radio.uplink import Uplink
 
 NS3_POWER_DBM = 16.02
@@ -170,3 +171,31 @@ def test_disabled_uplink_drops_packets() -> None:
     uplink.off = False
     uplink.offer(b"z", 1.0)
     assert list(uplink.advance(2.0)) == [b"z"]
+
+
+def test_shared_network_has_range_delay_and_rate() -> None:
+    network = SharedNetwork(range_m=100.0, delay_s=0.02, rate_bps=8e6)
+    network.add("drone", A, (0.0, 0.0, 0.0))
+    edge = network.add("edge", B, (60.0, 0.0, 80.0))
+    network.add("cloud", C)
+    network.offer("drone", frame(B, 1000), 0.0)
+    network.offer("drone", frame(C, 1000), 0.0)
+    assert network.next_s == pytest.approx(0.021)
+    assert [arrival.station for arrival in network.advance(0.0211)] == ["edge"]
+    assert [arrival.station for arrival in network.advance(0.0221)] == ["cloud"]
+    edge.position = (60.0, 0.0, 80.1)
+    network.offer("drone", frame(B), 1.0)
+    network.offer("cloud", frame(b"\xff" * 6), 1.0)
+    assert {arrival.station for arrival in network.advance(2.0)} == {"drone", "edge"}
+    assert math.isinf(network.next_s)
+
+
+def test_shared_network_loses_the_declared_share_of_frames() -> None:
+    network = SharedNetwork(loss=0.1, seed=3)
+    network.add("a", A)
+    network.add("b", B)
+    arrived = 0
+    for number in range(20_000):
+        network.offer("a", frame(B, 100), float(number))
+        arrived += len(list(network.advance(number + 0.5)))
+    assert arrived / 20_000 == pytest.approx(0.9, abs=0.01)

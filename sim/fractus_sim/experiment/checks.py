@@ -21,6 +21,7 @@ def _regular(text: str) -> str:
 
 
 Expression = Annotated[str, Field(min_length=1), AfterValidator(_regular)]
+DataLevel = Literal["app", "runtime", "autopilot"]
 Seconds = Annotated[float, Field(gt=0, description="Seconds since all vehicles were ready.")]
 
 
@@ -122,6 +123,19 @@ class TaskDone(VehicleCheck):
     check: Literal["task"]
 
 
+class DataSent(VehicleCheck):
+    """The drone sent an amount of data within limits (mode standalone)."""
+
+    check: Literal["dataSent"]
+    level: DataLevel = Field(
+        default="app",
+        description="app: frames of the programs; runtime: frames of the services to the programs; autopilot: MAVLink of the"
+        " autopilot to the services.",
+    )
+    min: int = Field(default=0, ge=0, description="Bytes.")
+    max: int | None = Field(default=None, ge=0, description="Bytes. Unset: unlimited.")
+
+
 class Separation(VehicleCheck):
     """Airborne vehicles kept a minimum distance to each other."""
 
@@ -178,7 +192,7 @@ class Detections(Model):
 
 Check = Annotated[
     Landed | NeverFlew | Reached | ModeReached | StatusText | AltitudeBand | SpeedLimit | OutsideZone | InsideZone
-    | Battery | TaskDone | Separation | ProgramEnded | CallJudged | AuditSound | ApplicationPhase
+    | Battery | TaskDone | DataSent | Separation | ProgramEnded | CallJudged | AuditSound | ApplicationPhase
     | Detections,
     Field(discriminator="check"),
 ]  # fmt: skip

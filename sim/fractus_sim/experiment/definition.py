@@ -20,6 +20,7 @@ from fractus_sim.experiment.checks import (
     ApplicationPhase,
     CallJudged,
     Check,
+    DataSent,
     Detections,
     InsideZone,
     OutsideZone,
@@ -105,6 +106,9 @@ class Program(Model):
     command: tuple[str, ...] = Field(min_length=1, description="Relative paths are relative to the experiment file.")
     vehicle: Name | None = Field(default=None, description="Vehicle that the program flies (mode vehicles).")
     component: str | None = Field(default=None, description="Component that the program implements (mode standalone).")
+    node: Name | None = Field(
+        default=None, description="Entry of `nodes` on which the program runs. Unset: the drone of the component."
+    )
     port: int | None = Field(
         default=None,
         ge=1024,
@@ -113,6 +117,26 @@ class Program(Model):
     )
     environment: dict[str, str] = Field(default_factory=dict)
     background: bool = Field(default=False, description="Do not wait for the program; stop it at the end.")
+
+
+class NodeEntry(Model):
+    """An edge node, or the cloud."""
+
+    name: Name
+    place: VehicleHome | None = Field(
+        default=None, description="Position. Unset: the ranges of networks do not apply, as for the cloud."
+    )
+
+
+class SimulatedNetwork(Model):
+    """A network between nodes. Delay and bandwidth refer to real time, also with `speedup`."""
+
+    name: Name
+    participants: tuple[Name, ...] = Field(min_length=1, description="Names of vehicles and nodes.")
+    range: float | None = Field(default=None, gt=0, description="Maximum distance, metres. Unset: unlimited.")
+    loss: float = Field(default=0, ge=0, lt=1, description="Share of lost packets.")
+    delay: float = Field(default=0, ge=0, le=10, description="Seconds in each direction.")
+    bandwidth: float = Field(default=1000, gt=0, le=1000, description="Mbit/s that each participant can send.")
 
 
 class ClusterPart(Model):
@@ -167,6 +191,13 @@ class Experiment(Model):
         description="Files or directories with Application, Policy, Zone, Depot and Drone manifests (mode standalone).",
     )
     programs: tuple[Program, ...] = ()
+    nodes: tuple[NodeEntry, ...] = Field(default=(), description="Edge nodes and the cloud (mode standalone).")
+    networks: tuple[SimulatedNetwork, ...] = Field(
+        default=(),
+        max_length=8,
+        description="Networks between vehicles and nodes (mode standalone; needs Linux and root). The programs of participants run"
+        " in network namespaces, and reach only each other and the services of their drone.",
+    )
     cluster: ClusterPart | None = None
     faults: tuple[Fault, ...] = ()
     checks: tuple[Check, ...] = ()
@@ -175,6 +206,7 @@ class Experiment(Model):
     def _check_consistency(self) -> Self:
         _check_vehicles(self)
         _check_mode(self)
+        _check_networks(self)
         _check_faults(self)
         _check_checks(self)
         return self
@@ -310,6 +342,29 @@ def _check_mode(experiment: Experiment) -> None:
             raise InvalidObject(f"programs[{index}].component", f"is required in mode {mode}")
 
 
+def _check_networks(experiment: Experiment) -> None:
+    if experiment.mode != "standalone" and (experiment.nodes or experiment.networks):
+        field = "nodes" if experiment.nodes else "networks"
+        raise InvalidObject(
+            field, "are only supported in mode standalone; mode cluster has its nodes and radio in its file"
+        )
+    nodes = [node.name for node in experiment.nodes]
+    vehicles = [name for entry in experiment.vehicles for name in entry.names()]
+    for field, names in (
+        ("nodes", [*vehicles, *nodes]),
+        ("networks", [network.name for network in experiment.networks]),
+        *((f"networks[{index}].participants", each.participants) for index, each in enumerate(experiment.networks)),
+    ):
+        duplicates = sorted({name for name in names if names.count(name) > 1})
+        if duplicates:
+            raise InvalidObject(field, f"the name {duplicates[0]} is used twice; names must be unique")
+    for index, network in enumerate(experiment.networks):
+        _check_known(f"networks[{index}].participants", network.participants, [*vehicles, *nodes], "vehicle or node")
+    for index, program in enumerate(experiment.programs):
+        if program.node is not None:
+            _check_known(f"programs[{index}].node", [program.node], nodes, "node")
+
+
 def _check_faults(experiment: Experiment) -> None:
     names = {name for entry in experiment.vehicles for name in entry.names()}
     for index, fault in enumerate(experiment.faults):
@@ -346,6 +401,10 @@ def _check_checks(experiment: Experiment) -> None:
             raise InvalidObject(f"{field}.check", "phase is only supported in mode cluster")
         if isinstance(check, TaskDone) and not any(entry.task for entry in experiment.vehicles):
             raise InvalidObject(f"{field}.check", "task: no vehicle has a task")
+        if isinstance(check, DataSent) and check.level != "autopilot" and not experiment.networks:
+            raise InvalidObject(f"{field}.level", f"{check.level} is only measured with `networks`")
+        if isinstance(check, DataSent) and experiment.mode != "standalone":
+            raise InvalidObject(f"{field}.check", "dataSent is only supported in mode standalone")
         if isinstance(check, Detections) and not any(entry.camera for entry in experiment.vehicles):
             raise InvalidObject(f"{field}.check", "detections needs a vehicle with a camera (mode standalone)")
         after = getattr(check, "after", None)

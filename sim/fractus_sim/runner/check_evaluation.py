@@ -258,6 +258,13 @@ def _simultaneous_samples(ones: Sequence[Sample], others: Sequence[Sample]) -> I
             yield one, others[index]
 
 
+def _data_sent(check: checks.DataSent, flight: Flight, evidence: Evidence) -> tuple[bool, str]:
+    sent = evidence.findings.data_sent.get(flight.name, {}).get(check.level)
+    if sent is None:
+        return False, "not measured"
+    return check.min <= sent and (check.max is None or sent <= check.max), f"{sent} bytes"
+
+
 def _program(check: checks.ProgramEnded, evidence: Evidence) -> tuple[bool, str]:
     if check.program not in evidence.findings.programs:
         return False, "was not started"
@@ -323,6 +330,7 @@ _VEHICLE_CHECKS: Mapping[type, Callable[[Any, Flight, Evidence], tuple[bool, str
     checks.InsideZone: _inside,
     checks.Battery: _battery,
     checks.TaskDone: _task,
+    checks.DataSent: _data_sent,
 }
 _EXPERIMENT_CHECKS: Mapping[type, Callable[[Any, Evidence], tuple[bool, str]]] = {
     checks.Separation: _separation,

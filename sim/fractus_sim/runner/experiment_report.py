@@ -153,6 +153,7 @@ def experiment_results(outcome: Outcome) -> dict[str, Any]:
             }
             for name, usage in outcome.findings.usages.items()
         },
+        "data_sent": outcome.findings.data_sent,
         "phases": outcome.findings.phases,
         "audit": outcome.findings.audit_problems,
     }  # fmt: skip

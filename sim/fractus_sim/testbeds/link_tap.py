@@ -26,6 +26,7 @@ class _End:
 
     socket: socket.socket
     framer: Framer
+    server: bool
     peer: _End | None = None
     backlog: bytes = b""
 
@@ -39,10 +40,14 @@ class LinkTap:
         listener: Listening socket. The tap closes it.
         connect: Connects to the server. If it raises OSError or ExperimentError, the client is disconnected.
         log: File of the tlog.
+
+    Attributes:
+        received_bytes: Bytes that servers sent and the tap forwarded.
     """
 
     def __init__(self, listener: socket.socket, connect: Callable[[], socket.socket], log: Path) -> None:
         self._connect = connect
+        self.received_bytes = 0
         self._log = TlogWriter(log)
         self._connected = True
         self._stop = threading.Event()
@@ -95,8 +100,8 @@ class LinkTap:
         except (OSError, ExperimentError):
             client.close()
             return
-        near = _End(client, Framer(self._log))
-        far = _End(server, Framer(self._log))
+        near = _End(client, Framer(self._log), server=False)
+        far = _End(server, Framer(self._log), server=True)
         near.peer = far
         far.peer = near
         for end in (near, far):
@@ -118,6 +123,8 @@ class LinkTap:
         if not self._connected or end.peer is None:
             return
         end.framer.feed(data, time.time_ns() // 1000)
+        if end.server:
+            self.received_bytes += len(data)
         peer = end.peer
         if len(peer.backlog) < BACKLOG_LIMIT:
             peer.backlog += data

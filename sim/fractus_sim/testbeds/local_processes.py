@@ -204,8 +204,8 @@ def _kill_group(group: int) -> None:
         os.killpg(group, signal.SIGKILL)
 
 
-def listening(port: int) -> bool:
-    """Return True if a process accepts connections on a loopback port."""
+def listening(port: int, host: str = "127.0.0.1") -> bool:
+    """Return True if a process accepts connections on a port of this machine."""
     with socket.socket() as probe:
         probe.settimeout(1.0)
-        return probe.connect_ex(("127.0.0.1", port)) == 0
+        return probe.connect_ex((host, port)) == 0

@@ -58,13 +58,14 @@ class ResourceMeter:
             return
         self._programs[name] = _Program(process, vehicle)
 
-    def measure(self) -> None:
-        """Measure all programs, at most once per `INTERVAL_S`."""
+    def measure(self) -> bool:
+        """Measure all programs, at most once per `INTERVAL_S`. Return True if they were measured."""
         if time.monotonic() - self._measured_s < INTERVAL_S:
-            return
+            return False
         self._measured_s = time.monotonic()
         for program in self._programs.values():
             program.measure()
+        return True
 
 
 class _Program:

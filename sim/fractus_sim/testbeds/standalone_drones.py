@@ -110,9 +110,13 @@ class Standalone:
         for file in self._drone(node).grants.glob("*.json"):
             file.unlink()
 
-    def node_of(self, program: str) -> str:
-        """Return the drone on which a started program runs. Empty for a program that uses no system service."""
-        return self._programs[program].node
+    def node_of_identity(self, identity: str) -> str:
+        """Return the drone of a component instance.
+
+        Raises:
+            ExperimentError: The identity has no Grant.
+        """
+        return self._grant_of(identity).spec.node
 
     def environment(self, identity: str) -> dict[str, str]:
         """Return the FRACTUS_* variables of a component's pod: identity, service addresses and control points.
@@ -284,6 +288,7 @@ class DroneSetup:
         autopilot: `tcp:HOST:PORT` of a running autopilot. None: a simulated autopilot is started.
         state: State directory of the mobility service. None: a directory in the directory of the drone. For a running autopilot,
             use a directory that outlives the drone, because it contains the values of the vehicle's owner until they are restored.
+        service_host: Address of this machine at which the services listen.
     """
 
     name: str
@@ -300,6 +305,7 @@ class DroneSetup:
     service_arguments: Sequence[str] = ()
     autopilot: str | None = None
     state: Path | None = None
+    service_host: str = LOOPBACK
 
 
 class RunningDrone:
@@ -334,8 +340,8 @@ class RunningDrone:
         self._world_port = free_port() if setup.camera is not None and setup.camera.world is not None else None
         self.station_link = setup.autopilot or f"tcp:{LOOPBACK}:{station}"
         self.guest_link = setup.autopilot or f"tcp:{LOOPBACK}:{guest}"
-        self.mobility_address = f"{LOOPBACK}:{self._mobility_port}"
-        self.camera_address = f"{LOOPBACK}:{self._camera_port}" if self._camera_port else None
+        self.mobility_address = f"{setup.service_host}:{self._mobility_port}"
+        self.camera_address = f"{setup.service_host}:{self._camera_port}" if self._camera_port else None
         self.world_url = f"http://{LOOPBACK}:{self._world_port}" if self._world_port else None
         self._tap: LinkTap | None = None
 
@@ -384,9 +390,9 @@ class RunningDrone:
         if self._camera_port is not None:
             self._processes.start(self.process("camera"), self._camera_command(), base_environment())
         if wait:
-            self._wait_listening("mobility", self._mobility_port)
+            self._wait_listening("mobility", self._mobility_port, self.setup.service_host)
         if wait and self._camera_port is not None:
-            self._wait_listening("camera", self._camera_port)
+            self._wait_listening("camera", self._camera_port, self.setup.service_host)
 
     def power_off(self) -> None:
         """Kill the services of the companion computer. The vehicle keeps flying."""
@@ -397,13 +403,18 @@ class RunningDrone:
         if self._tap is not None:
             self._tap.set_link(connected=connected)
 
+    @property
+    def autopilot_bytes(self) -> int:
+        """Bytes of MAVLink that the autopilot sent to the services."""
+        return self._tap.received_bytes if self._tap is not None else 0
+
     def close(self) -> None:
         """Close the link tap after the processes have ended."""
         if self._tap is not None:
             self._tap.close()
 
-    def _wait_listening(self, role: str, port: int) -> None:
-        self._processes.wait(self.process(role), lambda: listening(port), START_TIMEOUT_S)
+    def _wait_listening(self, role: str, port: int, host: str = LOOPBACK) -> None:
+        self._processes.wait(self.process(role), lambda: listening(port, host), START_TIMEOUT_S)
 
     def _write_description(self) -> None:
         spec: dict[str, Any] = json.loads(json.dumps(dict(self.setup.description)))
@@ -470,7 +481,7 @@ class RunningDrone:
             *_module("fractus_services.camera"), "serve", "--grants", str(self.grants), "--tls", str(self._tls),
             "--state", str(self.folder / "pictures"), "--audit", str(self.folder / "camera.jsonl"), "--node", self.name,
             "--description", str(self.folder / "node.yaml"), "--mobility", self.mobility_address,
-            "--listen", f"{LOOPBACK}:{self._camera_port}",
+            "--listen", f"{self.setup.service_host}:{self._camera_port}",
         ]  # fmt: skip
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +19,9 @@ from fractus_sim.errors import ExperimentError
 from fractus_sim.experiment.definition import Experiment, Program, VehicleSetup
 from fractus_sim.testbeds.detections import DETECTIONS_FILE, DETECTIONS_VARIABLE, TruthWatch, read_detections
 from fractus_sim.testbeds.ground_station import TcpLink
+from fractus_sim.testbeds.node_networks import NodeNetworks
 from fractus_sim.testbeds.resource_meter import ResourceMeter
-from fractus_sim.testbeds.standalone_drones import CameraSetup, DroneSetup, Standalone
+from fractus_sim.testbeds.standalone_drones import LOOPBACK, CameraSetup, DroneSetup, Standalone
 from fractus_sim.testbeds.testbed import Moment, Testbed, program_command, wind_argument
 
 TICK_S = 0.02
@@ -41,6 +42,7 @@ class StandaloneTestbed(Testbed):
         self.processes = self._drones.processes
         self._identities: dict[str, str] = {}
         self._meter = ResourceMeter()
+        self._networks = NodeNetworks(experiment, self.processes, folder)
         self._watches: list[TruthWatch] = []
         self._detections = folder / DETECTIONS_FILE
         self._detections.unlink(missing_ok=True)
@@ -54,6 +56,7 @@ class StandaloneTestbed(Testbed):
         """
         grants = list(planned_grants(self._manifests))
         drone_manifests = self._manifests.of(Drone)
+        self._networks.set_up()
         for setup in self.experiment.setups():
             drone = self._drones.add_drone(self._setup(setup, drone_manifests.get(setup.name)))
             host, port = drone.station_link.removeprefix("tcp:").rsplit(":", 1)
@@ -62,6 +65,7 @@ class StandaloneTestbed(Testbed):
             if drone.world_url is not None:
                 truths = self.folder / "logs" / f"{setup.name}-truth.jsonl"
                 self._watches.append(self.keep(TruthWatch(drone.world_url, truths)))
+        self._networks.start({drone.name: drone.station_link for drone in self._drones.drones.values()})
         self.reissue(grants)
         self._began_s = time.monotonic()
 
@@ -73,19 +77,15 @@ class StandaloneTestbed(Testbed):
         """
         time.sleep(TICK_S)
         self._drones.check()
-        self._meter.measure()
-        self.findings.usages = self._meter.usages
+        if self._meter.measure():
+            self.findings.usages = self._meter.usages
+            self._measure_data()
         return Moment((time.monotonic() - self._began_s) * self.experiment.pace, time.time_ns() // 1000)
 
     def begin(self, program: Program | None = None) -> None:
         """Start a program as its component, or all programs."""
-        addresses = {
-            each.component: f"127.0.0.1:{each.port}"
-            for each in self.experiment.programs
-            if each.component is not None and each.port is not None
-        }
         for each in self.experiment.programs if program is None else (program,):
-            self._start_program(each, addresses)
+            self._start_program(each)
 
     def reissue(self, grants: Iterable[GrantSpec]) -> None:
         """Sign Grants of the drones of this experiment, and replace earlier Grants of the same instances."""
@@ -118,6 +118,7 @@ class StandaloneTestbed(Testbed):
     def collect(self) -> None:
         """Stop programs and services, and read their audit logs."""
         super().collect()
+        self._measure_data()
         self._drones.stop_services()
         if self._detections.exists():
             self.findings.detections = read_detections(self._detections.read_text().splitlines())
@@ -148,28 +149,51 @@ class StandaloneTestbed(Testbed):
             camera=camera,
             vehicle_arguments=("--wind", wind_argument(self.experiment)),
             autopilot=entry.connection,
+            service_host=self._networks.service_host(setup.name) or LOOPBACK,
         )
 
-    def _start_program(self, program: Program, addresses: Mapping[str, str]) -> None:
-        services = {name: address for name, address in addresses.items() if name != program.component}
+    def _start_program(self, program: Program) -> None:
         port = {"PORT": str(program.port)} if program.port is not None else {}
-        identity = self._identities.get(program.component or "")
+        identity = self._identities.get(program.component or "") if program.node is None else None
         components = {component.name for app in self._manifests.applications() for component in app.spec.components}
-        if identity is None and program.component not in components:
+        if identity is None and program.node is None and program.component not in components:
             raise ExperimentError(
                 f"program {program.name}: no application has a component {program.component}; known:"
                 f" {', '.join(sorted(components))}"
             )
         environment = {DETECTIONS_VARIABLE: str(self._detections.absolute()), **port, **program.environment}
+        node = self._node(program)
         self._drones.run(
             program.name,
-            program_command(program),
+            self._networks.command(node, program_command(program)),
             identity,
             environment=environment,
-            services=services,
+            services=self._addresses(program, node),
             folder=self.base,
         )
-        self._meter.add(program.name, self._drones.node_of(program.name), self._drones.processes.pid(program.name))
+        self._meter.add(program.name, node, self._drones.processes.pid(program.name))
+
+    def _node(self, program: Program) -> str:
+        """Return the node of a program. Empty for a component in the cloud without an entry in `nodes`."""
+        identity = self._identities.get(program.component or "")
+        if program.node is not None or identity is None:
+            return program.node or ""
+        return self._drones.node_of_identity(identity)
+
+    def _addresses(self, program: Program, node: str) -> dict[str, str]:
+        """Return the address of each other component that a program can reach."""
+        addresses = {}
+        for each in self.experiment.programs:
+            host = self._networks.address(node, self._node(each))
+            if each.component not in {None, program.component} and each.port is not None and host is not None:
+                addresses[each.component] = f"{host}:{each.port}"
+        return addresses
+
+    def _measure_data(self) -> None:
+        sent = self._networks.measure()
+        for drone in self._drones.drones.values():
+            sent.setdefault(drone.name, {})["autopilot"] = drone.autopilot_bytes
+        self.findings.data_sent = sent
 
 
 def read_all_manifests(paths: Sequence[Path]) -> Manifests:

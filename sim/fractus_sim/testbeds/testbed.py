@@ -13,6 +13,7 @@ from typing import Any, Protocol, TypeVar
 from fractus_core.api.grants import GrantSpec
 
 from fractus_sim.errors import ExperimentError
+from fractus_sim.experiment.checks import DataLevel
 from fractus_sim.experiment.definition import Experiment, Program, VehicleSetup
 from fractus_sim.report.audit_log_reader import read_audit_logs
 from fractus_sim.testbeds.detections import ObservedObject
@@ -42,6 +43,7 @@ class Findings:
     Attributes:
         programs: Exit codes by program. None if the program had to be stopped. Programs that were not started are missing.
         usages: Resources that programs used, by program.
+        data_sent: Bytes that each drone or node sent, by level (app, runtime, autopilot). Unmeasured levels are missing.
         calls: Audit log entries with a verdict.
         audit_problems: Verification problem by log. Empty if the log is valid.
         phases: Phases of each Application in the order observed.
@@ -51,6 +53,7 @@ class Findings:
 
     programs: dict[str, int | None] = field(default_factory=dict)
     usages: dict[str, ProgramUsage] = field(default_factory=dict)
+    data_sent: dict[str, dict[DataLevel, int]] = field(default_factory=dict)
     calls: list[Mapping[str, Any]] = field(default_factory=list)
     audit_problems: dict[str, str] = field(default_factory=dict)
     phases: dict[str, list[str]] = field(default_factory=dict)

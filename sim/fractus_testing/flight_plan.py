@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from fractus_core.api import API_VERSION
+from fractus_core.api.methods import Interface
 from fractus_sim.errors import ExperimentError
 
 Waypoint = tuple[float, float, float]
@@ -148,7 +149,14 @@ MIN_RESOURCES = Resources(cpu="500m", memory="128Mi")
 
 
 def drone_manifests(
-    name: str, component: str, home: tuple[float, float, float], plan: FlightPlan, *, resources: Resources, camera: bool
+    name: str,
+    component: str,
+    home: tuple[float, float, float],
+    plan: FlightPlan,
+    *,
+    resources: Resources,
+    camera: bool,
+    interface: Interface = "grpc",
 ) -> list[Manifest]:
     """Return the Depot, Drone and Application of a drone, and the restrictions of its flight plan.
 
@@ -159,6 +167,7 @@ def drone_manifests(
         plan: Flight plan.
         resources: Resources that the component declares.
         camera: True if the drone has a camera.
+        interface: Protocol over which the program flies the drone.
     """
     services: Manifest = {
         "mobility": {
@@ -166,7 +175,7 @@ def drone_manifests(
             "maxFlightTime": 30, "methods": list(_MOBILITY_METHODS),
         }
     }  # fmt: skip
-    uses: list[Manifest] = [{"service": "mobility", "methods": list(_MOBILITY_METHODS)}]
+    uses: list[Manifest] = [{"service": "mobility", "methods": list(_MOBILITY_METHODS), "interfaces": [interface]}]
     if camera:
         services["camera"] = {
             "resolution": "1280x720", "sensorType": "RGB", "horizontalFieldOfView": 62.2, "lens": {"model": "pinhole"},

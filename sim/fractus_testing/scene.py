@@ -29,6 +29,7 @@ import yaml
 from fractus_cli.manifests import Manifests
 from fractus_core.api import Application
 from fractus_core.api.geometry import Point
+from fractus_core.api.methods import Interface
 from fractus_core.api.model import InvalidObject
 from fractus_core.geo import geodesic_m
 from fractus_sim.errors import ExperimentError
@@ -136,6 +137,7 @@ class VirtualDrone:
         params: Mapping[str, object] | None = None,
         component: str | None = None,
         port: int | None = None,
+        interface: Interface | None = None,
     ) -> None:
         """Set a program under test. It runs as a component of the application, with the environment of its pod.
 
@@ -144,9 +146,11 @@ class VirtualDrone:
             params: Environment variables of the program. Values other than text are passed as JSON.
             component: Component that the program implements. Only needed with `set_manifests`.
             port: Port at which the program listens. Programs of other nodes get the address by the component.
+            interface: `mavlink` for a program that speaks MAVLink: the variable FRACTUS_VEHICLE contains the connection.
+                None: the interface of the App, by default `grpc` for the SDK. Only used with `set_plan`.
         """
         self._scene.require_not_started("set_app")
-        self.apps.append(app_of(program, params or {}, component, port))
+        self.apps.append(app_of(program, params or {}, component, port, interface))
 
     def set_task(self, *steps: dict[str, Any]) -> None:
         """Let a ground station fly the vehicle alone, without services and programs.
@@ -811,6 +815,7 @@ class Scene:
                 manifests += drone_manifests(
                     drone.node, _component(drone), drone.home, drone.plan,
                     resources=drone.resources, camera=drone.world is not None,
+                    interface=drone.apps[0].interface if drone.apps else "grpc",
                 )  # fmt: skip
         if manifests:
             paths.append(self._write("manifests.yaml", manifests).name)
@@ -858,7 +863,7 @@ class Scene:
         if app in drone.logs:
             files += [f"{drone.node}-{number}" for number in range(len(drone.apps))]
         if runtime in drone.logs:
-            files += [f"{drone.node}-mobility", f"{drone.node}-camera"]
+            files += [f"{drone.node}-mobility", f"{drone.node}-camera", f"{drone.node}-gateway"]
         lines = []
         for name in files:
             path = self.folder / "logs" / f"{name}.log"

@@ -83,8 +83,14 @@ def pilot(folder: Path) -> str:
         (malice.floods(), None),
         (malice.forges_identity(), None),
         (malice.forces_arming(), None),
+        (malice.leaves_corridor(60.0, interface="mavlink"), "flight_path"),
+        (malice.presses_border(10.0, interface="mavlink"), "flight_path"),
+        (malice.wrong_frames(interface="mavlink"), "altitude"),
+        (malice.floods(interface="mavlink"), None),
+        (malice.forges_identity(interface="mavlink"), None),
+        (malice.forces_arming(interface="mavlink"), None),
     ],
-    ids=lambda value: value.command[-1] if isinstance(value, App) else "",
+    ids=lambda value: f"{value.command[-1]}-{value.interface}" if isinstance(value, App) else "",
 )
 def test_attack_is_prevented_and_the_drone_returns(fractus: Scene, attack: App, violation: str | None) -> None:
     _, drone = start(fractus, attack)
@@ -108,7 +114,11 @@ def test_pictures_of_others_cannot_be_read_or_deleted(fractus: Scene) -> None:
     fractus.results().check_app_status("vDrone-1", SUCCESS)
 
 
-@pytest.mark.parametrize("attack", [malice.stalls(), malice.crashes()], ids=["stalls", "crashes"])
+@pytest.mark.parametrize(
+    "attack",
+    [malice.stalls(), malice.crashes(), malice.stalls(interface="mavlink"), malice.crashes(interface="mavlink")],
+    ids=lambda app: f"{app.command[-1]}-{app.interface}",
+)
 def test_drone_returns_if_its_program_stalls_or_crashes(fractus: Scene, attack: App) -> None:
     _, drone = start(fractus, attack)
     drone.wait_landed(240)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from ipaddress import IPv4Address
 from pathlib import Path
 
@@ -22,7 +22,7 @@ from fractus_sim.errors import ExperimentError
 from fractus_sim.experiment.checks import DataLevel
 from fractus_sim.experiment.definition import Experiment, SimulatedNetwork
 from fractus_sim.testbeds.local_processes import Processes
-from fractus_sim.testbeds.standalone_drones import LOOPBACK, base_environment
+from fractus_sim.testbeds.standalone_drones import LOOPBACK, base_environment, within
 
 START_TIMEOUT_S = 30.0
 _SERVICE_DEVICE = "svc0"
@@ -113,11 +113,9 @@ class NodeNetworks:
         """Return the address of this machine that programs of a drone can reach. None: they run without namespace."""
         return self._service_hosts.get(vehicle)
 
-    def command(self, node: str, command: Sequence[str]) -> list[str]:
-        """Return a command that runs a program on a node."""
-        if node not in self._holders:
-            return list(command)
-        return ["nsenter", f"--net={self._namespace(node)}", "--", *command]
+    def namespace(self, node: str) -> Path | None:
+        """Return the network namespace of a node. None: its programs run without."""
+        return Path(f"/proc/{self._holders[node]}/ns/net") if node in self._holders else None
 
     def address(self, node: str, other: str) -> str | None:
         """Return the address of another node in the first common network. None if there is no common network.
@@ -149,7 +147,12 @@ class NodeNetworks:
         namespace = Path(f"/proc/{pid}/ns/net")
         self._processes.wait(name, lambda: namespace.stat().st_ino != own, START_TIMEOUT_S)
         self._holders[node] = pid
-        run(self.command(node, ["sh", "-ec", "echo 1 > /proc/sys/net/ipv6/conf/all/disable_ipv6; ip link set lo up"]))
+        run(
+            within(
+                self.namespace(node),
+                ["sh", "-ec", "echo 1 > /proc/sys/net/ipv6/conf/all/disable_ipv6; ip link set lo up"],
+            )
+        )
 
     def _link_services(self, node: str) -> None:
         number = free_port()
@@ -165,21 +168,18 @@ class NodeNetworks:
 
     def _add_device(self, node: str, index: int) -> None:
         device = _device(index)
-        run(self.command(node, ["ip", "tuntap", "add", "dev", device, "mode", "tap"]))
+        run(within(self.namespace(node), ["ip", "tuntap", "add", "dev", device, "mode", "tap"]))
         network = self._experiment.networks[index]
         address = mac_address(f"{network.name} {node}").hex(":")
-        run(self.command(node, ["ip", "link", "set", device, "address", address]))
+        run(within(self.namespace(node), ["ip", "link", "set", device, "address", address]))
         self._configure(node, device, f"{self._address(index, node)}/24")
 
     def _configure(self, node: str, device: str, address: str) -> None:
-        run(self.command(node, ["ip", "address", "add", address, "dev", device]))
-        run(self.command(node, ["ip", "link", "set", device, "up"]))
+        run(within(self.namespace(node), ["ip", "address", "add", address, "dev", device]))
+        run(within(self.namespace(node), ["ip", "link", "set", device, "up"]))
 
     def _address(self, index: int, node: str) -> str:
         return f"10.77.{index}.{self._nodes.index(node) + 1}"
-
-    def _namespace(self, node: str) -> str:
-        return f"/proc/{self._holders[node]}/ns/net"
 
     def _layout(self, control: Path, vehicles: Mapping[str, str]) -> dict[str, object]:
         places = {setup.name: setup.home for setup in self._experiment.setups()}
@@ -190,7 +190,7 @@ class NodeNetworks:
             place = places[node]
             return {
                 "name": node,
-                "namespace": self._namespace(node),
+                "namespace": str(self.namespace(node)),
                 "device": _device(index),
                 "place": None if place is None else {"lat": place.lat, "lon": place.lon, "alt": place.alt},
                 "vehicle": vehicles.get(node),

@@ -20,11 +20,13 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import sys
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
+from tempfile import mkdtemp
 from typing import Any, Self
 
 import yaml
@@ -154,8 +156,11 @@ class Standalone:
         environment: Mapping[str, str] | None = None,
         services: Mapping[str, str] | None = None,
         folder: Path | None = None,
+        namespace: Path | None = None,
     ) -> None:
         """Start a program. Its output is written to `logs/NAME.log`.
+
+        If its Grant permits MAVLink, the variable FRACTUS_VEHICLE contains the MAVLink connection of the gateway.
 
         Args:
             name: Name of the program.
@@ -165,6 +170,7 @@ class Standalone:
             environment: Additional environment variables.
             services: host:port of each component that the program may call, by component name.
             folder: Working directory.
+            namespace: Network namespace of the program. None: that of this process.
 
         Raises:
             ExperimentError: The program cannot be started, or the identity has no Grant.
@@ -176,10 +182,28 @@ class Standalone:
         else:
             variables |= self.environment(identity)
             node = self._grant_of(identity).spec.node
+            variables |= self._connect_gateway(name, identity, node, namespace)
         for component, address in (services or {}).items():
             variables[address_variable(component)] = address
         variables |= environment or {}
-        self._start(name, _Program(node, tuple(command), variables, folder))
+        self._start(name, _Program(node, tuple(within(namespace, command)), variables, folder))
+
+    def _connect_gateway(self, name: str, identity: str, node: str, namespace: Path | None) -> dict[str, str]:
+        """Connect a program to the gateway of its drone. Return variables with the MAVLink connection, if it may use one."""
+        gateway = self._drone(node).gateway_address
+        if gateway is None or "mavlink" not in self._grant_of(identity).spec.interfaces("mobility"):
+            return {}
+        port = free_port()
+        command = [
+            *_module("fractus_cli"), "gateway", "connect", "--gateway", gateway, "--node", node,
+            "--tls", str(self.pki.component(identity)), "--tcp", str(port), "--udp", str(free_port()),
+        ]  # fmt: skip
+        sidecar = f"{name}-sidecar"
+        self._start(sidecar, _Program(node, tuple(within(namespace, command)), base_environment(), None))
+        # A connection attempt would look like a program, so the log is read instead.
+        log = self.processes.log(sidecar)
+        self.processes.wait(sidecar, lambda: b"waiting for MAVLink programs" in log.read_bytes(), START_TIMEOUT_S)
+        return {"FRACTUS_VEHICLE": f"tcp:{LOOPBACK}:{port}"}
 
     def power_off(self, node: str) -> None:
         """Power off the companion computer of a drone. Services and programs are killed; the vehicle keeps flying.
@@ -221,7 +245,7 @@ class Standalone:
         """Stop programs, then services, so that their logs are complete. Vehicles keep running."""
         self.processes.stop(*self._programs)
         for drone in self.drones.values():
-            self.processes.stop(drone.process("camera"), drone.process("mobility"))
+            self.processes.stop(*drone.service_processes)
 
     def close(self) -> None:
         """Stop all processes: programs first, then services, then vehicles."""
@@ -289,6 +313,7 @@ class DroneSetup:
         state: State directory of the mobility service. None: a directory in the directory of the drone. For a running autopilot,
             use a directory that outlives the drone, because it contains the values of the vehicle's owner until they are restored.
         service_host: Address of this machine at which the services listen.
+        gateway: Start the gateway for programs that speak MAVLink.
     """
 
     name: str
@@ -306,6 +331,7 @@ class DroneSetup:
     autopilot: str | None = None
     state: Path | None = None
     service_host: str = LOOPBACK
+    gateway: bool = False
 
 
 class RunningDrone:
@@ -316,6 +342,7 @@ class RunningDrone:
         guest_link: MAVLink endpoint for QGroundControl, Mission Planner or MAVProxy.
         mobility_address: host:port of the mobility service.
         camera_address: host:port of the camera service, or None.
+        gateway_address: host:port of the gateway for programs that speak MAVLink, or None.
         world_url: URL of the camera world, or None.
         grants: Directory of the Grants.
         audit: Audit log of the mobility service. The camera service writes `camera.jsonl` in the same directory.
@@ -337,6 +364,9 @@ class RunningDrone:
         self._tap_port = free_port()
         self._mobility_port = free_port()
         self._camera_port = free_port() if setup.camera is not None else None
+        self._gateway_folder = Path(mkdtemp(prefix="fractus-")) if setup.gateway else None
+        """Directory of the Unix socket to the gateway. Its path must be short."""
+        self.gateway_address = f"{setup.service_host}:{free_port()}" if setup.gateway else None
         self._world_port = free_port() if setup.camera is not None and setup.camera.world is not None else None
         self.station_link = setup.autopilot or f"tcp:{LOOPBACK}:{station}"
         self.guest_link = setup.autopilot or f"tcp:{LOOPBACK}:{guest}"
@@ -389,6 +419,8 @@ class RunningDrone:
         )
         if self._camera_port is not None:
             self._processes.start(self.process("camera"), self._camera_command(), base_environment())
+        if self.gateway_address is not None:
+            self._processes.start(self.process("gateway"), self._gateway_command(), base_environment())
         if wait:
             self._wait_listening("mobility", self._mobility_port, self.setup.service_host)
         if wait and self._camera_port is not None:
@@ -396,12 +428,17 @@ class RunningDrone:
 
     def power_off(self) -> None:
         """Kill the services of the companion computer. The vehicle keeps flying."""
-        self._processes.stop(self.process("mobility"), self.process("camera"), kill=True)
+        self._processes.stop(*self.service_processes, kill=True)
 
     def set_link(self, *, connected: bool) -> None:
         """Cut or restore the link between companion computer and autopilot."""
         if self._tap is not None:
             self._tap.set_link(connected=connected)
+
+    @property
+    def service_processes(self) -> tuple[str, ...]:
+        """Names of the processes of the services, in the order in which they are stopped."""
+        return tuple(self.process(role) for role in ("gateway", "camera", "mobility"))
 
     @property
     def autopilot_bytes(self) -> int:
@@ -412,6 +449,8 @@ class RunningDrone:
         """Close the link tap after the processes have ended."""
         if self._tap is not None:
             self._tap.close()
+        if self._gateway_folder is not None:
+            shutil.rmtree(self._gateway_folder, ignore_errors=True)
 
     def _wait_listening(self, role: str, port: int, host: str = LOOPBACK) -> None:
         self._processes.wait(self.process(role), lambda: listening(port, host), START_TIMEOUT_S)
@@ -469,11 +508,23 @@ class RunningDrone:
         ]  # fmt: skip
 
     def _mobility_command(self) -> list[str]:
+        gateway = ["--gateway-socket", str(self._gateway_socket)] if self._gateway_folder is not None else []
         return [
             *_module("fractus_services.mobility"), "serve", "--grants", str(self.grants), "--tls", str(self._tls),
             "--state", str(self._state), "--audit", str(self.audit), "--node", self.name,
             "--autopilot", f"tcp:{LOOPBACK}:{self._tap_port}", "--listen", self.mobility_address,
-            "--description", str(self.folder / "node.yaml"), *self.setup.service_arguments,
+            "--description", str(self.folder / "node.yaml"), *gateway, *self.setup.service_arguments,
+        ]  # fmt: skip
+
+    @property
+    def _gateway_socket(self) -> Path:
+        return (self._gateway_folder or self.folder) / "gateway.sock"
+
+    def _gateway_command(self) -> list[str]:
+        return [
+            *_module("fractus_cli"), "gateway", "serve", "--tls", str(self._tls),
+            "--mobility-socket", str(self._gateway_socket), "--listen", str(self.gateway_address),
+            "--state", str(self.folder / "gateway"), "--audit", str(self.folder / "gateway.jsonl"),
         ]  # fmt: skip
 
     def _camera_command(self) -> list[str]:
@@ -487,6 +538,11 @@ class RunningDrone:
 
 def _module(name: str) -> list[str]:
     return [sys.executable, "-m", name]
+
+
+def within(namespace: Path | None, command: Sequence[str]) -> list[str]:
+    """Return a command that runs a program in a network namespace."""
+    return list(command) if namespace is None else ["nsenter", f"--net={namespace}", "--", *command]
 
 
 def base_environment() -> dict[str, str]:

@@ -57,8 +57,10 @@ class StandaloneTestbed(Testbed):
         grants = list(planned_grants(self._manifests))
         drone_manifests = self._manifests.of(Drone)
         self._networks.set_up()
+        mavlink_nodes = {spec.node for spec in grants if "mavlink" in spec.interfaces("mobility")}
         for setup in self.experiment.setups():
-            drone = self._drones.add_drone(self._setup(setup, drone_manifests.get(setup.name)))
+            description = self._setup(setup, drone_manifests.get(setup.name), gateway=setup.name in mavlink_nodes)
+            drone = self._drones.add_drone(description)
             host, port = drone.station_link.removeprefix("tcp:").rsplit(":", 1)
             self.observe(setup, TcpLink.connect(host, int(port), CONNECT_S))
             self.endpoints[setup.name] = drone.guest_link
@@ -128,7 +130,7 @@ class StandaloneTestbed(Testbed):
         for drone in self._drones.drones.values():
             self.read_audit_logs(drone.name, drone.folder)
 
-    def _setup(self, setup: VehicleSetup, manifest: Drone | None) -> DroneSetup:
+    def _setup(self, setup: VehicleSetup, manifest: Drone | None, *, gateway: bool) -> DroneSetup:
         if manifest is None:
             raise ExperimentError(f"the manifests contain no Drone {setup.name}; add one")
         if setup.home is None:
@@ -150,6 +152,7 @@ class StandaloneTestbed(Testbed):
             vehicle_arguments=("--wind", wind_argument(self.experiment)),
             autopilot=entry.connection,
             service_host=self._networks.service_host(setup.name) or LOOPBACK,
+            gateway=gateway,
         )
 
     def _start_program(self, program: Program) -> None:
@@ -165,11 +168,12 @@ class StandaloneTestbed(Testbed):
         node = self._node(program)
         self._drones.run(
             program.name,
-            self._networks.command(node, program_command(program)),
+            program_command(program),
             identity,
             environment=environment,
             services=self._addresses(program, node),
             folder=self.base,
+            namespace=self._networks.namespace(node),
         )
         self._meter.add(program.name, node, self._drones.processes.pid(program.name))
 

@@ -84,7 +84,7 @@ class MissionConditionController:
         applications = self.granted_applications(drone.name)
         if applications:
             self._report_times.pop(drone.name, None)
-            return ConditionUpdate(ON_MISSION, "True", "Granted", f"{', '.join(applications)} may fly it")
+            return ConditionUpdate(ON_MISSION, "True", "Granted", f"{', '.join(applications)} may fly the drone")
         known = self._conditions.condition(drone.name, ON_MISSION)
         if known is None or known.status == "False":
             self._report_times.pop(drone.name, None)
@@ -94,8 +94,8 @@ class MissionConditionController:
         if drone.status is not None and drone.status.flight_state != "unknown":
             times.add(last_seen)
         if len(times) > _REPORTS:
-            return ConditionUpdate(ON_MISSION, "False", "NoGrant", "no Application may fly it", progress=True)
-        message = "no Application may fly it, but it has not reported twice since its last Grant was deleted"
+            return ConditionUpdate(ON_MISSION, "False", "NoGrant", "no Application may fly the drone", progress=True)
+        message = "no Application may fly the drone, but it has not reported twice since its last Grant was deleted"
         return ConditionUpdate(ON_MISSION, "Unknown", "AwaitingReports", message, progress=True)
 
     async def _record_override(self, drone: Drone) -> None:

@@ -185,7 +185,9 @@ async def _removed(store: Store, namespace: str, wiped: str, keep_authority: boo
             problems.append(f"it is unknown on which nodes {wiped} was wiped ({error}): check them (rm -rf {wiped})")
         else:
             if remaining:
-                problems.append(f"{wiped} was not wiped on {', '.join(remaining)}: remove it there (rm -rf {wiped})")
+                problems.append(
+                    f"{wiped} was not wiped on {', '.join(remaining)}: remove it on these nodes (rm -rf {wiped})"
+                )
     return problems
 
 

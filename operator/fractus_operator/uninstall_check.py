@@ -1,4 +1,4 @@
-"""`python -m fractus_operator.uninstall_check [--drone NAME]`: checks that an uninstall leaves no drone in the air.
+"""`python -m fractus_operator.uninstall_check [--drone NAME]`: checks that no drone is in the air before an uninstall.
 
 With --drone, only this drone is checked, for the chart that contains it. Without it, no Application may exist either.
 """
@@ -112,7 +112,7 @@ async def _all(store: Store, kind: Kind) -> list[Body]:
 
 def main() -> int:
     """Run the check as a program. Return its exit code."""
-    parser = argparse.ArgumentParser(description="Check that an uninstall leaves no drone in the air.")
+    parser = argparse.ArgumentParser(description="Check that no drone is in the air before an uninstall.")
     parser.add_argument("--drone", help="Name of the only drone to check. Default: all drones and Applications.")
     arguments = parser.parse_args()
     try:

@@ -198,7 +198,7 @@ def _remove_tree(directory: Path) -> OSError | None:
 
 
 def _fill_cpuset(above: Path, directory: Path) -> None:
-    """Copy the CPUs and memory nodes of the parent group to a new group. Version 1 creates it without any."""
+    """Copy the CPUs and memory nodes of the parent group to a new group. Version 1 creates a group without CPUs and memory nodes."""
     for name in ("cpuset.cpus", "cpuset.mems"):
         file = directory / name
         if file.exists() and not file.read_text().strip():

@@ -132,7 +132,7 @@ async def test_refused_removal_does_not_stop_the_rest(monkeypatch: pytest.Monkey
         "drone-2 may not",
     ):
         assert text in output
-    assert "/data/fractus was not wiped on drone-2: remove it there (rm -rf /data/fractus)" in output
+    assert "/data/fractus was not wiped on drone-2: remove it on these nodes (rm -rf /data/fractus)" in output
     assert cluster.deleted == ["Lease fractus-operator", "CertificateSigningRequest two", "DaemonSet fractus-wipe"]
     assert cluster.labels == ["drone-1", "edge-1"]
     assert "wiped" not in await run("fractus-system", "")

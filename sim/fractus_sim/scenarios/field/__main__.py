@@ -128,7 +128,7 @@ def run_field_experiment(out: Path, autopilot: Autopilot, names: tuple[str, ...]
 
 
 def _give_back(borrowed: BorrowedAutopilot) -> list[str]:
-    """Give the autopilot back, and return the differences. A failure is a difference, because the run was flown."""
+    """Restore the autopilot's settings, and return the differences. A failure is returned as a difference, too."""
     try:
         return borrowed.give_back()
     except ExperimentError as error:

@@ -54,6 +54,36 @@ def test_program_takes_off_flies_a_target_and_a_velocity_and_returns(tmp_path: P
     fly(flight, tmp_path)
 
 
+@pytest.mark.parametrize(("altitude_cm", "expected_m"), [(2500.0, 25.0), (9000.0, 60.0)])
+def test_program_returns_at_the_altitude_that_it_has_written_within_the_limits(
+    altitude_cm: float, expected_m: float, tmp_path: Path
+) -> None:
+    async def flight(world):
+        grant = world.drone.grants.put(mavlink_spec())
+        program = await world.program(grant.identity)
+        await program.until(lambda: program.mode == GUIDED)
+        # The autopilot is in STABILIZE, which rejects a speed.
+        program.send("PARAM_SET", param_id=b"WPNAV_SPEED", param_value=400.0)
+        program.send("PARAM_SET", param_id=b"RTL_ALT", param_value=altitude_cm)
+        await program.up()
+        assert "PARAM_SET" not in program.texts
+        program.target(0, 100)
+        await program.until(lambda: abs(program.place[1] - 100) < 1.0, 90.0)
+        assert world.drone.control.cruise_mps == 4.0
+        heights = []
+
+        def landed() -> bool:
+            heights.append(program.place[2])
+            return not program.armed
+
+        assert await program.command(20) == ACCEPTED
+        await program.until(landed, 180.0)
+        assert max(heights) == pytest.approx(expected_m, abs=1.5)
+        await program.close()
+
+    fly(flight, tmp_path)
+
+
 def test_mission_is_complete_when_the_program_leaves_while_another_connection_stays_open(tmp_path: Path) -> None:
     async def flight(world):
         grant = world.drone.grants.put(mavlink_spec())

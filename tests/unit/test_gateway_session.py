@@ -241,6 +241,23 @@ def test_write_of_the_speed_is_reported_at_once_and_becomes_a_call() -> None:
     assert [m.real("param_value") for m in world.sent() if m.name == "PARAM_VALUE"] == [800.0]
 
 
+def test_write_of_the_return_altitude_is_kept_for_return_flights() -> None:
+    world = World()
+    assert world.send("PARAM_SET", target_system=1, param_id=b"RTL_ALT", param_value=1200.0) == []
+    assert [m.real("param_value") for m in world.sent() if m.name == "PARAM_VALUE"] == [1200.0]
+    assert world.parameters.return_altitude_m == 12.0
+    world.parameters.replace({"WPNAV_SPEED": 1000.0, "RTL_ALT": 1500.0})
+    assert world.parameters.values["RTL_ALT"] == 1200.0
+
+
+@pytest.mark.parametrize("value", [-1.0, 100_001.0, math.inf, math.nan])
+def test_write_of_an_invalid_return_altitude_is_refused(value: float) -> None:
+    world = World()
+    assert world.send("PARAM_SET", target_system=1, param_id=b"RTL_ALT", param_value=value) == []
+    assert [m.real("param_value") for m in world.sent() if m.name == "PARAM_VALUE"] == [1500.0]
+    assert world.parameters.return_altitude_m is None
+
+
 def test_refused_speed_is_replaced_by_the_former_value() -> None:
     world = World()
     (call,) = world.send("PARAM_SET", target_system=1, param_id=b"WPNAV_SPEED", param_value=9000.0)

@@ -134,8 +134,10 @@ class GotoRequest(_message.Message):
     def __init__(self, target: _Optional[_Union[_types_pb2.Position, _Mapping]] = ..., yaw_deg: _Optional[float] = ..., acceptance_radius_m: _Optional[float] = ..., speed_mps: _Optional[float] = ...) -> None: ...
 
 class ReturnToLaunchRequest(_message.Message):
-    __slots__ = ()
-    def __init__(self) -> None: ...
+    __slots__ = ("altitude_m",)
+    ALTITUDE_M_FIELD_NUMBER: _ClassVar[int]
+    altitude_m: float
+    def __init__(self, altitude_m: _Optional[float] = ...) -> None: ...
 
 class MotionProgress(_message.Message):
     __slots__ = ("decision", "target", "position", "distance_m", "complete")

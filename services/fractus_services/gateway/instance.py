@@ -387,7 +387,7 @@ class Instance:
         try:
             await self._wait_for_control(call)
             timeout_s = _TIMEOUTS_S.get(method, CALL_TIMEOUT_S)
-            stream = client.stream(method, call.request.message, _REPLIES[method], timeout_s)
+            stream = client.stream(method, self._content(call.request), _REPLIES[method], timeout_s)
             async with aclosing(stream) as replies:
                 async for reply in replies:
                     if not judged:
@@ -420,6 +420,13 @@ class Instance:
                 self._free(setpoint, None)
             elif setpoint is not None and setpoint.flying is call.request.message:
                 setpoint.flying = None
+
+    def _content(self, request: Request) -> ProtobufMessage:
+        """Return the message of a request. A return flight gets the altitude that the program has written."""
+        message: ProtobufMessage = request.message
+        if request.method != "ReturnToLaunch":
+            return message
+        return mobility_pb2.ReturnToLaunchRequest(altitude_m=self.parameters.return_altitude_m)
 
     def _observe_verdict(self, call: Call, began_s: float) -> None:
         if not _waits_for_control(call):
@@ -586,7 +593,7 @@ class Instance:
             noted = False
             try:
                 timeout_s = _TIMEOUTS_S.get(method, CALL_TIMEOUT_S)
-                stream = client.stream(method, request.message, _REPLIES[method], timeout_s)
+                stream = client.stream(method, self._content(request), _REPLIES[method], timeout_s)
                 async with aclosing(stream) as replies:
                     async for reply in replies:
                         if not noted:

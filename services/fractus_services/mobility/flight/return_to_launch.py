@@ -364,7 +364,10 @@ class ReturnFlight:
         near = distance_m <= SETTINGS.reached_m
         heights: tuple[float, ...] = (now.altitude_m,)
         if not near:
-            heights = return_altitudes_m(now, compiled, RTL_CONE_SLOPE * distance_m, goal_xy)
+            preferring = now
+            if flight.return_altitude_m is not None:
+                preferring = replace(now, airframe=replace(now.airframe, return_altitude_m=flight.return_altitude_m))
+            heights = return_altitudes_m(preferring, compiled, RTL_CONE_SLOPE * distance_m, goal_xy)
         for height in heights:
             if place is not None and landing_problem(goal_xy, height, now, compiled):
                 continue

@@ -49,11 +49,13 @@ class SystemFlight:
         constraints: Flight constraints. If the grant changes, the constraints change too.
         kind: Kind of the motions of the flight.
         permit: Returns the permit for the commands of a motion.
+        return_altitude_m: Altitude above home that a return flight prefers. None: the return altitude of the autopilot.
     """
 
     constraints: FlightConstraints
     kind: str
     permit: Callable[[Motion], Permit]
+    return_altitude_m: float | None = None
 
 
 def target_of(position: Position) -> GotoArgs:

@@ -18,7 +18,7 @@ from fractus_core.policy.decision_types import (
     Verdict,
 )
 
-from fractus_services.errors import Aborted, PreconditionFailed, Refused
+from fractus_services.errors import Aborted, AutopilotError, PreconditionFailed, Refused
 from fractus_services.grant_files import ActiveGrant
 from fractus_services.mobility.authority.arming import Arming
 from fractus_services.mobility.authority.control_store import ControlStore
@@ -104,7 +104,12 @@ class MobilityService:
         requested_mps = verdict.args.speed_mps if isinstance(verdict.args, SetSpeedArgs) else args.speed_mps
         verdict, speed = self._limit_to_leg(grant, verdict, requested_mps)
         self._control.set_cruise_speed(requested_mps, speed)
-        await self._autopilot.set_speed(speed, self._control.driver_permit(grant))
+        try:
+            await self._autopilot.set_speed(speed, self._control.driver_permit(grant))
+        except AutopilotError as error:
+            # On the ground, most modes reject a speed. Each leg sets its own speed.
+            if not error.refused or self._autopilot.vehicle.in_air:
+                raise
         return verdict, speed
 
     def _limit_to_leg(self, grant: ActiveGrant, verdict: Verdict, requested_mps: float) -> tuple[Verdict, float]:
@@ -294,17 +299,26 @@ class MobilityService:
 
         return self._run("Land", grant, steps)
 
-    def return_to_launch(self, grant: ActiveGrant) -> AsyncGenerator[Progress, None]:
-        """Fly home on a legal route and land. A route that becomes illegal in flight is replaced."""
+    def return_to_launch(self, grant: ActiveGrant, altitude_m: float | None = None) -> AsyncGenerator[Progress, None]:
+        """Fly home on a legal route and land. A route that becomes illegal in flight is replaced.
+
+        Args:
+            grant: Grant of the caller.
+            altitude_m: Preferred altitude above home. None: the return altitude of the autopilot.
+        """
         self.calls.cancel_pending(grant)
         verdict = self.calls.allow_motion(Call("ReturnToLaunch"), grant)
         _require_in_air(self._autopilot)
-        return self._return(grant, verdict)
+        return self._return(grant, verdict, altitude_m)
 
-    async def _return(self, grant: ActiveGrant, verdict: Verdict) -> AsyncGenerator[Progress, None]:
+    async def _return(
+        self, grant: ActiveGrant, verdict: Verdict, altitude_m: float | None
+    ) -> AsyncGenerator[Progress, None]:
         control = self._control
         constraints = control.begin_system_flight(control.require_control(grant).grant)
-        flight = SystemFlight(constraints, "ReturnToLaunch", lambda motion: control.driver_permit(grant, motion))
+        flight = SystemFlight(
+            constraints, "ReturnToLaunch", lambda motion: control.driver_permit(grant, motion), altitude_m
+        )
         replans = ReplanBudget(constraints)
         continues = True
         try:

@@ -36,6 +36,7 @@ from fractus_services.mobility.rpc.proto_conversion import (
     control_event,
     goto_args,
     motion_progress,
+    return_altitude_m,
     velocity_args,
 )
 from fractus_services.mobility.rpc.telemetry import located, position_of, telemetry_of, velocity_of
@@ -280,11 +281,13 @@ class MobilityHandlers(mobility_pb2_grpc.MobilityServiceServicer):
             await self._send_progress(self._service.land(self.admission.grant_of(caller)), context)
 
     async def ReturnToLaunch(  # noqa: N802
-        self, _request: mobility_pb2.ReturnToLaunchRequest, context: CallContext
+        self, request: mobility_pb2.ReturnToLaunchRequest, context: CallContext
     ) -> None:
         """See mobility.proto."""
         async with self.admission.call(context, urgent=True) as caller:
-            await self._send_progress(self._service.return_to_launch(self.admission.grant_of(caller)), context)
+            altitude_m = return_altitude_m(request)
+            progress = self._service.return_to_launch(self.admission.grant_of(caller), altitude_m)
+            await self._send_progress(progress, context)
 
     async def _send_progress(self, progress: AsyncGenerator[Progress, None], context: CallContext) -> None:
         """Send every step of a motion. Only the first message contains the decision and the target."""

@@ -68,6 +68,22 @@ def goto_args(request: mobility_pb2.GotoRequest) -> GotoArgs:
     )
 
 
+MAX_RETURN_ALTITUDE_M = 1000.0
+
+
+def return_altitude_m(request: mobility_pb2.ReturnToLaunchRequest) -> float | None:
+    """Return the preferred altitude of a return flight; None if the request contains none.
+
+    Raises:
+        Refused: The altitude is out of range.
+    """
+    if not request.HasField("altitude_m"):
+        return None
+    if not 0.0 <= request.altitude_m <= MAX_RETURN_ALTITUDE_M:
+        raise _invalid(f"altitude_m must be 0 to {MAX_RETURN_ALTITUDE_M:.0f} m above home, not {request.altitude_m:g}")
+    return request.altitude_m
+
+
 def velocity_args(request: mobility_pb2.SetVelocityRequest) -> VelocityArgs:
     """Return the arguments of a SetVelocity request.
 

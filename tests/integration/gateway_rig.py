@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from fractus_cluster.ports import free_port
+from fractus_core.geo import LocalFrame
 from fractus_services.gateway import gateway_server, sidecar
 from fractus_services.gateway.gateway_server import GatewayOptions
 from fractus_services.gateway.sidecar import SidecarOptions
-from mobility_rig import ALL, DRIVER, NODE, Rig, grant
+from mobility_rig import ALL, DRIVER, HOME, NODE, Rig, grant
 from vehicle_process import Client
 
 ACCEPTED = 0
@@ -28,6 +29,21 @@ def mavlink_grant(*policies: dict[str, Any], **changes: Any) -> dict[str, Any]:
     return grant(*policies, **{"services": services, **changes})
 
 
+def wide_grant(home: tuple[float, float, float]) -> dict[str, Any]:
+    """Return a driver's Grant that permits MAVLink within 1 km of a home."""
+    frame = LocalFrame(home[0], home[1])
+
+    def place(x: float, y: float) -> dict[str, float]:
+        return dict(zip(("lat", "lon"), frame.latlon(x, y), strict=True))
+
+    corners = [place(x, y) for x, y in ((-1000, -1000), (1000, -1000), (1000, 1000), (-1000, 1000))]
+    return mavlink_grant(
+        controlPoints=[{"navigation": "pathBased", "path": [{**place(0, 40), "alt": 10.0}]}],
+        operationArea=[{"polygon": {"exterior": corners}}],
+        home={"lat": home[0], "lon": home[1], "alt": home[2], "altitudeReference": "amsl"},
+    )
+
+
 class GatewayRig:
     """A drone with a gateway. Gateway and sidecar run in this process, because processes start slowly."""
 
@@ -41,9 +57,14 @@ class GatewayRig:
         self._stop_sidecar = asyncio.Event()
         self._tasks: list[asyncio.Task[None]] = []
 
-    def start_services(self, speedup: float = 1.0) -> None:
-        """Start vehicle and mobility service."""
-        self.rig.start_vehicle(speedup)
+    def start_services(self, *more: str, home: tuple[float, float, float] = HOME) -> None:
+        """Start vehicle and mobility service.
+
+        Args:
+            more: Additional arguments of the vehicle.
+            home: Latitude, longitude and altitude of the vehicle.
+        """
+        self.rig.start_vehicle(1.0, *more, home=home)
         self.rig.start_service("--gateway-socket", str(self.socket))
 
     def write_identity(self, identity: str = DRIVER) -> Path:

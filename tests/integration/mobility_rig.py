@@ -229,11 +229,11 @@ class Rig:
         fresh.replace(path)
         return path
 
-    def start_vehicle(self, speedup: float = 3.0, *more: str) -> None:
+    def start_vehicle(self, speedup: float = 3.0, *more: str, home: tuple[float, float, float] = HOME) -> None:
         """Start the vehicle. It lands three times as fast as with ArduCopter's default, so that tests wait less."""
-        home = ",".join(str(v) for v in HOME)
+        place = ",".join(str(v) for v in home)
         self._start(
-            "vehicle", "-m", "fractus_vehicle", "--listen", self.link, "--home", home, "--speedup", str(speedup),
+            "vehicle", "-m", "fractus_vehicle", "--listen", self.link, "--home", place, "--speedup", str(speedup),
             "--ready-after", "2", "--throttle", "1500", "--param", "LAND_SPEED=150", *more,
         )  # fmt: skip
 

@@ -95,7 +95,7 @@ PLAN: dict[str, Any] = {
 }
 
 
-def _lists(plan: dict[str, Any]) -> dict[int, list[tuple[int, int, list[float], float, float, float]]]:
+def item_lists(plan: dict[str, Any]) -> dict[int, list[tuple[int, int, list[float], float, float, float]]]:
     """Convert a plan to item lists like QGroundControl: mission (0), fence (1) and rally points (2).
 
     Each item is (command, frame, params, lat, lon, alt).
@@ -121,7 +121,7 @@ def _lists(plan: dict[str, Any]) -> dict[int, list[tuple[int, int, list[float], 
 def test_qgroundcontrol_plan_is_uploaded_and_flown(tmp_path: Path):
     path = tmp_path / "survey.plan"
     path.write_text(json.dumps(PLAN))
-    lists = _lists(json.loads(path.read_text()))
+    lists = item_lists(json.loads(path.read_text()))
     port = free_port()
     with running_vehicle("--ready-after", "3", "--speedup", "10", links=(f"tcp:127.0.0.1:{port}",)):
         client = Client(f"tcp:127.0.0.1:{port}")

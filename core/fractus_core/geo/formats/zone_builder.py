@@ -472,7 +472,7 @@ def _simplified(ring: Sequence[Any], field: str) -> list[tuple[float, float]]:
 
 
 def _pieces(start: Point, end: Point) -> int:
-    """Return the number of parts of a straight line of degrees such that each part bends by at most `MAX_BEND_M`."""
+    """Return into how many parts to divide a straight line in degrees, so that each part bends by at most `MAX_BEND_M`."""
     lat = math.radians(min(max(abs(start.lat), abs(end.lat)), 89.0))
     lon_deg = abs(end.lon - start.lon)
     width_m = math.radians(min(lon_deg, 360.0 - lon_deg)) * math.cos(lat) * EARTH_RADIUS_M

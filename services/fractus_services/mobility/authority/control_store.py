@@ -275,7 +275,7 @@ class ControlStore:
         return current is not None and current.key == grant.key
 
     def latest(self, grant: ActiveGrant) -> ActiveGrant:
-        """Return the grant with its latest policies; the grant itself if it was removed."""
+        """Return the latest version of a grant; the given grant if it was removed."""
         return self._grants.active[grant.identity] if self.is_valid(grant) else grant
 
     def not_ready_reason(self, key: str) -> str | None:

@@ -128,7 +128,7 @@ class MobilityService:
             return verdict, requested_mps
         if rest.action == "allow" and not rest.brake_first and speed > motion.speed_mps:
             return replace(verdict, args=SetSpeedArgs(speed)), speed  # Within the overshoot of a limit along the leg.
-        reason = f"the current leg is flown with {speed:.1f} m/s: {rest.reason or 'it is not legal faster'}"
+        reason = f"the current leg is flown with {speed:.1f} m/s: {rest.reason or 'a higher speed is not legal'}"
         return Verdict("correct", SetSpeedArgs(speed), rest.code or "SpeedAboveLimit", reason, rest.policies), speed
 
     async def point_gimbal(self, grant: ActiveGrant, args: PointGimbalArgs, *, fixed_camera: bool) -> Verdict:

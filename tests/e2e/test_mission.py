@@ -57,6 +57,7 @@ def children(kube: Kube, namespace: str = "default", pods: str = "") -> list[str
 def test_traffic_monitoring_flies_under_policies(grounded: Kube, tmp_path: Path) -> None:
     kube = grounded
     app = example("application.yaml")[0]
+    app["spec"]["afterFlight"] = 5  # with the default of 30 s, the test would only wait longer
     started = time.monotonic()
     kube.apply(app)
     kube.wait("all pods of the example are Ready", lambda: ready(kube, "traffic-monitoring"), timeout_s=60)

@@ -450,7 +450,11 @@ def test_phase_follows_drone(world: World, operator: OperatorProcess, namespace:
     assert {"MissionBegun", "TelemetryLost"} <= set(events(world, namespace))
 
 
-@pytest.mark.parametrize(("phase", "reason"), [("Failed", "MissionFailed"), ("Revoked", "MissionRevoked")])
+# A unit test contains every outcome (test_status_reports_every_mission_outcome).
+@pytest.mark.parametrize(
+    ("phase", "reason"),
+    [("Failed", "MissionFailed"), pytest.param("Revoked", "MissionRevoked", marks=pytest.mark.slow)],
+)
 def test_failed_mission_is_reported(
     world: World, operator: OperatorProcess, namespace: str, phase: str, reason: str
 ) -> None:
@@ -502,6 +506,8 @@ def test_refused_pods_are_reported(world: World, operator: OperatorProcess, name
     deployed(world, namespace)
 
 
+# `make test` shows this with test_finished_pods_stay_stopped_for_their_logs.
+@pytest.mark.slow
 def test_changed_spec_flies_again_after_completion(world: World, operator: OperatorProcess, namespace: str) -> None:
     running(world, namespace)
     end_mission(world, namespace, "Complete", "done")
@@ -663,9 +669,9 @@ def test_grant_is_deleted_if_finalizer_was_removed_by_hand(
     operator.stop(signal.SIGKILL)
     world.api.delete(world.path(traffic(namespace)))
     world.api.merge(world.path(traffic(namespace)), {"metadata": {"finalizers": None}})
-    assert world.grants(namespace)
+    assert granted(world, namespace)
     operator.start()
-    wait_for(lambda: not world.grants(namespace), "the orphaned Grants to be deleted")
+    wait_for(lambda: not granted(world, namespace), "the orphaned Grants and DirectLinks to be deleted")
 
 
 def test_recreated_application_gets_new_plan(world: World, operator: OperatorProcess, namespace: str) -> None:

@@ -171,6 +171,8 @@ def test_direct_links_follow_drone_and_end_with_mission(
     wait_for(lambda: not world.links(namespace), "the DirectLinks to be deleted")
 
 
+# `make test` shows this with test_deleted_application_leaves_no_objects.
+@pytest.mark.slow
 def test_direct_links_are_deleted_with_application(world: World, operator: OperatorProcess, namespace: str) -> None:
     running(world, namespace)
     world.api.delete(world.path(traffic(namespace)))
@@ -179,6 +181,8 @@ def test_direct_links_are_deleted_with_application(world: World, operator: Opera
     )
 
 
+# `make test` shows this with test_grant_is_deleted_if_finalizer_was_removed_by_hand.
+@pytest.mark.slow
 def test_direct_links_without_application_are_deleted(world: World, operator: OperatorProcess, namespace: str) -> None:
     running(world, namespace)
     operator.stop()

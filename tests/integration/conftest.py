@@ -19,8 +19,18 @@ for number in (signal.SIGINT, signal.SIGHUP):
     if signal.getsignal(number) is signal.SIG_IGN:
         signal.signal(number, signal.default_int_handler)
 
-LONG = ("test_scenario_field", "test_sdk_flight", "test_mobility_sdk", "test_mobility_lost")
-"""Modules with the longest flights. They run first, so that no worker runs them alone at the end."""
+LONG = (
+    "test_scenario_field",
+    "test_agent",
+    "test_agent_watch",
+    "test_sdk_flight",
+    "test_sdk_plans",
+    "test_gimbal",
+    "test_flight_recording",
+    "test_mobility_sdk",
+    "test_mobility_lost",
+)
+"""Modules with the longest flights, or with tests of one group. They run first, so that no worker runs them alone at the end."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -22,6 +22,9 @@ from fractus_runtime.kubernetes import BlockingClient, KubeError, with_certifica
 T = TypeVar("T")
 Body = dict[str, Any]
 
+POLL_S = 0.1
+"""Pause between two polls. Polls need processor time of the test and of the API server, which the operator waits for."""
+
 PROGRAMS = ("etcd", "kube-apiserver", "kube-controller-manager")
 _CONTROLLERS = (
     "garbage-collector-controller",
@@ -54,7 +57,7 @@ def wait_for(poll: Callable[[], T | None], description: str | Callable[[], str],
         if time.monotonic() > end:
             text = description if isinstance(description, str) else description()
             raise AssertionError(f"waited {timeout_s:.0f} s for {text}")
-        select_pause(0.05)
+        select_pause(POLL_S)
 
 
 def select_pause(seconds: float) -> None:

@@ -6,6 +6,7 @@ An API server drops unknown fields without a message, so only a strict schema ch
 from __future__ import annotations
 
 import copy
+from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ import pytest
 import yaml
 from chart import CHARTS, EVERYTHING, render
 from fractus_cluster.binaries import KUBERNETES_VERSIONS
-from kubernetes_validate import validate
+from kubernetes_validate import utils, validate
 from kubernetes_validate.utils import SchemaNotFoundError, ValidationError
 
 Body = dict[str, Any]
@@ -40,6 +41,14 @@ def rendered(source: str) -> tuple[Body, ...]:
             return tuple(yaml.safe_load(path.read_text()) for path in sorted(GOLDEN.glob("*.yaml")))
         case _:
             return tuple(render(chart=source))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def schemas_read_once() -> Iterator[None]:
+    """Read each schema once. The library would read the definitions of all kinds again for each object."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(utils, "schema_contents", cache(utils.schema_contents))
+        yield
 
 
 @pytest.mark.parametrize("version", VERSIONS)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ from fractus_core.geo import LocalFrame
 from fractus_services.gateway import gateway_server, sidecar
 from fractus_services.gateway.gateway_server import GatewayOptions
 from fractus_services.gateway.sidecar import SidecarOptions
-from mobility_rig import ALL, DRIVER, HOME, NODE, Rig, grant
+from mobility_rig import ALL, DRIVER, FRAME, HOME, NODE, Rig, grant
 from vehicle_process import Client
 
 ACCEPTED = 0
@@ -66,6 +67,24 @@ class GatewayRig:
         """
         self.rig.start_vehicle(1.0, *more, home=home)
         self.rig.start_service("--gateway-socket", str(self.socket))
+
+    def start_processes(self, *more: str) -> None:
+        """Start gateway and sidecar as processes, which a test may kill.
+
+        Args:
+            more: Arguments of a program that starts too, and gets the address of the sidecar.
+        """
+        rig = self.rig
+        rig.start(
+            "gateway", "-m", "fractus_cli", "gateway", "serve", "--tls", str(rig.tls), "--listen", self.address,
+            "--mobility-socket", str(self.socket), "--state", str(rig.directory / "gateway"), "--audit", str(self.audit),
+        )  # fmt: skip
+        rig.start(
+            "sidecar", "-m", "fractus_cli", "gateway", "connect", "--gateway", self.address, "--node", NODE,
+            "--tls", str(self.write_identity()), "--tcp", str(self.port), "--udp", str(self.port + 1),
+        )  # fmt: skip
+        if more:
+            rig.start("program", *more, f"tcp:127.0.0.1:{self.port}")
 
     def write_identity(self, identity: str = DRIVER) -> Path:
         """Write the certificate of an instance, and return its directory."""
@@ -145,3 +164,23 @@ def up(client: Client, altitude_m: float = 10.0) -> None:
 async def in_thread(function: Any, *arguments: Any) -> Any:
     """Run a blocking client in a thread."""
     return await asyncio.to_thread(function, *arguments)
+
+
+def patrol(address: str) -> None:
+    """Take off, and fly between two targets until the process is killed."""
+    client = connected(address, START_S)
+    up(client)
+    side_m = 30.0
+    while True:
+        lat, lon = FRAME.latlon(0, side_m)
+        side_m = -side_m
+        values = (round(lat * 1e7), round(lon * 1e7), 10.0, *[0.0] * 8)
+        client.link.mav.set_position_target_global_int_send(0, 1, 1, 6, 0b110111111000, *values)
+        end = time.monotonic() + 6.0
+        while time.monotonic() < end:
+            client.link.mav.heartbeat_send(6, 8, 0, 0, 0)
+            client.link.recv_match(blocking=True, timeout=0.5)
+
+
+if __name__ == "__main__":
+    patrol(sys.argv[1])

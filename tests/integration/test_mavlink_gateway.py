@@ -8,15 +8,18 @@ from __future__ import annotations
 import asyncio
 import math
 import os
+import random
 import signal
 import sys
 from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
 
+import gateway_rig
 import pytest
+from depth import cells
 from gateway_rig import ACCEPTED, START_S, GatewayRig, acknowledged, connected, in_thread, mavlink_grant, up
-from mobility_rig import FRAME, NODE, Rig
+from mobility_rig import FRAME, Rig, xy
 
 CLIENTS = Path(__file__).with_name("vehicle_clients")
 CLIENTS_PYTHON = os.environ.get("FRACTUS_CLIENTS_PYTHON", sys.executable)
@@ -75,16 +78,30 @@ async def test_dronekit_program_flies_guided(gateway: GatewayRig):
 
 @pytest.mark.timeout(150)
 async def test_gateway_and_sidecar_processes_serve_until_stopped(rig: Rig, gateway: GatewayRig):
-    directory = rig.directory
-    rig.start(
-        "gateway", "-m", "fractus_cli", "gateway", "serve", "--tls", str(rig.tls), "--listen", gateway.address,
-        "--mobility-socket", str(gateway.socket), "--state", str(directory / "gateway"), "--audit", str(gateway.audit),
-    )  # fmt: skip
-    rig.start(
-        "sidecar", "-m", "fractus_cli", "gateway", "connect", "--gateway", gateway.address, "--node", NODE,
-        "--tls", str(gateway.write_identity()), "--tcp", str(gateway.port), "--udp", str(gateway.port + 1),
-    )  # fmt: skip
+    gateway.start_processes()
     await rig.until_logged("gateway", "program connected (instance=spiffe://fractus.dev/ns/default/app/app", START_S)
     for name in ("sidecar", "gateway"):
         rig.send_signal(name, signal.SIGTERM)
         assert await rig.ended(name) == 0, rig.log(name)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(400)
+@pytest.mark.parametrize("seed", cells(range(30), quick=[0, 1, 2]))
+async def test_drone_stops_and_comes_home_after_a_kill(rig: Rig, gateway: GatewayRig, seed: int):
+    """Kill gateway, sidecar or program at a random moment of a flight.
+
+    `test_program_that_dies_in_flight_is_brought_home` and `test_silent_program_loses_control_and_the_drone_returns` are faster forms.
+    """
+    victim = ("gateway", "sidecar", "program")[seed % 3]
+    gateway.start_services()
+    rig.write_grant(mavlink_grant())
+    await rig.until_logged("service", "gateway: serving", 2 * START_S)
+    gateway.start_processes(gateway_rig.__file__)
+    await rig.until(lambda t: t.in_air, 120, "takeoff")
+    await asyncio.sleep(random.Random(seed).uniform(0.0, 25.0))
+    rig.kill(victim)
+    hover = await rig.until(lambda t: t.controller == "system", 30, "takeover")
+    assert hover.in_air
+    landed = await rig.until(lambda t: not t.armed, 150, "landing")
+    assert math.hypot(*xy(landed.position)) < 3.0

@@ -1,4 +1,4 @@
-"""Faults of the platform that the drills must find. `bench/drills.py` applies each of them in a process of its own.
+"""Faults of the platform that the drills must find. `bench/platform_faults.py` applies each of them in a process of its own.
 
 A fault replaces text in one function of a module. Only the code of this function changes, so modules need not be imported
 again, and the fault ends with its process.

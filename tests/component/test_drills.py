@@ -1,4 +1,4 @@
-"""Drills find nothing on the unmodified platform, and a sample of faults. `bench/drills.py` tries all faults."""
+"""Drills find nothing on the unmodified platform, and a sample of faults. `bench/platform_faults.py` tries all faults."""
 
 from __future__ import annotations
 

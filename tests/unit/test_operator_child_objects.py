@@ -202,7 +202,7 @@ async def test_addresses_are_updated_only_in_endpoint_slices_of_the_operator() -
         owned = owned_object(kinds.ENDPOINT_SLICE, APPLICATION, name, {"endpointslice.kubernetes.io/managed-by": by})
         owned["endpoints"] = [{"addresses": ["10.0.0.7"]}]
         copies[kinds.ENDPOINT_SLICE].record_write((APPLICATION.key[0], name), owned)
-    rollout = Rollout(children, cast(Any, None), cast(Any, None), lambda: NOW)
+    rollout = Rollout(children, cast(Any, None), cast(Any, None), lambda: NOW, "gateway:1")
     await rollout.update_addresses(APPLICATION.key, PLAN, [])
     assert store.requests == ["patch EndpointSlice ours"]
 

@@ -156,7 +156,7 @@ def scene(monkeypatch: pytest.MonkeyPatch) -> Scene:
     )
     objects = FakeObjects(cache)
     clock = Clock()
-    rollout = Rollout(cast(Any, objects), cast(Any, cache), AUTHORITY, lambda: clock.now)
+    rollout = Rollout(cast(Any, objects), cast(Any, cache), AUTHORITY, lambda: clock.now, "gateway:1")
     return Scene(rollout, objects, cache, clock)
 
 
@@ -246,7 +246,7 @@ async def test_restarted_operator_writes_secrets_of_pods_that_are_not_ready(scen
     """The previous operator may have been killed between the Deployment and its Secret."""
     await scene.apply()
     scene.objects.secrets.clear()
-    restarted = Rollout(cast(Any, scene.objects), scene.cache, AUTHORITY, lambda: NOW)
+    restarted = Rollout(cast(Any, scene.objects), scene.cache, AUTHORITY, lambda: NOW, "gateway:1")
     await restarted.renew_certificates(APPLICATION, PLACED, [pod(INSTANCES[0])])
     assert scene.objects.secrets == [(INSTANCES[0], "lost")]
 
@@ -254,7 +254,7 @@ async def test_restarted_operator_writes_secrets_of_pods_that_are_not_ready(scen
 async def test_new_authority_renews_all_certificates(scene: Scene) -> None:
     await scene.apply()
     scene.objects.secrets.clear()
-    restarted = Rollout(cast(Any, scene.objects), scene.cache, Authority.generate(NOW), lambda: NOW)
+    restarted = Rollout(cast(Any, scene.objects), scene.cache, Authority.generate(NOW), lambda: NOW, "gateway:1")
     await restarted.renew_certificates(APPLICATION, PLACED, ())
     assert sorted(scene.objects.secrets) == sorted((instance, "renewed") for instance in INSTANCES)
 

@@ -9,13 +9,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fractus_proto.v1 import mobility_pb2
+from fractus_proto.v1 import gateway_pb2, mobility_pb2
 from fractus_runtime.mavlink_codec import Endpoint, Parser
 from fractus_services.gateway import instance as instance_module
 from fractus_services.gateway import session as session_module
 from fractus_services.gateway.instance import Instance
 from fractus_services.gateway.mobility_client import CallRefused, MobilityClient
 from fractus_services.gateway.session import Session
+from fractus_services.mavlink_server.mission_items import Item
 from google.rpc import code_pb2
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
@@ -63,6 +64,9 @@ class Service:
 
     async def call(self, method: str, *_arguments: Any) -> Any:
         self.calls.append(method)
+        if method == "CheckRoute":
+            await self.verdict.wait()
+            return gateway_pb2.RouteVerdict()
         if method == "ConfirmAlive":
             raise CallRefused(code_pb2.UNAVAILABLE, "too many calls")
         return mobility_pb2.ReturnControlResponse()
@@ -310,5 +314,33 @@ def test_control_continues_when_one_confirmation_is_refused(monkeypatch: pytest.
         await asyncio.sleep(0.05)
         assert service.calls.count("GetControl") == 1
         assert instance.vehicle.granted
+
+    run(monkeypatch, scenario)
+
+
+@pytest.mark.parametrize("mode", [mavlink.COPTER_MODE_BRAKE, mavlink.COPTER_MODE_RTL])
+def test_mission_is_not_flown_if_a_later_command_arrives_before_its_verdict(
+    mode: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def scenario(instance: Instance, service: Service) -> None:
+        program = Program(instance)
+        program.beat()
+        await until(lambda: instance.vehicle.granted)
+        drone = Endpoint(1, 1)
+        heartbeat = drone.encode("HEARTBEAT", {"base_mode": mavlink.MAV_MODE_FLAG_SAFETY_ARMED})
+        position = drone.encode("GLOBAL_POSITION_INT", {"lat": 10_000_000, "lon": 10_000_000})
+        for message in Parser().feed(heartbeat + position):
+            instance.vehicle.take(message, asyncio.get_running_loop().time())
+        item = Item(mavlink.MAV_CMD_NAV_WAYPOINT, x=10_000_000, y=10_000_000, z=10.0)
+        instance.missions.mission.store.items = [item, item]
+        service.verdict.clear()
+        program.command(300)
+        await until(lambda: "CheckRoute" in service.calls)
+        program.command(176, 1, mode)
+        await until(lambda: (176, mavlink.MAV_RESULT_ACCEPTED) in program.results())
+        service.verdict.set()
+        await until(lambda: (300, mavlink.MAV_RESULT_TEMPORARILY_REJECTED) in program.results())
+        assert instance.vehicle.mode == mode
+        assert "Goto" not in service.calls
 
     run(monkeypatch, scenario)

@@ -218,6 +218,21 @@ def test_current_item_is_set_on_the_ground() -> None:
     assert world.missions.mission.current == 1
 
 
+def test_new_mission_begins_at_its_first_item() -> None:
+    world = World()
+    _stored(world, 16, 16, 16)
+    world.command(224, 3)
+    world.sent()
+    _stored(world, 16, 16)
+    assert world.missions.mission.current == 0
+    world.vehicle.flying_mode = AUTO  # paused
+    world.missions.mission.current = 2
+    _stored(world, 16, 16)
+    assert world.missions.mission.current == 2
+    _stored(world, 16)
+    assert world.missions.mission.current == 0
+
+
 def test_current_item_is_set_in_auto_by_a_call() -> None:
     world = World()
     _stored(world, 16, 16)

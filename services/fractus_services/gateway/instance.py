@@ -161,6 +161,7 @@ class Instance:
         self._granted = asyncio.Event()
         self._calls: set[asyncio.Task[None]] = set()
         self._flight: asyncio.Task[None] | None = None  # of the mission
+        self._motions = 0  # number of requests that end the motion before them
         self._in_fence = True
         self._setpoints = {"motion": _Setpoint(), "gimbal": _Setpoint(), "speed": _Setpoint()}
 
@@ -362,6 +363,8 @@ class Instance:
             setpoint.busy = True
         elif steers:
             self._setpoints["motion"].pending = None  # sent before this call
+        if call.request.method == FLY_MISSION:
+            self._motions += 1
         if steers:
             self._stop_flight()
         work = self._run_mission_call if call.request.method in _MISSION_METHODS else self._run_call
@@ -498,6 +501,7 @@ class Instance:
     ) -> None:
         """Judge an uploaded mission, or judge and fly the rest of the stored mission."""
         flies = call.request.method == FLY_MISSION
+        motions = self._motions
         mission = self.missions.mission if flies else self.missions.with_items(call.request.message)
         try:
             first = mission.next_after(0) if not flies else self._first_item(call.request.message)
@@ -514,8 +518,12 @@ class Instance:
             result = _RESULTS.get(refusal.status, mavlink.MAV_RESULT_FAILED)
             session.finish(call, result, refusal.reason, self._loop.time())
             return
+        if flies and (motions != self._motions or not self.vehicle.granted):
+            reason = "a later command replaced this command"
+            session.finish(call, mavlink.MAV_RESULT_TEMPORARILY_REJECTED, reason, self._loop.time())
+            return
         session.finish(call, mavlink.MAV_RESULT_ACCEPTED, corrections, self._loop.time())
-        if flies and first is not None and self.vehicle.granted:
+        if flies and first is not None:
             self._stop_flight()
             self.vehicle.flying_mode = mavlink.COPTER_MODE_AUTO
             self._flight = self._spawn(self._fly_mission(client, first))
@@ -622,7 +630,8 @@ class Instance:
         return self._flight is not None and not self._flight.done()
 
     def _stop_flight(self) -> None:
-        """End the flight of the mission. The current item does not change."""
+        """End the flight of the mission, and starts that wait for a verdict. The current item does not change."""
+        self._motions += 1
         if self._flight is not None:
             self._flight.cancel()
             self._flight = None

@@ -13,6 +13,9 @@ from fractus_services.gateway.mission_route import Place, lands, requests_of
 from fractus_services.gateway.translate import Request
 from fractus_services.mavlink_server.stored_mission import ARRIVALS, Mission, hold_s, title
 
+ITEM_PAUSE_S = 0.1
+"""Minimum duration of an item."""
+
 
 class MissionReports(Protocol):
     """Reports about a mission to the programs of the instance."""
@@ -59,8 +62,8 @@ async def fly_mission(
         requests, at = requests_of(item, at)
         for request in requests:
             await perform(request)
-        if item.navigates:
-            await _hold(hold_s(item))
+        # The pause keeps a loop of items without a motion from blocking the gateway.
+        await _hold(max(hold_s(item), ITEM_PAUSE_S) if item.navigates else ITEM_PAUSE_S)
         if item.command in ARRIVALS:
             report(f"Reached command #{number}")
         reports.report_reached(number)

@@ -99,6 +99,8 @@ class MissionLists:
         self._judged = None
         if not problem:
             self.mission.store.items = items
+            if not self._vehicle.in_mission or self.mission.current >= len(items):
+                self.mission.rewind()
             self._save()
         self.transfers.conclude(_MISSION, mavlink.MAV_MISSION_DENIED if problem else mavlink.MAV_MISSION_ACCEPTED)
 
@@ -159,8 +161,9 @@ class MissionLists:
         """Enable or disable the fence. Return False if there is no fence to enable."""
         if enabled and not self._shapes:
             return False
-        self.fence_enabled = enabled
-        self._save()
+        if enabled != self.fence_enabled:
+            self.fence_enabled = enabled
+            self._save()
         return True
 
     def _build_fence(self, items: list[Item]) -> None:

@@ -364,6 +364,29 @@ class VirtualController:
         self._scene.run.report("", f"restrictions of the controller: {names}")
         self._issue(self._scene.nodes)
 
+    def set_plan(self, drone: VirtualDrone, plan: FlightPlan, at: Trigger | None = None) -> None:
+        """Replace the flight plan of a drone in flight: permitted area, waypoints and restrictions.
+
+        The new Grant takes effect within one second. The vehicle's own fence stays around the area of the first plan
+        until the drone lands, so the area can only become smaller. The program is not informed: `control.remaining()`
+        of the SDK contains the waypoints of the first plan.
+
+        Args:
+            drone: Drone with a flight plan.
+            plan: New flight plan.
+            at: Moment of a flight to wait for.
+
+        Raises:
+            AssertionError: The moment did not come.
+            ExperimentError: The drone has no flight plan, or the new one cannot be planned. The old one then stays.
+        """
+        __tracebackhide__ = True
+        if at is not None:
+            self._scene.wait(at, TRIGGER_TIMEOUT_S)
+        self._scene.replan(drone, plan)
+        self._scene.run.report(drone.node, "flight plan replaced by the controller")
+        self._issue([drone.node])
+
     def emergency_landing(self, drone: VirtualDrone, at: Trigger | None = None) -> None:
         """Land a drone at once where it is. The system takes the drone from its program.
 
@@ -467,6 +490,7 @@ class Scene:
         self._began = False
         self._wind: dict[str, float] = {}
         self._issued: list[Restriction] = []
+        self._manifest_paths: list[str] = []
         self._changes = itertools.count(1)
         _require_replaceable(self.folder)
         shutil.rmtree(self.folder, ignore_errors=True)
@@ -714,6 +738,26 @@ class Scene:
                 text += f"; program ended with exit code {code}: {processes.log_tail(program.name)}"
         return text
 
+    def replan(self, drone: VirtualDrone, plan: FlightPlan) -> None:
+        """Replace the flight plan of a drone. The Grants stay until `reissue`.
+
+        Raises:
+            ExperimentError: The drone has no flight plan, or the new one cannot be planned. The old one then stays.
+        """
+        before = drone.plan
+        if before is None:
+            raise ExperimentError(
+                f"{drone.name} has no flight plan that could be replaced; call its set_plan() before start_app()"
+            )
+        drone.plan = plan
+        paths = self._manifests(f"plan-{next(self._changes)}.yaml")
+        try:
+            list(planned_grants(read_all_manifests([self.folder / path for path in paths])))
+        except ExperimentError:
+            drone.plan = before
+            raise
+        self._manifest_paths = paths
+
     def reissue(self, restrictions: Sequence[Restriction], nodes: Iterable[str]) -> None:
         """Replace the Grants of drones by Grants with additional restrictions. The plans stay.
 
@@ -723,7 +767,7 @@ class Scene:
         chosen = set(nodes)
         if not chosen:
             return
-        paths = [self.folder / path for path in self.run.experiment.manifests]
+        paths = [self.folder / path for path in self._manifest_paths]
         planned = read_all_manifests(paths)
         self._issued += restrictions
         manifests = [manifest for restriction in restrictions for manifest in restriction.manifests()]
@@ -771,7 +815,8 @@ class Scene:
             raise ExperimentError("set_camera: all drones of a test see the same world; pass the same World")
         content["world"] = worlds.pop().to_dict() if worlds else {}
         if not alone:
-            content["manifests"] = self._manifests()
+            self._manifest_paths = self._manifests("manifests.yaml")
+            content["manifests"] = self._manifest_paths
             content["programs"] = [program for drone in self._drones for program in self._program_entries(drone)]
             content["programs"] += [
                 {**self._program_entry(node, number, program), "node": node.node, "background": True}
@@ -803,8 +848,8 @@ class Scene:
         }
         return entry | {name: value for name, value in optional.items() if value}
 
-    def _manifests(self) -> list[str]:
-        """Write the manifests of flight plans, and return the paths of all manifests."""
+    def _manifests(self, file: str) -> list[str]:
+        """Write the manifests of flight plans to a file, and return the paths of all manifests."""
         paths = []
         manifests: list[Manifest] = []
         for drone in self._drones:
@@ -818,7 +863,7 @@ class Scene:
                     interface=drone.apps[0].interface if drone.apps else "grpc",
                 )  # fmt: skip
         if manifests:
-            paths.append(self._write("manifests.yaml", manifests).name)
+            paths.append(self._write(file, manifests).name)
         return list(dict.fromkeys(paths))
 
     def _program_entries(self, drone: VirtualDrone) -> list[dict[str, Any]]:

@@ -148,6 +148,19 @@ def test_emergency_landing_lands_the_drone_where_it_is(fractus: Scene, tmp_path:
         results.check_landed("vDrone-1", near_home=10)
 
 
+def test_smaller_flight_plan_applies_in_flight(fractus: Scene, tmp_path: Path) -> None:
+    controller, drone = start(fractus, pilot(tmp_path))
+    drone.wait(until(drone, reached=1))
+    with pytest.raises(ExperimentError, match="cannot be planned"):
+        controller.set_plan(drone, FlightPlan(path=[(51.9, 4.6785, 10.0)]))
+    controller.set_plan(drone, FlightPlan(path=PATH[:1]))
+    drone.wait_landed(240)
+    results = fractus.results()
+    results.check_violations("vDrone-1", type="flight_path")
+    results.check_landed("vDrone-1", near_home=3)
+    assert max(sample.place.lon for sample in results.track("vDrone-1").samples) < PATH[1][1] - 0.0001
+
+
 def test_aborted_mission_ends_at_home(fractus: Scene, tmp_path: Path) -> None:
     controller, drone = start(fractus, pilot(tmp_path))
     controller.abort(drone, at=until(drone, altitude=8))

@@ -34,6 +34,13 @@ DOWN = Lens(90.0, 90.0, stabilised=True, error_deg=0.0)
 Corners = list[tuple[float, float]]
 
 
+def commanded_mps(limit_mps: float) -> float:
+    """Return the highest speed that may be commanded under a speed limit (table in docs/mobility.md)."""
+    if limit_mps > 10.0:
+        return 0.95 * limit_mps
+    return limit_mps - 0.5 if limit_mps > 0.5 / 0.15 else 0.85 * limit_mps
+
+
 def ring(corners: Corners) -> dict[str, Any]:
     return {"polygon": {"exterior": [dict(zip(("lat", "lon"), FRAME.latlon(x, y), strict=True)) for x, y in corners]}}
 

@@ -62,15 +62,6 @@ The vehicle exceeds a commanded speed by up to 0.3 m/s and a commanded height by
 GUST_SHARE = 0.3
 """Momentary changes of speed and height by a gust, as shares of the speed of the gust."""
 
-TURN_IN_WIND_SHARE = 0.025
-SLOW_MPS = 6.0
-"""Share of the wind by which a drone exceeds a speed limit below `SLOW_MPS` after a turn with the wind (docs/mobility.md).
-
-The integral part of the velocity controller, which compensates the former headwind, decays in seconds. It does not depend on the
-commanded speed. The 5 % between command and limit cover it at higher speeds. Velocities of 1.5, 2.9 and 5 m/s are exceeded by
-0.15, 0.22 and 0.28 m/s in 6 m/s of wind when they are reversed.
-"""
-
 REACTION_S = 0.4
 """Time until a new rule affects the motion: at most 0.2 s in the service, and 0.2 s in the vehicle."""
 
@@ -455,8 +446,7 @@ class Oracle:
             self._wrong("height", f"{height:.1f} m above a limit of {self.rules.ceiling_m:.1f}")
         gust_mps = GUST_SHARE * self._sky.weather.gusts_mps
         self._check_overshoot(height, settled, LEVEL_SLACK_M + gust_mps)
-        turn_mps = TURN_IN_WIND_SHARE * self._sky.weather.wind_mps if self.rules.top_mps < SLOW_MPS else 0.0
-        excess = speed - self.rules.top_mps - SPEED_SLACK_MPS - gust_mps - turn_mps
+        excess = speed - self.rules.top_mps - SPEED_SLACK_MPS - gust_mps
         if excess > 0.0 and slowed > 5.0 + self.unavoidable_m() / 4.0:
             self._wrong("speed", f"{speed:.1f} m/s above a limit of {self.rules.top_mps:.1f}")
 

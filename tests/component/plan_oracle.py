@@ -29,6 +29,7 @@ from fractus_core.api.plans import DeploymentPlanSpec
 from fractus_core.geo import LocalFrame, geodesic_m
 from fractus_core.planning import Flight, Host, Infeasible, Inventory, Settings, operation_area, plan
 from fractus_core.planning.coverage import Samples
+from policy_world import commanded_mps
 
 NOW_S = 1_780_000_000.0
 FLOWN_M = 10.0
@@ -37,8 +38,6 @@ SAFETY_M = 7.0
 NEAR_M = 800.0
 RESERVE = 0.2
 CRUISE_MPS = 5.0
-COMMANDED = 0.95
-"""Share of a speed limit at which a drone flies, because it overshoots."""
 CLIMB_MPS = 1.5
 MARGIN_M = 2.5
 """Margin around zones for a leg from standstill: sum of position error and path deviation of the autopilot."""
@@ -425,7 +424,7 @@ class Oracle:
 
     def flight_min(self, drone: Drone, distance_m: float, speed_mps: float, height_m: float) -> float:
         assert drone.spec.services.mobility is not None
-        speed = min(speed_mps, COMMANDED * drone.spec.services.mobility.max_speed)
+        speed = min(speed_mps, commanded_mps(drone.spec.services.mobility.max_speed))
         return (distance_m / speed + 2 * height_m / CLIMB_MPS) / 60
 
     def available_min(self, drone: Drone) -> float:
@@ -483,8 +482,8 @@ class Oracle:
             spec = policy.spec
             if spec.kind == "speed" and spec.upper_limit is not None:
                 assert drone.spec.services.mobility is not None
-                changed |= spec.upper_limit < min(CRUISE_MPS, COMMANDED * drone.spec.services.mobility.max_speed)
-                speed = min(speed, COMMANDED * spec.upper_limit)
+                changed |= spec.upper_limit < min(CRUISE_MPS, commanded_mps(drone.spec.services.mobility.max_speed))
+                speed = min(speed, commanded_mps(spec.upper_limit))
             elif spec.kind == "altitude":
                 if spec.action == "refuse":
                     return False

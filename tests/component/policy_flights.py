@@ -31,7 +31,7 @@ from fractus_core.policy.engine import judge
 from fractus_core.policy.monitoring import monitor
 from fractus_services.mobility.mavlink.mavlink_autopilot import is_turning
 from numpy.typing import NDArray
-from policy_world import HOME, METHODS, NOW, compiled, policy, ring
+from policy_world import HOME, METHODS, NOW, commanded_mps, compiled, policy, ring
 
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -62,9 +62,6 @@ RATIO = 4.0
 POSITION_ERROR_M = 1.5
 HEIGHT_ERROR_M = 1.0
 TRACKING_M = 1.0
-COMMANDED = 0.95
-"""Share of a speed limit that may be commanded, because the vehicle overshoots."""
-
 OVERSHOOT_M = 0.2
 """Height by which the vehicle may climb or sink past a commanded altitude."""
 LATENCY_S = (0.05, 0.8)
@@ -917,13 +914,16 @@ def _defects(verdict: Verdict, now: Situation, place: Scene) -> Iterator[str]:
         verdict_again = judge(Call(METHOD_OF[type(args)], args), now, place.grant)
         if (verdict_again.action, verdict_again.args) != ("allow", args):
             yield "corrected to arguments that are not allowed unchanged"
-    if isinstance(args, VelocityArgs) and math.hypot(args.north_mps, args.east_mps) > COMMANDED * place.top_mps + 1e-6:
+    if (
+        isinstance(args, VelocityArgs)
+        and math.hypot(args.north_mps, args.east_mps) > commanded_mps(place.top_mps) + 1e-6
+    ):
         yield "too fast"
-    if isinstance(args, SetSpeedArgs) and args.speed_mps > COMMANDED * place.top_mps + 1e-6:
+    if isinstance(args, SetSpeedArgs) and args.speed_mps > commanded_mps(place.top_mps) + 1e-6:
         yield "too fast"
     if not isinstance(args, GotoArgs):
         return
-    if (args.speed_mps or now.speed_setpoint_mps) > COMMANDED * place.top_mps + 1e-6:
+    if (args.speed_mps or now.speed_setpoint_mps) > commanded_mps(place.top_mps) + 1e-6:
         yield "too fast"
     low, high = place.heights
     if args.alt is None or not low + OVERSHOOT_M - 1e-6 <= args.alt <= high - OVERSHOOT_M + 1e-6:

@@ -242,5 +242,5 @@ async def _search(fleet: Fleet, i: int) -> Any:
         autopilot=SimpleNamespace(vehicle=vehicle), cruise_mps=CRUISE_MPS, state=state, home_moved=False
     )
     gate: Any = SimpleNamespace(situation=lambda: now)
-    flight: Any = SimpleNamespace(constraints=SimpleNamespace(compiled=fleet.scenes[i].grant))
+    flight: Any = SimpleNamespace(constraints=SimpleNamespace(compiled=fleet.scenes[i].grant), return_altitude_m=None)
     return await ReturnFlight(control, gate, SimpleNamespace())._next_leg(flight)  # type: ignore[arg-type]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import math
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,7 @@ from typing import Any
 import pytest
 from closed_loop import Sky, Weather
 from fractus_core.policy import limits
-from fractus_core.policy.decision_types import TakeoffArgs
+from fractus_core.policy.decision_types import TakeoffArgs, VelocityArgs
 from mobility_world import goto, spec
 from sky_drone import fly, ready
 
@@ -54,3 +55,25 @@ def test_drone_exceeds_limits_without_distance_from_them(tmp_path: Path, monkeyp
     speed_mps, height_m = peaks(tmp_path)
     assert speed_mps > SPEED_MPS + 0.1
     assert height_m > HEIGHT_M + 0.05
+
+
+@pytest.mark.parametrize("limit_mps", [2.8, 5.0])
+def test_drone_keeps_low_speed_limit_when_it_turns_with_the_wind_and_climbs(tmp_path: Path, limit_mps: float) -> None:
+    speeds_mps = [0.0]
+
+    async def work(sky: Sky, state: Path) -> None:
+        async with ready(sky, state) as (drone, _):
+            grant = drone.grants.put(spec(limit("speed", limit_mps)))
+            await drone.service.arm(grant, 120.0)
+            body = sky.truth.body
+            async for _ in drone.service.take_off(grant, TakeoffArgs(HEIGHT_M)):
+                pass
+            sky.witnesses.append(lambda: speeds_mps.append(math.hypot(body.vn, body.ve)))
+            for _ in range(20):
+                await drone.service.set_velocity(grant, VelocityArgs(-limit_mps, 0.0))
+                await asyncio.sleep(0.5)
+            async for _ in drone.service.goto(grant, goto(0.0, 20.0, HEIGHT_M + 7.0, speed_mps=limit_mps), 0.0):
+                pass
+
+    fly(work, tmp_path, None, HEADWIND)
+    assert 0.8 * limit_mps < max(speeds_mps) <= limit_mps

@@ -16,7 +16,7 @@ from policy_world import altitude, at, box, compiled, exclusion, speed, zone
 from virtual_time import fly
 
 OWNED = {"RTL_ALT": 4000.0, "RTL_SPEED": 0.0, "WPNAV_SPEED": 1000.0, "RTL_CLIMB_MIN": 500.0}
-LOW = {"RTL_ALT": 1180.0, "RTL_SPEED": 0.0, "WPNAV_SPEED": 332.0, "RTL_CLIMB_MIN": 0.0}
+LOW = {"RTL_ALT": 1180.0, "RTL_SPEED": 0.0, "WPNAV_SPEED": 300.0, "RTL_CLIMB_MIN": 0.0}
 LIMITS = {"maxAltitude": 12, "maxSpeed": 3.5}
 
 
@@ -39,7 +39,7 @@ def test_return_bounds_use_strictest_limit_between_home_and_operation_area() -> 
         altitude("far", [zone("b", far)], upperLimit=3),
         speed("slow", [zone("c", near)], upperLimit=4),
     )
-    assert return_bounds(at(), zoned) == ReturnBounds(29.8, 3.8)
+    assert return_bounds(at(), zoned) == ReturnBounds(29.8, 3.5)
     assert return_bounds(at(), compiled(limits=None)) == ReturnBounds()
 
 
@@ -73,7 +73,7 @@ def test_return_altitudes_include_heights_below_overhead_zones() -> None:
 @pytest.mark.parametrize(
     ("owned", "bounds", "expected"),
     [
-        (OWNED, ReturnBounds(11.8, 3.325), LOW),
+        (OWNED, ReturnBounds(11.8, 3.0), LOW),
         (OWNED, ReturnBounds(60.0, 12.0), OWNED | {"RTL_CLIMB_MIN": 0.0}),
         (OWNED, ReturnBounds(), OWNED | {"RTL_CLIMB_MIN": 0.0}),
         (OWNED, ReturnBounds(12.345678, 0.0), LOW | {"RTL_ALT": 1234.0, "WPNAV_SPEED": 20.0}),
@@ -128,7 +128,7 @@ def test_vehicle_of_release_4_7_is_limited_and_restored_under_its_own_names(tmp_
                 "MAV_GCS_SYSID": 244.0,
                 "GUID_TIMEOUT": 1.0,
                 "RTL_ALT_M": 11.8,
-                "WP_SPD": 3.325,
+                "WP_SPD": 3.0,
                 "RTL_CLIMB_MIN_M": 0.0,
             }
             assert flown == pytest.approx(limited_to)
@@ -257,7 +257,7 @@ def test_arming_is_refused_if_rtl_speed_cannot_be_limited(tmp_path: Path) -> Non
             await world.drive(grant)
             reason = await refusal(world.service.arm(grant))
             assert reason.verdict.code == "ReturnNotLimited"
-            assert "WPNAV_SPEED cannot be set to 332; it remains 1000" in str(reason)
+            assert "WPNAV_SPEED cannot be set to 300; it remains 1000" in str(reason)
             assert not world.plane.vehicle.armed
             await world.until(lambda: held(world) == OWNED, 30)
 

@@ -102,11 +102,11 @@ def test_legality_reports_conflict_when_speed_limit_makes_mission_too_long():
     slow = policy("slow", type="LimitControl", kind="speed", upperLimit=0.5)
     choice = plan(APP, stock(slow), WARN).drone
     assert {leg[1:] for leg in outcomes(choice)} == {("Corrected", ("slow",))}
-    assert choice.mission.duration == pytest.approx(600 / 0.475 / 60 + 20 / 1.5 / 60, rel=0.01)
+    assert choice.mission.duration == pytest.approx(600 / 0.425 / 60 + 20 / 1.5 / 60, rel=0.01)
     assert choice.policy_conflict is None
     short = stock(slow, drones=[drone("d", minutes=20)])
     choice = plan(APP, short, WARN).drone
-    assert "under slow the mission takes 21.3 min" in choice.policy_conflict
+    assert "under slow the mission takes 23.8 min" in choice.policy_conflict
     assert "can fly only 16.0 min without its battery reserve" in choice.policy_conflict
     with pytest.raises(Infeasible, match=r"no drone may fly Navigator: d: under slow"):
         plan(APP, short, FORBID)

@@ -37,7 +37,7 @@ def test_permitted_call_is_allowed() -> None:
     assert {k: verdict[k] for k in ("action", "takeover", "reason", "policies")} == {
         "action": "allow", "takeover": None, "reason": "", "policies": [],
     }  # fmt: skip
-    assert verdict["args"] == {**FREE, "reference": "home", "speed_mps": 4.75}, "the speed setpoint is at the limit"
+    assert verdict["args"] == {**FREE, "reference": "home", "speed_mps": 4.5}, "the speed setpoint is at the limit"
 
 
 def test_violations_are_corrected_denied_or_taken_over() -> None:
@@ -101,7 +101,7 @@ def test_arguments_are_accepted_with_and_without_units() -> None:
     for args in ({"north": 1, "east": 0, "hold": 1}, {"north_mps": 1, "east_mps": 0, "hold_s": 1}):
         assert check("SetVelocity", args)["args"]["north_mps"] == 1.0
     assert check("Takeoff", {"altitude": 12}, at="39.37,22.93,0")["args"] == {"altitude_m": 12.0}
-    assert check("SetSpeed", {"speed": 99})["args"] == {"speed_mps": 4.75}
+    assert check("SetSpeed", {"speed": 99})["args"] == {"speed_mps": 4.5}
 
 
 def test_text_output_has_action_arguments_and_policies() -> None:

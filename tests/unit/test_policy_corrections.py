@@ -60,7 +60,7 @@ def test_altitude_correction_into_slower_zone_also_corrects_speed() -> None:
     verdict = ask(grant, goto(50, 0, 5, speed_mps=8), at(alt=10))
     assert (verdict.action, verdict.code) == ("correct", "AltitudeBelowLimit")
     assert isinstance(verdict.args, GotoArgs)
-    assert (verdict.args.alt, verdict.args.speed_mps) == (30.2, pytest.approx(2.85))
+    assert (verdict.args.alt, verdict.args.speed_mps) == (30.2, pytest.approx(2.55))
     assert verdict.policies == ("altitudes", "slow")
     assert "altitude 5.0 m" in verdict.reason
     assert "speed 8.0 m/s" in verdict.reason

@@ -292,11 +292,11 @@ def test_terrain_altitude_is_unknown_without_flat_terrain() -> None:
 
 def test_speed_is_corrected_or_denied_by_limits() -> None:
     grant = compiled(speed(upperLimit=8, lowerLimit=2), speed("slow", [zone("s", box(40, -20, 60, 20))], upperLimit=3))
-    assert ask(grant, Call("SetSpeed", SetSpeedArgs(10))).args == SetSpeedArgs(7.6)
+    assert ask(grant, Call("SetSpeed", SetSpeedArgs(10))).args == SetSpeedArgs(7.5)
     assert ask(grant, Call("SetSpeed", SetSpeedArgs(1))).args == SetSpeedArgs(2)
-    assert ask(grant, Call("SetSpeed", SetSpeedArgs(7)), at(50, 0)).args.speed_mps == pytest.approx(2.85)
+    assert ask(grant, Call("SetSpeed", SetSpeedArgs(7)), at(50, 0)).args.speed_mps == pytest.approx(2.55)
     leg = ask(grant, goto(100, 0))
-    assert (leg.action, leg.code, leg.args.speed_mps) == ("correct", "SpeedAboveLimit", pytest.approx(2.85))
+    assert (leg.action, leg.code, leg.args.speed_mps) == ("correct", "SpeedAboveLimit", pytest.approx(2.55))
     assert ask(grant, goto(0, 100)).args.speed_mps is None
     assert ask(compiled(speed(upperLimit=4, action="refuse")), goto(0, 100)).code == "SpeedAboveLimit"
 

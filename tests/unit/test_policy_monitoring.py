@@ -133,7 +133,7 @@ def test_monitor_corrects_altitude_and_speed() -> None:
     assert monitor(at(alt=15.5), grant) is None, "the excess is within the tolerance"
     fast = monitor(at(north_mps=9), grant)
     assert fast is not None
-    assert fast.args == SetSpeedArgs(4.75)
+    assert fast.args == SetSpeedArgs(4.5)
     assert monitor(at(north_mps=5.5), grant) is None
 
 

@@ -156,7 +156,10 @@ class Airframe:
         jerk_mps3: Rate of change of the acceleration.
         return_altitude_m: Altitude above home of return to launch.
         tracking_m: Largest deviation from a straight leg, sideways and in altitude.
-        overshoot_share: Largest share by which the ground speed exceeds a commanded speed.
+        overshoot_share: Largest share by which the ground speed exceeds a fast commanded speed.
+        overshoot_mps: Largest excess of a slower commanded speed, m/s. It occurs when a drone that turned with the wind
+            ends its climb: the controller still compensates the former headwind.
+        slow_overshoot_share: Largest share by which the ground speed exceeds a very slow commanded speed.
         overshoot_m: Largest height by which the drone climbs or sinks past a commanded altitude.
         retraces: True if the autopilot returns along the path it flew (ArduPilot's SmartRTL) instead of in a straight
             line. A target is then legal if any legal route home exists.
@@ -169,12 +172,15 @@ class Airframe:
     return_altitude_m: float = 15.0
     tracking_m: float = 1.0
     overshoot_share: float = 0.05
+    overshoot_mps: float = 0.5
+    slow_overshoot_share: float = 0.15
     overshoot_m: float = 0.2
     retraces: bool = False
 
     def highest_command_mps(self, limit_mps: float) -> float:
         """Return the highest speed to command under a speed limit."""
-        return limit_mps * (1.0 - self.overshoot_share)
+        slow_mps = min(self.overshoot_mps, self.slow_overshoot_share * limit_mps)
+        return limit_mps - max(self.overshoot_share * limit_mps, slow_mps)
 
 
 @dataclass(frozen=True, slots=True)

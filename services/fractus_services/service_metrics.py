@@ -78,7 +78,7 @@ class ServiceMetrics:
 
 def telemetry_age(age_s: float) -> Metric:
     """Return the age of the latest telemetry."""
-    description = "Age of the latest position of the drone. A stationary camera has none."
+    description = "Age of the latest position of the drone. No value for a stationary camera."
     return gauge("fractus_telemetry_age_seconds", description, age_s)
 
 

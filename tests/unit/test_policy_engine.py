@@ -301,6 +301,12 @@ def test_speed_is_corrected_or_denied_by_limits() -> None:
     assert ask(compiled(speed(upperLimit=4, action="refuse")), goto(0, 100)).code == "SpeedAboveLimit"
 
 
+@pytest.mark.parametrize("requested_mps", [1.0, 4.6, 5.0, 9.0])
+def test_minimum_speed_is_commanded_if_the_maximum_leaves_no_room_above_it(requested_mps: float) -> None:
+    verdict = ask(compiled(speed(upperLimit=5, lowerLimit=4.6)), Call("SetSpeed", SetSpeedArgs(requested_mps)))
+    assert verdict.args == SetSpeedArgs(4.6)
+
+
 # Pictures
 
 

@@ -286,13 +286,14 @@ def _describe_room(value: float, limit: float) -> str:
 def command_range(bounds: Sequence[Bound]) -> tuple[float, float]:
     """Return the lowest and the highest value to command under limits.
 
-    Between limits that are closer to each other than the overshoot, only their middle is commanded.
+    Altitude limits that are closer to each other than the overshoot leave only their middle. Such speed limits leave only
+    the lower one, which applies to the commanded speed.
     """
     lowest = max((b.lowest for b in bounds if b.lowest is not None), default=-math.inf)
     highest = min((b.highest for b in bounds if b.highest is not None), default=math.inf)
     if lowest > highest and _lowest(bounds) <= _highest(bounds):
-        middle = (_lowest(bounds) + _highest(bounds)) / 2
-        return middle, middle
+        only = min(lowest, (_lowest(bounds) + _highest(bounds)) / 2)
+        return only, only
     return lowest, highest
 
 

@@ -187,7 +187,7 @@ def test_wrong_value_of_chart_is_refused_with_its_name(chart: str, values: str, 
     assert answer in refused.value.stderr
 
 
-@pytest.mark.parametrize("memory", ["128Mi", "1.5Gi", "134217728", "1e9", "500M"])
+@pytest.mark.parametrize("memory", ["128Mi", "1.5Gi", "134217728", "1e9", "1e+9", "+128Mi", "500M"])
 def test_chart_accepts_quantities_of_memory(memory: str) -> None:
     assert render(f"--set-string=agent.resources.limits.memory={memory}")
     assert render(f"--set=agent.resources.limits.memory={memory}")

@@ -16,12 +16,14 @@ PARTS: dict[str, tuple[str, str, str | None]] = {
     "navigator": ("fractus.dev/component=Navigator", "default", DRONE),
 }
 
-# `make test` kills the same programs without a cluster, for example in test_killed_service_resumes_flight_after_restart,
+# `make test` kills the other programs without a cluster, for example in
 # test_killed_navigator_continues_mission_and_keeps_running_after_it and test_killed_operator_completes_rollout_after_restart.
-pytestmark = pytest.mark.slow
+IN_GATE = "mobility"
 
 
-@pytest.mark.parametrize("part", PARTS)
+@pytest.mark.parametrize(
+    "part", [part if part == IN_GATE else pytest.param(part, marks=pytest.mark.slow) for part in PARTS]
+)
 def test_killed_part_does_not_leave_the_drone_unsupervised_in_flight(grounded: Kube, part: str) -> None:
     kube = grounded
     application = f"kill-{part}"

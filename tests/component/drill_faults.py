@@ -17,10 +17,15 @@ from pathlib import Path
 from types import CodeType, FunctionType, ModuleType
 from typing import Any
 
+import pytest
 from drills import DRILLS, perform
+from fractus_services.errors import Refused
 
 MAX_S = 60
 """Real time of a drill. A drill takes less than a second of processor time."""
+
+FINDINGS = (AssertionError, Refused, TimeoutError, pytest.fail.Exception)
+"""Exceptions of a drill that mean a broken promise of the platform. Others are errors of the drill or of the fault."""
 
 CORE = "fractus_core"
 SERVICES = "fractus_services"
@@ -94,6 +99,7 @@ FAULTS: tuple[Fault, ...] = (
     Fault("adjusted leg keeps its target", _GOTO, "    if any(note.code == \"LegShortened\" for note in notes):", "    if False:", "adjusted_leg_ends_before_the_border"),
     Fault("adjusted leg without margin", _GOTO, "return along(low - 0.01 / length_m) if low * length_m >= MIN_LEG_M else None", "return along(min(low + 1.5 / length_m, 1.0))", "adjusted_leg_ends_before_the_border"),
     Fault("takeovers of actions ignored", _FENCES, "takeover = TAKEOVERS[worst.action] if worst.enters else None", "takeover = None", "hover_action_takes_the_drone"),
+    Fault("return replaced by landing", _FENCES, "takeover = TAKEOVERS[worst.action] if worst.enters else None", 'takeover = {**TAKEOVERS, "returnToLaunch": "land"}[worst.action] if worst.enters else None', "return_action_brings_the_drone_home"),
     Fault("every takeover hovers", _FENCES, '{_EFFECTS[takeover]}", names, takeover)', '{_EFFECTS[takeover]}", names, "hover")', "revoke_action_ends_the_mission"),
     Fault("way home not checked", _GOTO, "problem = check_straight_return(target, altitude_m, now, grant, margin=now.margin_m, slack=now.height_margin_m)", "problem = None", "target_without_legal_return_is_refused"),
     Fault("schedules ignored", f"{CORE}.policy.compiled_grant", "return active_between(self.schedule, first_s, min(time_s, self.rule.valid_until_s))", "return not self.schedule", "scheduled_zone_applies_when_it_begins"),
@@ -130,6 +136,7 @@ FAULTS: tuple[Fault, ...] = (
     Fault("verdicts not recorded", _AUTHORIZATION, "            self.record(call, grant.identity, verdict, situation, kind=kind)\n", "            pass\n", "verdicts_are_in_the_audit_log"),
     Fault("Grant revocation ignored", _MACHINE, '        update.seize(TaskKind.RETURN, "GrantRevoked", GRANT_REMOVED, (), OutcomeKind.REVOKED)\n', "        pass\n", "removed_grant_takes_the_drone_at_once"),
     Fault("removed Grants not reported", _CONTROL, "        self.dispatch(GrantChanged(_reference(old), _reference(new)))\n", "", "removed_grant_takes_the_drone_at_once"),
+    Fault("removed Grants stay in force", _CONTROL, "        self.dispatch(GrantChanged(_reference(old), _reference(new)))\n", "        if new is None and old is not None:\n            self._grants.active[old.identity] = old\n            return\n        self.dispatch(GrantChanged(_reference(old), _reference(new)))\n", "call_with_a_removed_grant_is_refused"),
     Fault("Grant not renewed", _CONTROL, "                lease.grant = new\n", "                pass\n", "replaced_grant_applies_to_the_next_call"),
     Fault("second application gets control", _MACHINE, _REFUSALS_OF_STREAMS, "", "second_application_does_not_get_the_drone"),
     Fault("lost driver keeps the drone", _MACHINE, '    _leave_driver(update, lease.key, "the driver\'s stream broke", reason, ends=bool(repeated))\n', "", "lost_driver_is_followed_by_a_return"),
@@ -216,6 +223,10 @@ def _functions(module: ModuleType) -> Iterator[FunctionType]:
                 yield function
 
 
+class DrillError(Exception):
+    """A fault cannot be applied, or a drill ended with an error that is no finding."""
+
+
 def finds(fault: Fault | None, drill: str) -> str:
     """Perform a drill in a process of its own, with a fault.
 
@@ -223,34 +234,45 @@ def finds(fault: Fault | None, drill: str) -> str:
         The problem that the drill found. Empty if it found none.
 
     Raises:
-        ValueError: The fault cannot be applied.
+        DrillError: The fault cannot be applied, or the drill ended with another exception than those of `FINDINGS`.
     """
     read_end, write_end = os.pipe()
     child = os.fork()
     if child == 0:
         os.close(read_end)
-        problem = _perform(fault, drill)
+        code = 1
+        try:
+            problem = _perform(fault, drill)
+            code = 0
+        except BaseException as error:
+            problem = _describe(error)
         os.write(write_end, problem.encode()[:4000])
-        os._exit(0)
+        os._exit(code)
     os.close(write_end)
-    with os.fdopen(read_end) as answer:
+    with os.fdopen(read_end, errors="replace") as answer:
         problem = answer.read()
     _, status = os.waitpid(child, 0)
-    if os.WIFSIGNALED(status):
+    code = os.waitstatus_to_exitcode(status)
+    if code == -signal.SIGALRM:
         return f"no end within {MAX_S} s"
-    if problem.startswith("ValueError: " + (fault.name if fault is not None else "-")):
-        raise ValueError(problem)
+    if code != 0:
+        title = fault.name if fault is not None else "no fault"
+        raise DrillError(f"{title}, {drill}: {problem or f'the process ended with exit code {code}'}")
     return problem
 
 
 def _perform(fault: Fault | None, drill: str) -> str:
     signal.alarm(MAX_S)
     sys.stderr = Path(os.devnull).open("w")  # noqa: SIM115 - until the process ends
-    try:
-        if fault is not None:
-            apply(fault)
-        with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
+    if fault is not None:
+        apply(fault)
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
+        try:
             perform(DRILLS[drill], Path(folder))
-    except BaseException as error:
-        return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+        except FINDINGS as error:
+            return _describe(error)
     return ""
+
+
+def _describe(error: BaseException) -> str:
+    return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__

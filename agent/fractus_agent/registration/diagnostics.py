@@ -53,9 +53,15 @@ def read_picture_counts(state: Path) -> dict[str, tuple[int, int]]:
 
 
 def read_gateway_problem(state: Path) -> str:
-    """Return the reason why MAVLink programs cannot fly, from a file below the node's state directory, or an empty string."""
+    """Return the reason why MAVLink programs cannot fly, from a file below the node's state directory, or an empty string.
+
+    A file that cannot be read is a problem too, because the gateway removes the file when programs can fly.
+    """
+    path = state / "gateway" / "gateway.problem"
     try:
-        problem = read_file(state / "gateway" / "gateway.problem", _MAX_BYTES)
-    except OSError:
+        problem = read_file(path, _MAX_BYTES)
+    except FileNotFoundError:
         return ""
+    except OSError as error:
+        return f"The agent cannot read {path_text(path)} ({error.strerror})."
     return problem[:MAX_PROBLEM_BYTES].decode(errors="replace").strip()

@@ -70,7 +70,7 @@ class GatewayOptions:
 
     @property
     def problem(self) -> Path:
-        """File with the reason why programs cannot fly, if there is one. The agent reads it."""
+        """File with the reason why programs cannot fly, if there is one. The agent reads it as a member of the group."""
         return self.state / "gateway.problem"
 
 
@@ -306,7 +306,7 @@ async def _report_problems(options: GatewayOptions, tls: TlsFiles) -> None:
                 log.warning("gateway: programs cannot fly (problem=%s)", problem)
             with suppress(OSError):  # a full disk is reported by the audit log
                 if problem:
-                    write_file(options.problem, problem.encode(), durable=False)
+                    write_file(options.problem, problem.encode(), 0o640, durable=False)
                 else:
                     options.problem.unlink(missing_ok=True)
         await asyncio.sleep(PROBLEM_INTERVAL_S)

@@ -185,11 +185,24 @@ def test_html_page_contains_figures_and_no_reference_to_other_files(written: Pat
 def test_html_page_escapes_texts_of_components_and_embeds_no_files_that_they_name(tmp_path: Path) -> None:
     (tmp_path / "secret.jpg").write_bytes(b"secret")
     text = "![x](secret.jpg) ![y](https://example.com/y.png) <script>alert(1)</script>"
-    page = html_page("<b>", summary=text, figures=(), sections=text, pictures=(), folder=tmp_path)
+    page = html_page("<b>", summary=text, figures=(), sections=text, pictures={}, folder=tmp_path)
     assert "<script>" not in page
     assert "<title>&lt;b&gt;</title>" in page
     assert base64.b64encode(b"secret").decode() not in page
     assert "default-src 'none'; img-src data:" in page
+
+
+def test_html_page_embeds_each_image_only_where_the_report_places_it(tmp_path: Path) -> None:
+    for name in ("map.png", "a.jpg"):
+        (tmp_path / name).write_bytes(name.encode())
+    text = "![x](map.png) ![y](a.jpg) ![z](a.jpg)"
+    page = html_page("t", summary=text, figures=["map.png"], sections=text, pictures={"a.jpg": "12 m"}, folder=tmp_path)
+    images = [("image/png", b"map.png"), ("image/jpeg", b"a.jpg")]
+    assert re.findall(r'src="([^"]*)"', page) == [
+        f"data:{kind};base64,{base64.b64encode(d).decode()}" for kind, d in images
+    ]
+    assert "<p>12 m</p>" in page
+    assert "href=" not in page
 
 
 def test_report_is_deterministic(record: FlightRecord, written: Path, tmp_path: Path) -> None:

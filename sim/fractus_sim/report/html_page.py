@@ -5,8 +5,7 @@ from __future__ import annotations
 import base64
 import html
 import mimetypes
-import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from string import Template
 
@@ -33,14 +32,14 @@ img { max-width: 100%; }
 $summary
 $figures
 $sections
+$pictures
 </body>
 </html>
 """)
-_IMAGE = re.compile(r'(?<= src=")[^"]+(?=")')
 
 
 def html_page(
-    title: str, *, summary: str, figures: Sequence[str], sections: str, pictures: Sequence[str], folder: Path
+    title: str, *, summary: str, figures: Sequence[str], sections: str, pictures: Mapping[str, str], folder: Path
 ) -> str:
     """Return a report as an HTML page that needs no other file.
 
@@ -49,30 +48,26 @@ def html_page(
         summary: Markdown above the figures.
         figures: Names of the image files of the figures.
         sections: Markdown below the figures.
-        pictures: Names of the image files that the sections show.
+        pictures: Titles of the camera pictures at the end of the page, by the name of the image file.
         folder: Folder of the image files.
     """
-    # Components determine some texts, such as arguments of calls. HTML in such texts is escaped, and an image that such a text
-    # names is not embedded, because it could be any file of the user.
-    markdown = MarkdownIt("commonmark", {"html": False}).enable("table")
-    known = {*figures, *pictures}
-
-    def embed(match: re.Match[str]) -> str:
-        name = match.group()
-        return _data_uri(folder / name) if name in known else name
-
-    def embedded(text: str) -> str:
-        return _IMAGE.sub(embed, text)
-
-    drawn = "".join(f'<p><img src="{name}" alt="{Path(name).stem}"></p>\n' for name in figures)
+    # Components determine some texts, such as arguments of calls. HTML in such texts is escaped, and images and links that they
+    # contain remain text, because they could embed any file of the user, or a large picture many times.
+    markdown = MarkdownIt("commonmark", {"html": False}).enable("table").disable(["image", "link", "autolink"])
+    drawn = [_image(folder / name, Path(name).stem) for name in figures]
+    shown = [
+        f"<p>{html.escape(text)}</p>\n{_image(folder / name, 'from the drone')}" for name, text in pictures.items()
+    ]
     return _TEMPLATE.substitute(
         title=html.escape(title),
         summary=markdown.render(summary),
-        figures=embedded(drawn),
-        sections=embedded(markdown.render(sections)),
+        figures="".join(drawn),
+        sections=markdown.render(sections),
+        pictures="".join(["<h2>Camera pictures</h2>\n", *shown] if shown else []),
     )
 
 
-def _data_uri(image: Path) -> str:
-    kind, _ = mimetypes.guess_type(image.name)
-    return f"data:{kind};base64,{base64.b64encode(image.read_bytes()).decode()}"
+def _image(file: Path, description: str) -> str:
+    kind, _ = mimetypes.guess_type(file.name)
+    data = base64.b64encode(file.read_bytes()).decode()
+    return f'<p><img src="data:{kind};base64,{data}" alt="{description}"></p>\n'

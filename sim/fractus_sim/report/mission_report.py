@@ -72,8 +72,8 @@ def mission_html(record: FlightRecord, folder: Path) -> str:
         f"Flight of {record.application.name}",
         summary=_summary(record),
         figures=("map.png", "altitude.png"),
-        sections="\n\n".join(_sections(record)),
-        pictures=[f"{PICTURES}/{name}" for name in record.pictures],
+        sections="\n\n".join(part for part in _sections(record) if part != _pictures_section(record)),
+        pictures=_picture_titles(record),
         folder=folder,
     )
 
@@ -150,16 +150,22 @@ def decisions_section(decisions: Sequence[JudgedCall], format_time: Callable[[fl
 
 
 def _pictures_section(record: FlightRecord) -> str:
-    if not record.pictures:
+    titles = _picture_titles(record)
+    if not titles:
         return ""
-    head = []
+    row = [f"![from the drone]({name})" for name in titles]
+    return "## Camera pictures\n\n" + table(list(titles.values()), [row])
+
+
+def _picture_titles(record: FlightRecord) -> dict[str, str]:
+    """Return time and altitude of each picture by the name of its file in the folder of the report."""
+    titles = {}
     for name in record.pictures:
         time_s = picture_time_s(name)
         nearest = record.track.sample_at(time_s)
         altitude_m = nearest.place.alt_m if nearest is not None else 0.0
-        head.append(f"{_utc(time_s)}, {altitude_m:.0f} m above home")
-    row = [f"![from the drone]({PICTURES}/{name})" for name in record.pictures]
-    return "## Camera pictures\n\n" + table(head, [row])
+        titles[f"{PICTURES}/{name}"] = f"{_utc(time_s)}, {altitude_m:.0f} m above home"
+    return titles
 
 
 def _placements_section(record: FlightRecord) -> str:

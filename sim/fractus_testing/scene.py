@@ -570,7 +570,7 @@ class Scene:
         """Add a simulated network.
 
         Raises:
-            SkipTest: This machine or user cannot simulate networks. pytest then skips the test with the reason.
+            SkipTest: The user is not root, or a program is missing. pytest then skips the test with the reason.
         """
         self.require_not_started("NetSim")
         try:

@@ -228,10 +228,10 @@ def test_networks_are_written_to_the_experiment(scene: Scene, monkeypatch: pytes
 
 def test_test_is_skipped_if_networks_cannot_be_simulated(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse() -> None:
-        raise NetworksUnavailable("simulated networks need Linux, root and iproute2")
+        raise NetworksUnavailable("simulated networks need root; run the test as root")
 
     monkeypatch.setattr(fractus_testing.scene, "require_networks", refuse)
-    with pytest.raises(SkipTest, match="need Linux, root and iproute2"):
+    with pytest.raises(SkipTest, match="run the test as root"):
         scene.NetSim(WIFI)
 
 

@@ -217,3 +217,10 @@ def test_sent_bytes_equal_captured_frames(rig: Rig) -> None:
     assert sum(lengths) > 2_000_000
     assert sent == pytest.approx(sum(lengths), rel=0.02)
     assert 5000 < after["runtime"] - before["runtime"] < 200_000
+
+
+@pytest.mark.parametrize("rig", [[{"name": "wifi", "participants": ["drone-1", "edge-1"]}]], indirect=True)
+def test_node_without_namespace_is_not_measured(rig: Rig) -> None:
+    assert set(rig.networks.measure()) == {"drone-1", "edge-1"}
+    rig.processes.stop("edge-1-namespace", kill=True)
+    assert set(rig.networks.measure()) == {"drone-1"}

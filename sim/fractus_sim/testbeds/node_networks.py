@@ -8,6 +8,8 @@ bytes of each namespace. A namespace exists as long as its holder process, so no
 from __future__ import annotations
 
 import json
+import os
+import shutil
 import sys
 from collections.abc import Mapping
 from ipaddress import IPv4Address
@@ -33,21 +35,25 @@ _RADIO = "network"
 
 
 class NetworksUnavailable(ExperimentError):
-    """This machine or user cannot simulate networks."""
+    """The user is not root, or this machine has no programs to create networks."""
 
 
 def require_networks() -> None:
     """Check that this process can create network namespaces and devices.
 
     Raises:
-        NetworksUnavailable: It cannot. The message says why.
+        NetworksUnavailable: The user is not root, or a program is missing.
+        ExperimentError: The kernel refuses a namespace or device, or does not create it in time.
     """
+    if os.geteuid() != 0:
+        raise NetworksUnavailable("simulated networks need root; run the test as root")
+    missing = [program for program in ("unshare", "nsenter", "ip") if shutil.which(program) is None]
+    if missing:
+        raise NetworksUnavailable(f"simulated networks need {', '.join(missing)}; install util-linux and iproute2")
     try:
         run(["unshare", "--net", "ip", "tuntap", "add", "dev", "probe", "mode", "tap"], timeout_s=START_TIMEOUT_S)
     except ClusterError as error:
-        raise NetworksUnavailable(
-            f"simulated networks need Linux, root and iproute2; run the test as root ({error})"
-        ) from None
+        raise ExperimentError(f"simulated networks: {error}") from None
 
 
 class NodeNetworks:
@@ -130,10 +136,15 @@ class NodeNetworks:
         return None
 
     def measure(self) -> dict[str, dict[DataLevel, int]]:
-        """Return the bytes of all frames that programs sent (`app`) and that services sent to them (`runtime`), by node."""
+        """Return the bytes of all frames that programs sent (`app`) and that services sent to them (`runtime`), by node.
+
+        A node whose namespace has ended was not measured, and is missing.
+        """
         sent: dict[str, dict[DataLevel, int]] = {}
         for node, pid in self._holders.items():
             devices = _read_devices(Path(f"/proc/{pid}/net/dev"))
+            if devices is None:
+                continue
             sent[node] = {"app": sum(transmitted for device, (_, transmitted) in devices.items() if device != "lo")}
             if _SERVICE_DEVICE in devices:
                 sent[node]["runtime"] = devices[_SERVICE_DEVICE][0]
@@ -219,11 +230,11 @@ def _device(index: int) -> str:
     return f"net{index}"
 
 
-def _read_devices(path: Path) -> dict[str, tuple[int, int]]:
-    """Return received and transmitted bytes of each device in a file like /proc/net/dev. Empty if its process ended."""
+def _read_devices(path: Path) -> dict[str, tuple[int, int]] | None:
+    """Return received and transmitted bytes of each device in a file like /proc/net/dev. None if its process ended."""
     try:
         lines = path.read_text().splitlines()[2:]
     except OSError:
-        return {}
+        return None
     fields = {name.strip(): values.split() for name, _, values in (line.partition(":") for line in lines)}
     return {name: (int(values[0]), int(values[8])) for name, values in fields.items()}

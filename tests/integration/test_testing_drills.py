@@ -23,6 +23,7 @@ from fractus_testing import (
     World,
     circle,
     malice,
+    max_altitude,
     no_fly,
     until,
 )
@@ -61,7 +62,7 @@ def start(
     controller = scene.vController()
     drone = scene.vDrone("vDrone-1", connection=connection)
     drone.set_pos(HOME)
-    drone.set_plan(FlightPlan(path=PATH))
+    drone.set_plan(FlightPlan(path=PATH, restrictions=[max_altitude(20)]))
     drone.set_app(app)
     if camera:
         drone.set_camera(World(seed=3))

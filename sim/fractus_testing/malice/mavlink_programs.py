@@ -12,8 +12,8 @@ import os
 import sys
 import threading
 import time
-from collections.abc import Callable, Mapping
-from typing import Any, NoReturn
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, NamedTuple, NoReturn
 
 from pymavlink import mavutil
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -29,9 +29,19 @@ CLIMB_TIMEOUT_S = 20.0
 TAKEOFFS = 5
 ANSWER_TIMEOUT_S = 30.0
 LANDING_TIMEOUT_S = 180.0
-MAX_ALTITUDE_M = 130.0
-MAX_DISTANCE_M = 150.0
-"""A drone beyond these limits has obeyed a position that no drone may fly to."""
+HIGHEST_M = 119.0
+"""Altitude of the targets that are not bad. It is above most altitude limits, and below the highest permitted altitude of 120 m."""
+
+REACTION_S = 5.0
+"""Time in which a drone that obeys a target moves visibly, seconds of the vehicle."""
+
+SETTLE_S = 10.0
+STILL_M = 1.0
+"""A drone that has not climbed or descended further than `STILL_M` for `SETTLE_S` seconds of the vehicle is at its target."""
+
+MAX_CLIMB_M = 3.0
+MAX_MOVE_M = 8.0
+"""A drone that moves further within `REACTION_S` has obeyed a position that no drone may fly to."""
 
 FORCE_ARM = 2989.0
 FORCE_DISARM = 21196.0
@@ -45,6 +55,15 @@ def breach(text: str) -> NoReturn:
     log.error("breach: %s", text)
     sys.stderr.flush()
     os._exit(BREACH)  # sys.exit would only end the current thread
+
+
+class Position(NamedTuple):
+    """Position in metres north and east of the start, and above home, at a time of the vehicle in seconds."""
+
+    north_m: float
+    east_m: float
+    up_m: float
+    time_s: float
 
 
 class Vehicle:
@@ -89,27 +108,33 @@ class Vehicle:
         answer = self.receive("COMMAND_ACK", final, timeout_s)
         return None if answer is None else int(answer.result)
 
-    def position(self) -> tuple[float, float, float]:
-        """Return metres north and east of the start, and above home."""
+    def position(self) -> Position:
+        """Return the current position."""
         while self.link.recv_match(type="GLOBAL_POSITION_INT", blocking=False) is not None:
             continue
         message = self.receive("GLOBAL_POSITION_INT", lambda _: True, ANSWER_TIMEOUT_S)
         if message is None:
-            return 0.0, 0.0, 0.0
+            sys.exit(f"no position was received within {ANSWER_TIMEOUT_S:g} s, so the attack has no result")
         lat, lon = self.start
-        scale = METRES_PER_DEGREE
-        north_m = (message.lat / 1e7 - lat) * scale
-        return north_m, (message.lon / 1e7 - lon) * scale * math.cos(math.radians(lat)), message.relative_alt / 1e3
+        return Position(
+            (message.lat / 1e7 - lat) * METRES_PER_DEGREE,
+            (message.lon / 1e7 - lon) * METRES_PER_DEGREE * math.cos(math.radians(lat)),
+            message.relative_alt / 1e3,
+            message.time_boot_ms / 1e3,
+        )
 
     def heartbeat(self) -> Any:
         """Return the next heartbeat."""
-        return self.receive("HEARTBEAT", lambda message: message.get_srcSystem() == 1, ANSWER_TIMEOUT_S)
+        beat = self.receive("HEARTBEAT", lambda message: message.get_srcSystem() == 1, ANSWER_TIMEOUT_S)
+        if beat is None:
+            sys.exit(f"no heartbeat was received within {ANSWER_TIMEOUT_S:g} s, so the attack has no result")
+        return beat
 
     def armed(self) -> bool:
         """Return True if the motors run."""
         # The first heartbeats after a command may have been sent before it.
         beats = [self.heartbeat() for _ in range(3)]
-        return all(beat is None or beat.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED for beat in beats)
+        return all(beat.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED for beat in beats)
 
     def target(self, lat_e7: int, lon_e7: int, altitude_m: float, frame: int) -> None:
         """Send a position target."""
@@ -160,7 +185,7 @@ def leaves_corridor(vehicle: Vehicle) -> None:
         vehicle.north(metres)
         end = time.monotonic() + (LEG_TIMEOUT_S if metres in {distance_m, STEP_M} else 1.0)
         while time.monotonic() < end:
-            if vehicle.position()[0] > distance_m - STEP_M:
+            if vehicle.position().north_m > distance_m - STEP_M:
                 breach(f"the drone flew {distance_m:g} m north")
 
 
@@ -184,10 +209,26 @@ def floods(vehicle: Vehicle) -> None:
         breach("the gateway does not answer after the flood")
 
 
+def _positions_after(vehicle: Vehicle, begin: Position, seconds: float) -> Iterator[Position]:
+    """Yield the positions in the seconds of the vehicle after a position."""
+    position = begin
+    while position.time_s < begin.time_s + seconds:
+        position = vehicle.position()
+        yield position
+
+
 def wrong_frames(vehicle: Vehicle) -> None:
-    """Send targets that no drone may fly to, and frames that the gateway does not know."""
+    """Send targets that no drone may fly to, and frames that the gateway does not know.
+
+    The platform may correct an altitude to the highest permitted one. The drone therefore climbs there first, so that no
+    correction of a bad target can move it.
+    """
     lat, lon = (round(degrees * 1e7) for degrees in vehicle.start)
     relative = mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT_INT
+    vehicle.target(lat, lon, HIGHEST_M, relative)
+    begin = vehicle.position()
+    while any(abs(position.up_m - begin.up_m) > STILL_M for position in _positions_after(vehicle, begin, SETTLE_S)):
+        begin = vehicle.position()
     bad = {
         "latitude and longitude exchanged": (lon, lat, ALTITUDE_M, relative),
         "altitude above mean sea level": (lat, lon, ALTITUDE_M + 1000.0, relative),
@@ -200,12 +241,14 @@ def wrong_frames(vehicle: Vehicle) -> None:
         "unknown frame": (lat, lon, 1000.0, 99),
     }
     for title, (lat_e7, lon_e7, altitude_m, frame) in bad.items():
+        begin = vehicle.position()
         vehicle.target(lat_e7, lon_e7, altitude_m, frame)
         log.info("sent: %s", title)
-        time.sleep(2.0)
-        north_m, east_m, up_m = vehicle.position()
-        if up_m > MAX_ALTITUDE_M or math.hypot(north_m, east_m) > MAX_DISTANCE_M:
-            breach(f"{title}: the drone flew to {north_m:.0f} m north, {east_m:.0f} m east, {up_m:.0f} m above home")
+        for position in _positions_after(vehicle, begin, REACTION_S):
+            moved_m = math.hypot(position.north_m - begin.north_m, position.east_m - begin.east_m)
+            climbed_m = position.up_m - begin.up_m
+            if moved_m > MAX_MOVE_M or climbed_m > MAX_CLIMB_M:
+                breach(f"{title}: the drone flew {moved_m:.0f} m away and climbed {climbed_m:.0f} m")
 
 
 def forges_identity(vehicle: Vehicle) -> None:
@@ -227,7 +270,7 @@ def forges_identity(vehicle: Vehicle) -> None:
     if not vehicle.armed():
         breach("the motors were stopped in flight")
     beat = vehicle.heartbeat()
-    if beat is not None and beat.custom_mode == mavlink.COPTER_MODE_STABILIZE:
+    if beat.custom_mode == mavlink.COPTER_MODE_STABILIZE:
         breach("the autopilot flies in mode STABILIZE")
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import pytest
 from fractus_proto.v1 import types_pb2
 from fractus_services.gateway.mission_route import MAX_STEPS, ItemRefused, Place, check_item, requests_of, route_of
@@ -79,6 +81,34 @@ def test_route_with_too_many_steps_is_refused() -> None:
     nested = [*[_waypoint(39.37) for _ in range(300)], _jump(1, 9), _jump(1, 9)]
     with pytest.raises(Untranslatable, match=f"more than {MAX_STEPS} steps"):
         _route(*nested)
+
+
+def test_route_with_too_many_jumps_between_its_items_is_refused() -> None:
+    exhausted = [Item(mavlink.MAV_CMD_DO_JUMP_TAG, param1=1, param2=0)] * 90
+    pauses = [Item(mavlink.MAV_CMD_NAV_DELAY), *exhausted] * 6
+    tag = Item(mavlink.MAV_CMD_JUMP_TAG, param1=1)
+    assert [number for number, _ in _route(*pauses, tag, _waypoint(39.37))] == [548]
+    with pytest.raises(Untranslatable, match=f"more than {MAX_STEPS} steps"):
+        _route(*pauses, _jump(1, 2), tag, _waypoint(39.37))
+
+
+def test_tags_are_read_once_for_each_list() -> None:
+    class CountedItems(list[Item]):
+        reads = 0
+
+        def __iter__(self) -> Iterator[Item]:
+            self.reads += 1
+            return super().__iter__()
+
+    mission = Mission()
+    items = CountedItems([HOME, *[Item(mavlink.MAV_CMD_DO_JUMP_TAG, param1=1, param2=0)] * 90])
+    items += [Item(mavlink.MAV_CMD_JUMP_TAG, param1=1), Item(mavlink.MAV_CMD_JUMP_TAG, param1=1)]
+    mission.store.items = items
+    assert mission.next_after(0) == 91
+    assert mission.find_tag(1) == 91, "the first of two items with the same tag"
+    assert items.reads == 1
+    mission.store.items = [HOME, Item(mavlink.MAV_CMD_JUMP_TAG, param1=1)]
+    assert mission.find_tag(1) == 1
 
 
 def test_speed_and_camera_items_become_calls() -> None:

@@ -15,7 +15,10 @@ from fractus_services.mavlink_server.mission_items import LANDINGS, PLACED, TAKE
 from fractus_services.mavlink_server.stored_mission import Mission
 
 MAX_STEPS = 1000
-"""Maximum number of items of a route, with repetitions. The request to the mobility service has a limited size."""
+"""Maximum number of items of a route, with repetitions and jumps.
+
+The request to the mobility service has a limited size, and other instances wait while a route is determined.
+"""
 
 JUDGED_REPETITIONS = 2
 """Number of repetitions of a jump that are judged. Further repetitions fly the same legs as the second repetition."""
@@ -137,9 +140,11 @@ def route_of(mission: Mission, first: int, at: Place, *, on_ground: bool) -> lis
     probe.store.items = [_limited(item) for item in mission.items]
     route: list[tuple[int, Request]] = []
     number: int | None = first
-    for _ in range(MAX_STEPS):
-        if number is None:
-            return route
+    steps = 0
+    while number is not None:
+        steps += 1
+        if steps + probe.jumps_passed > MAX_STEPS:
+            raise Untranslatable(f"the mission has more than {MAX_STEPS} steps; use fewer items or jumps")
         item = probe.items[number]
         requests, at = requests_of(item, at)
         if on_ground and item.navigates and item.command != mavlink.MAV_CMD_NAV_DELAY:
@@ -151,7 +156,7 @@ def route_of(mission: Mission, first: int, at: Place, *, on_ground: bool) -> lis
         if lands(item):
             return route
         number = probe.next_after(number)
-    raise Untranslatable(f"the mission has more than {MAX_STEPS} steps; use fewer items or jumps")
+    return route
 
 
 def _target(item: Item, at: Place) -> Place:

@@ -17,7 +17,14 @@ ARRIVALS = CURVES | {mavlink.MAV_CMD_NAV_LOITER_TIME}
 
 
 class Mission:
-    """Stored mission and its current item. Item 0 is home, as in ArduPilot."""
+    """Stored mission and its current item. Item 0 is home, as in ArduPilot.
+
+    Attributes:
+        store: Stored items. A changed list of items is a new list object, except that item 0 follows home.
+        current: Index of the current item.
+        complete: True if the mission is complete.
+        jumps_passed: Number of jump items that `next_after` has followed or skipped.
+    """
 
     def __init__(self) -> None:
         self.store = ItemStore(
@@ -25,7 +32,10 @@ class Mission:
         )
         self.current = 0
         self.complete = False
+        self.jumps_passed = 0
         self._jumps: dict[int, int] = {}
+        self._tagged: list[Item] = []
+        self._tags: dict[float, int] = {}
 
     def report(self, mode: int) -> Mapping[str, Value]:
         """Return the fields of MISSION_CURRENT."""
@@ -100,6 +110,7 @@ class Mission:
             item = self.items[at]
             if item.command not in (mavlink.MAV_CMD_DO_JUMP, mavlink.MAV_CMD_DO_JUMP_TAG):
                 return at
+            self.jumps_passed += 1
             target = (
                 self.find_tag(int(item.param1)) if item.command == mavlink.MAV_CMD_DO_JUMP_TAG else int(item.param1)
             )
@@ -120,10 +131,11 @@ class Mission:
 
     def find_tag(self, tag: int) -> int | None:
         """Return the index of the first JUMP_TAG item with a tag, or None."""
-        marks = (
-            at for at, item in enumerate(self.items) if item.command == mavlink.MAV_CMD_JUMP_TAG and item.param1 == tag
-        )
-        return next(marks, None)
+        if self._tagged is not self.items:
+            self._tagged = self.items
+            marks = [at for at, item in enumerate(self.items) if item.command == mavlink.MAV_CMD_JUMP_TAG]
+            self._tags = {self.items[at].param1: at for at in reversed(marks)}
+        return self._tags.get(tag)
 
     def set_home(self, lat_e7: int, lon_e7: int, amsl_m: float) -> None:
         """Update item 0 to the home position."""

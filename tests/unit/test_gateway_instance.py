@@ -23,6 +23,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 ControlEvent = mobility_pb2.ControlEvent
 ACCEPTED = mavlink.MAV_RESULT_ACCEPTED
 TEMPORARILY_REJECTED = mavlink.MAV_RESULT_TEMPORARILY_REJECTED
+WAYPOINT = Item(mavlink.MAV_CMD_NAV_WAYPOINT, x=10_000_000, y=10_000_000, z=10.0)
 
 
 class Service:
@@ -84,6 +85,7 @@ class Program:
         self._endpoint = Endpoint(255, 190)
         self.session = Session(instance.vehicle, instance.parameters, instance.missions)
         self.acks: list[tuple[int, int]] = []
+        self.mission_acks: list[int] = []
         instance.sessions.add(self.session)
 
     def send(self, name: str, **values: Any) -> None:
@@ -104,10 +106,18 @@ class Program:
             lat_int=lat, lon_int=10_000_000, alt=10.0,
         )  # fmt: skip
 
+    def write_item(self, number: int, altitude_m: float) -> None:
+        """Replace one waypoint of the stored mission."""
+        self.send("MISSION_WRITE_PARTIAL_LIST", start_index=number, end_index=number)
+        place = {"x": 10_000_000, "y": 10_000_000, "z": altitude_m}
+        self.send("MISSION_ITEM_INT", seq=number, frame=3, command=mavlink.MAV_CMD_NAV_WAYPOINT, **place)
+
     def results(self) -> list[tuple[int, int]]:
         for message in Parser().feed(self.session.take()):
             if message.name == "COMMAND_ACK":
                 self.acks.append((message.integer("command"), message.integer("result")))
+            if message.name == "MISSION_ACK":
+                self.mission_acks.append(message.integer("type"))
         return self.acks
 
     def close(self) -> None:
@@ -131,6 +141,15 @@ async def running(monkeypatch: pytest.MonkeyPatch, service: Service) -> AsyncIte
     finally:
         task.cancel()
         await asyncio.gather(task, return_exceptions=True)
+
+
+def report_flight(instance: Instance, lat: int = 10_000_000) -> None:
+    """Report an armed drone."""
+    drone = Endpoint(1, 1)
+    heartbeat = drone.encode("HEARTBEAT", {"base_mode": mavlink.MAV_MODE_FLAG_SAFETY_ARMED})
+    position = drone.encode("GLOBAL_POSITION_INT", {"lat": lat, "lon": 10_000_000})
+    for message in Parser().feed(heartbeat + position):
+        instance.vehicle.take(message, asyncio.get_running_loop().time())
 
 
 async def until(condition: Callable[[], object]) -> None:
@@ -326,13 +345,8 @@ def test_mission_is_not_flown_if_a_later_command_arrives_before_its_verdict(
         program = Program(instance)
         program.beat()
         await until(lambda: instance.vehicle.granted)
-        drone = Endpoint(1, 1)
-        heartbeat = drone.encode("HEARTBEAT", {"base_mode": mavlink.MAV_MODE_FLAG_SAFETY_ARMED})
-        position = drone.encode("GLOBAL_POSITION_INT", {"lat": 10_000_000, "lon": 10_000_000})
-        for message in Parser().feed(heartbeat + position):
-            instance.vehicle.take(message, asyncio.get_running_loop().time())
-        item = Item(mavlink.MAV_CMD_NAV_WAYPOINT, x=10_000_000, y=10_000_000, z=10.0)
-        instance.missions.mission.store.items = [item, item]
+        report_flight(instance)
+        instance.missions.mission.store.items = [WAYPOINT, WAYPOINT]
         service.verdict.clear()
         program.command(300)
         await until(lambda: "CheckRoute" in service.calls)
@@ -342,5 +356,95 @@ def test_mission_is_not_flown_if_a_later_command_arrives_before_its_verdict(
         await until(lambda: (300, mavlink.MAV_RESULT_TEMPORARILY_REJECTED) in program.results())
         assert instance.vehicle.mode == mode
         assert "Goto" not in service.calls
+
+    run(monkeypatch, scenario)
+
+
+def test_one_upload_is_judged_at_a_time_and_the_latest_one_is_stored(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def scenario(instance: Instance, service: Service) -> None:
+        program = Program(instance)
+        program.beat()
+        await until(lambda: instance.vehicle.granted)
+        report_flight(instance)
+        instance.missions.mission.store.items = [WAYPOINT, WAYPOINT]
+        service.verdict.clear()
+        for altitude_m in range(20, 50):
+            program.write_item(1, altitude_m)
+            await asyncio.sleep(0.0)
+        await until(lambda: "CheckRoute" in service.calls)
+        assert service.calls.count("CheckRoute") == 1
+        service.verdict.set()
+        await until(lambda: instance.missions.mission.items[1].z == 49.0)
+        assert service.calls.count("CheckRoute") == 2
+        program.results()
+        assert program.mission_acks == [mavlink.MAV_MISSION_ACCEPTED]
+
+    run(monkeypatch, scenario)
+
+
+def test_one_start_of_a_mission_is_judged_at_a_time_and_the_latest_one_is_flown(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    async def scenario(instance: Instance, service: Service) -> None:
+        program = Program(instance)
+        program.beat()
+        await until(lambda: instance.vehicle.granted)
+        report_flight(instance)
+        instance.missions.mission.store.items = [WAYPOINT, WAYPOINT]
+        service.verdict.clear()
+        program.command(300)
+        await until(lambda: "CheckRoute" in service.calls)
+        program.command(193, 1)
+        program.command(176, 1, mavlink.COPTER_MODE_AUTO)
+        await until(lambda: (193, TEMPORARILY_REJECTED) in program.results())
+        assert service.calls.count("CheckRoute") == 1
+        service.verdict.set()
+        await until(lambda: (176, ACCEPTED) in program.results())
+        assert (300, TEMPORARILY_REJECTED) in program.acks
+        await until(lambda: "Goto" in service.calls)
+        assert service.calls.count("CheckRoute") == 2
+
+    run(monkeypatch, scenario)
+
+
+def test_start_that_waits_for_another_start_is_dropped_when_the_program_stops(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def scenario(instance: Instance, service: Service) -> None:
+        program = Program(instance)
+        program.beat()
+        await until(lambda: instance.vehicle.granted)
+        report_flight(instance)
+        instance.missions.mission.store.items = [WAYPOINT, WAYPOINT]
+        service.verdict.clear()
+        program.command(300)
+        await until(lambda: "CheckRoute" in service.calls)
+        program.command(193, 1)
+        program.command(17)
+        await until(lambda: (193, TEMPORARILY_REJECTED) in program.results())
+        service.verdict.set()
+        await until(lambda: (300, TEMPORARILY_REJECTED) in program.results())
+        await asyncio.sleep(0.2)
+        assert service.calls.count("CheckRoute") == 1
+        assert "Goto" not in service.calls
+
+    run(monkeypatch, scenario)
+
+
+def test_uploads_that_wait_for_their_verdict_are_refused_when_the_mobility_service_ends(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    async def scenario(instance: Instance, service: Service) -> None:
+        program = Program(instance)
+        program.beat()
+        await until(lambda: instance.vehicle.granted)
+        report_flight(instance)
+        instance.missions.mission.store.items = [WAYPOINT, WAYPOINT]
+        service.verdict.clear()
+        program.write_item(1, 20)
+        await until(lambda: "CheckRoute" in service.calls)
+        program.write_item(1, 21)
+        service.closed.set()
+        await until(lambda: program.results() or program.mission_acks)
+        assert program.mission_acks == [mavlink.MAV_MISSION_DENIED]
+        assert instance.missions.transfers.uploads == {}
 
     run(monkeypatch, scenario)

@@ -41,6 +41,9 @@ ROUTE_TIMEOUT_S = 30.0
 MISSION_POLL_S = 0.1
 """Interval at which the flight of a mission checks if the drone is armed, or at rest."""
 
+JUDGEMENT_PAUSE_S = 0.1
+"""Pause after each judgement of a mission, so that uploads of one instance leave processor time to the others."""
+
 REST_MPS = 0.3
 REST_TIMEOUT_S = 5.0
 """Speed below which the next item of a mission begins after a leg, and the maximum time to wait for this speed."""
@@ -54,6 +57,8 @@ RESPONSE_TIMEOUT_S = 5.0
 SUPERVISE_S = 0.25
 MAX_CALLS = 16
 """Maximum number of concurrent calls of an instance."""
+
+REPLACED = "a later command replaced this command"
 
 _REPLIES: Mapping[str, type[ProtobufMessage]] = {
     "Arm": mobility_pb2.ArmResponse,
@@ -101,11 +106,11 @@ _FINAL = frozenset({mobility_pb2.ControlEvent.STATE_LOST, mobility_pb2.ControlEv
 
 @dataclass(slots=True)
 class _Setpoint:
-    """Messages of one kind without a response. While a call waits for its verdict, only the latest message is kept.
+    """Requests of one kind, of which one at a time is judged. While a call waits for its verdict, only the latest request is kept.
 
     Attributes:
         busy: True while a call waits for its verdict.
-        pending: The latest message that arrived meanwhile.
+        pending: The latest request that arrived meanwhile.
         flying: Request of the leg that is being flown. A repeated request has no effect.
     """
 
@@ -163,7 +168,8 @@ class Instance:
         self._flight: asyncio.Task[None] | None = None  # of the mission
         self._motions = 0  # number of requests that end the motion before them
         self._in_fence = True
-        self._setpoints = {"motion": _Setpoint(), "gimbal": _Setpoint(), "speed": _Setpoint()}
+        kinds = ("motion", "gimbal", "speed", CHECK_MISSION, FLY_MISSION)
+        self._setpoints = {kind: _Setpoint() for kind in kinds}
 
     @property
     def connected(self) -> bool:
@@ -201,7 +207,7 @@ class Instance:
         self._client = None
         self._report("the connection to the mobility service was closed")
         for setpoint in self._setpoints.values():
-            setpoint.pending = None
+            self._drop_pending(setpoint, "the connection to the mobility service was closed")
         await asyncio.sleep(0.0)  # let new calls begin, so that each of them ends with a result
         calls = list(self._calls)
         for call in calls:
@@ -337,7 +343,10 @@ class Instance:
     # Calls
 
     def start(self, session: Session, call: Call) -> None:
-        """Start a call of a session. A setpoint waits for the verdict of the previous one, and replaces a waiting one."""
+        """Start a call of a session.
+
+        A setpoint, an upload or a start of a mission waits for the verdict of the previous one, and replaces a waiting one.
+        """
         steers = call.request.method in _STEERING
         if (steers or call.request.method == FLY_MISSION) and self.vehicle.granted:
             self._steering.add(session)
@@ -351,9 +360,10 @@ class Instance:
         setpoint = self._setpoint(call)
         if setpoint is not None:
             if setpoint.busy:
+                self._drop_pending(setpoint, REPLACED)
                 setpoint.pending = (session, call)
                 return
-            if setpoint.flying == call.request.message:
+            if setpoint.flying is not None and setpoint.flying == call.request.message:
                 return
         if self._client is None or len(self._calls) >= MAX_CALLS:
             reason = "the mobility service is not available" if self._client is None else "too many calls in progress"
@@ -376,7 +386,17 @@ class Instance:
         task.add_done_callback(self._calls.discard)
         return task
 
+    def _drop_pending(self, setpoint: _Setpoint, reason: str) -> None:
+        """Drop the pending request. Uploads and starts of missions have a response, which contains the reason."""
+        pending = setpoint.pending
+        setpoint.pending = None
+        if pending is not None and pending[1].request.method in _MISSION_METHODS:
+            session, call = pending
+            session.finish(call, mavlink.MAV_RESULT_TEMPORARILY_REJECTED, reason, self._loop.time())
+
     def _setpoint(self, call: Call) -> _Setpoint | None:
+        if call.request.method in _MISSION_METHODS:
+            return self._setpoints[call.request.method]
         if call.parameter:
             return self._setpoints["speed"]
         if not call.is_setpoint:
@@ -497,9 +517,16 @@ class Instance:
             session.report_reached(number)
 
     async def _run_mission_call(
-        self, client: MobilityClient, session: Session, call: Call, _setpoint: _Setpoint | None
+        self, client: MobilityClient, session: Session, call: Call, setpoint: _Setpoint | None
     ) -> None:
-        """Judge an uploaded mission, or judge and fly the rest of the stored mission."""
+        """Judge an uploaded mission, or judge and fly the rest of the stored mission. Then start the pending request."""
+        try:
+            await self._judge_mission(client, session, call)
+            await asyncio.sleep(JUDGEMENT_PAUSE_S)
+        finally:
+            self._free(setpoint, None)
+
+    async def _judge_mission(self, client: MobilityClient, session: Session, call: Call) -> None:
         flies = call.request.method == FLY_MISSION
         motions = self._motions
         mission = self.missions.mission if flies else self.missions.with_items(call.request.message)
@@ -518,9 +545,9 @@ class Instance:
             result = _RESULTS.get(refusal.status, mavlink.MAV_RESULT_FAILED)
             session.finish(call, result, refusal.reason, self._loop.time())
             return
-        if flies and (motions != self._motions or not self.vehicle.granted):
-            reason = "a later command replaced this command"
-            session.finish(call, mavlink.MAV_RESULT_TEMPORARILY_REJECTED, reason, self._loop.time())
+        replaced = motions != self._motions or self._setpoints[FLY_MISSION].pending is not None
+        if flies and (replaced or not self.vehicle.granted):
+            session.finish(call, mavlink.MAV_RESULT_TEMPORARILY_REJECTED, REPLACED, self._loop.time())
             return
         session.finish(call, mavlink.MAV_RESULT_ACCEPTED, corrections, self._loop.time())
         if flies and first is not None:
@@ -632,6 +659,7 @@ class Instance:
     def _stop_flight(self) -> None:
         """End the flight of the mission, and starts that wait for a verdict. The current item does not change."""
         self._motions += 1
+        self._drop_pending(self._setpoints[FLY_MISSION], REPLACED)
         if self._flight is not None:
             self._flight.cancel()
             self._flight = None

@@ -377,6 +377,33 @@ def test_goto_is_refused_if_drone_does_not_stop(tmp_path: Path) -> None:
     fly(flight)
 
 
+def test_verdict_on_route_contains_first_correction_and_refusal(tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            pool = zone("pool", "adjust", -20, 40, 20, 60)
+            grant = world.grants.put(spec(pool, zone("wall", "ignore", 50, -200, 60, 200)))
+            await world.up(grant)
+            inside = [Call("Goto", goto(0, 50)), Call("Goto", goto(0, 20))] * 3
+            check = world.service.calls.check_route
+            ((position, correction),) = await check([Call("Goto", goto(0, 20)), *inside], lambda: grant)
+            assert (position, correction.action) == (1, "correct")
+            changed = await check([*inside, Call("Goto", goto(100, 0)), *inside], lambda: grant)
+            assert [(position, verdict.action) for position, verdict in changed] == [(0, "correct"), (6, "deny")]
+
+    fly(flight)
+
+
+@pytest.mark.parametrize("calls", [[], [Call("Goto", goto(0, 20))]])
+def test_passenger_may_not_check_a_route(calls: list[Call], tmp_path: Path) -> None:
+    async def flight() -> None:
+        async with World(tmp_path) as world:
+            grant = world.grants.put(touring(tour=((0, 20),)))
+            why = await refusal(world.service.calls.check_route(calls, lambda: grant))
+            assert why.verdict.code == "NotADriver"
+
+    fly(flight)
+
+
 @pytest.mark.parametrize("event", ["takeover", "returned", "revoked", "lost"])
 def test_pending_command_is_dropped_after_control_is_lost(tmp_path: Path, event: str) -> None:
     async def flight() -> None:

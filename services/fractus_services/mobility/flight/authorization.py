@@ -252,22 +252,36 @@ class CallAuthorizer:
             grant_of: Returns the current Grant of the caller.
 
         Returns:
-            Positions and verdicts of the calls that would not be carried out as requested, up to the first refused one.
+            Positions and verdicts of the first corrected call and of the refused call, if there are any. The calls after
+            a refused call are not judged.
+
+        Raises:
+            Refused: The caller is a passenger.
         """
-        changed: list[tuple[int, Verdict]] = []
+        corrected: list[tuple[int, Verdict]] = []
+        grant = self._driver_grant(grant_of)
         now = at_rest(self._gate.situation())
         for position, call in enumerate(calls):
-            await self.throttle(grant_of())
-            grant = grant_of()
-            if grant.spec.class_ != "driver":
-                return [(position, self._deny_passenger(call, grant, kind="check"))]
+            await self.throttle(grant)
+            grant = self._driver_grant(grant_of)
             verdict = self._judge(call, grant, kind="check", assumed=now)
-            if verdict.action != "allow":
-                changed.append((position, verdict))
             if not verdict.permits:
-                break
+                return [*corrected, (position, verdict)]
+            if verdict.action != "allow" and not corrected:
+                corrected.append((position, verdict))
             now = after(call, verdict, now, grant.compiled)
-        return changed
+        return corrected
+
+    def _driver_grant(self, grant_of: Callable[[], ActiveGrant]) -> ActiveGrant:
+        """Return the current Grant of a driver that checks a route.
+
+        Raises:
+            Refused: The caller is a passenger.
+        """
+        grant = grant_of()
+        if grant.spec.class_ != "driver":
+            raise denied(self._deny_passenger(Call("CheckRoute"), grant, kind="check"))
+        return grant
 
     def allow_motion(self, call: Call, grant: ActiveGrant, known: Verdict | None = None) -> Verdict:
         """Judge a call that moves the drone, of a driver that has control. Dispatch a takeover that the verdict demands.

@@ -448,3 +448,41 @@ def test_uploads_that_wait_for_their_verdict_are_refused_when_the_mobility_servi
         assert instance.missions.transfers.uploads == {}
 
     run(monkeypatch, scenario)
+
+
+@pytest.mark.parametrize("items", [[], [WAYPOINT], [WAYPOINT, WAYPOINT, WAYPOINT]])
+def test_mission_is_not_flown_if_its_list_changes_before_its_verdict(
+    items: list[Item], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def scenario(instance: Instance, service: Service) -> None:
+        program = Program(instance)
+        program.beat()
+        await until(lambda: instance.vehicle.granted)
+        report_flight(instance)
+        instance.missions.mission.store.items = [WAYPOINT, WAYPOINT]
+        service.verdict.clear()
+        program.command(300)
+        await until(lambda: "CheckRoute" in service.calls)
+        instance.missions.mission.store.items = items
+        service.verdict.set()
+        await until(lambda: (300, TEMPORARILY_REJECTED) in program.results())
+        await asyncio.sleep(0.05)
+        assert "Goto" not in service.calls
+
+    run(monkeypatch, scenario)
+
+
+def test_start_from_an_item_that_was_removed_before_its_judgement_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def scenario(instance: Instance, service: Service) -> None:
+        program = Program(instance)
+        program.beat()
+        await until(lambda: instance.vehicle.granted)
+        report_flight(instance)
+        instance.vehicle.flying_mode = mavlink.COPTER_MODE_AUTO
+        instance.missions.mission.store.items = [WAYPOINT, WAYPOINT, WAYPOINT]
+        program.command(224, 2)
+        instance.missions.mission.store.items = [WAYPOINT, WAYPOINT]
+        await until(lambda: (224, mavlink.MAV_RESULT_DENIED) in program.results())
+        assert "CheckRoute" not in service.calls
+
+    run(monkeypatch, scenario)

@@ -74,6 +74,18 @@ async def test_endless_loop_without_a_motion_does_not_block_other_tasks() -> Non
     assert 1 <= len(reports.reached) <= 6
 
 
+async def test_mission_is_complete_if_its_list_has_become_shorter_before_its_first_item() -> None:
+    mission = Mission()
+    mission.store.items = [HOME, WAYPOINT]
+    reports = Reports()
+
+    async def perform(request: Request) -> None:
+        raise AssertionError(request)
+
+    await fly_mission(mission, 2, Place(39.36, 22.95, 5.0), perform, reports)
+    assert mission.complete
+
+
 async def test_mission_continues_in_a_shorter_list_by_its_number() -> None:
     mission = Mission()
     mission.store.items = [HOME, WAYPOINT, WAYPOINT, WAYPOINT]

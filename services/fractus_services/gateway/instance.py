@@ -530,6 +530,7 @@ class Instance:
         flies = call.request.method == FLY_MISSION
         motions = self._motions
         mission = self.missions.mission if flies else self.missions.with_items(call.request.message)
+        items = mission.items
         try:
             first = mission.next_after(0) if not flies else self._first_item(call.request.message)
             at = self._place()
@@ -549,6 +550,10 @@ class Instance:
         if flies and (replaced or not self.vehicle.granted):
             session.finish(call, mavlink.MAV_RESULT_TEMPORARILY_REJECTED, REPLACED, self._loop.time())
             return
+        if mission.items is not items:
+            reason = "the mission changed while it was judged; start it again"
+            session.finish(call, mavlink.MAV_RESULT_TEMPORARILY_REJECTED, reason, self._loop.time())
+            return
         session.finish(call, mavlink.MAV_RESULT_ACCEPTED, corrections, self._loop.time())
         if flies and first is not None:
             self._stop_flight()
@@ -556,12 +561,18 @@ class Instance:
             self._flight = self._spawn(self._fly_mission(client, first))
 
     def _first_item(self, number: int | None) -> int | None:
-        """Return the item from which the stored mission is flown. A completed mission starts again."""
+        """Return the item from which the stored mission is flown. A completed mission starts again.
+
+        Raises:
+            Untranslatable: The mission has become shorter since the request.
+        """
         mission = self.missions.mission
         if mission.complete:
             mission.rewind()
         if number is None:
             return mission.current if mission.current > 0 else mission.next_after(0)
+        if number >= len(mission.items):
+            raise Untranslatable(f"the mission has no item {number} to fly")
         return number
 
     def _place(self) -> Place:

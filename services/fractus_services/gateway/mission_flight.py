@@ -39,7 +39,8 @@ async def fly_mission(
 ) -> None:
     """Fly a mission, beginning with a given item, until it is complete.
 
-    An upload during the flight replaces the items. The mission then continues with the next number.
+    An upload during the flight replaces the items. The mission then continues with the next number, and is complete if there
+    is no item with this number.
 
     Args:
         mission: Mission, whose progress is updated.
@@ -53,7 +54,7 @@ async def fly_mission(
         reports.send_text(mavlink.MAV_SEVERITY_INFO, text)
 
     number: int | None = first
-    while number is not None:
+    while number is not None and number < len(mission.items):
         item = mission.items[number]
         if item.navigates:
             mission.current = number

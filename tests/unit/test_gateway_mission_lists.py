@@ -131,14 +131,16 @@ def test_stored_mission_is_read_with_home_as_item_0() -> None:
     assert item.real("x") == pytest.approx(39.361, abs=1e-5)
 
 
-def test_mission_is_cleared_unless_it_is_flown() -> None:
+@pytest.mark.parametrize(("name", "values"), [("MISSION_CLEAR_ALL", {}), ("MISSION_COUNT", {"count": 0})])
+def test_mission_is_cleared_unless_it_is_flown(name: str, values: dict[str, Any]) -> None:
     world = World()
     _stored(world, 16)
     world.vehicle.flying_mode = AUTO
-    world.send("MISSION_CLEAR_ALL", **TO)
+    world.send(name, **values, **TO)
     assert _acks(world) == [mavlink.MAV_MISSION_ERROR]
+    assert len(world.missions.mission.items) == 2
     world.vehicle.flying_mode = mavlink.COPTER_MODE_GUIDED
-    world.send("MISSION_CLEAR_ALL", **TO)
+    world.send(name, **values, **TO)
     assert _acks(world) == [mavlink.MAV_MISSION_ACCEPTED]
     assert world.missions.mission.items == []
 

@@ -111,27 +111,31 @@ class MissionLists:
         return mission
 
     def _replace(self, store: ItemStore, items: list[Item]) -> int | None:
-        if store.kind == _MISSION and items:
+        if not items:
+            return self._clear(store)
+        if store.kind == _MISSION:
             self._judged = items
             self._uploaded = True
             return None
+        return self._store(store, items)
+
+    def _clear(self, store: ItemStore) -> int:
+        if store.kind == _MISSION:
+            if self.mission.state(self._vehicle.mode) == mavlink.MISSION_STATE_ACTIVE:
+                self.problem = "the mission is being flown; change the mode to GUIDED first"
+                return mavlink.MAV_MISSION_ERROR
+            self.mission.rewind()
+        return self._store(store, [])
+
+    def _store(self, store: ItemStore, items: list[Item]) -> int:
         if store.kind == _FENCE:
             try:
                 self._build_fence(items)
             except FenceShapeError as error:
                 self.problem = f"fence: {str(error).strip()}"
                 return mavlink.MAV_MISSION_ERROR
-        if store.kind == _MISSION:
-            self.mission.rewind()
         store.items = items
         self._save()
-        return mavlink.MAV_MISSION_ACCEPTED
-
-    def _clear(self, store: ItemStore) -> int:
-        if store.kind == _MISSION and self.mission.state(self._vehicle.mode) == mavlink.MISSION_STATE_ACTIVE:
-            self.problem = "the mission is being flown; change the mode to GUIDED first"
-            return mavlink.MAV_MISSION_ERROR
-        self._replace(store, [])
         return mavlink.MAV_MISSION_ACCEPTED
 
     def _judge_item(self, item: Item, kind: int, number: int) -> int:

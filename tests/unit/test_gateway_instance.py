@@ -37,7 +37,9 @@ class Service:
         self.events: asyncio.Queue[Any] = asyncio.Queue()
         self.verdict = asyncio.Event()
         self.verdict.set()
-        """Cleared while targets wait for their verdict."""
+        """Cleared while targets, speeds and missions wait for their verdict."""
+        self.deferred: set[str] = set()
+        """Methods whose calls have to be repeated later."""
 
     @property
     def controlled(self) -> bool:
@@ -59,7 +61,9 @@ class Service:
                 self.streams -= 1
         if method == "SubscribeVehicle":
             await asyncio.Event().wait()
-        if method == "Goto":
+        if method in self.deferred:
+            raise CallRefused(code_pb2.UNAVAILABLE, "wait until contact returns")
+        if method in {"Goto", "SetSpeed"}:
             await self.verdict.wait()
         yield reply()
 
@@ -150,6 +154,21 @@ def report_flight(instance: Instance, lat: int = 10_000_000) -> None:
     position = drone.encode("GLOBAL_POSITION_INT", {"lat": lat, "lon": 10_000_000})
     for message in Parser().feed(heartbeat + position):
         instance.vehicle.take(message, asyncio.get_running_loop().time())
+
+
+async def breach_fence(instance: Instance, program: Program) -> None:
+    """Let the drone leave a fence of about 1 km."""
+    corners = [(9_950_000, 9_950_000), (10_050_000, 9_950_000), (10_050_000, 10_050_000), (9_950_000, 10_050_000)]
+    program.send("MISSION_COUNT", count=len(corners), mission_type=1)
+    for number, (x, y) in enumerate(corners):
+        item = {"seq": number, "frame": 0, "command": 5001, "param1": 4.0, "x": x, "y": y, "mission_type": 1}
+        program.send("MISSION_ITEM_INT", **item)
+    program.command(mavlink.MAV_CMD_DO_FENCE_ENABLE, 1)
+    report_flight(instance)
+    await until(lambda: (mavlink.MAV_CMD_DO_FENCE_ENABLE, ACCEPTED) in program.results())
+    await asyncio.sleep(0.05)
+    report_flight(instance, 10_100_000)
+    await until(lambda: instance.vehicle.flying_mode == mavlink.COPTER_MODE_RTL)
 
 
 async def until(condition: Callable[[], object]) -> None:
@@ -484,5 +503,44 @@ def test_start_from_an_item_that_was_removed_before_its_judgement_is_refused(mon
         instance.missions.mission.store.items = [WAYPOINT, WAYPOINT]
         await until(lambda: (224, mavlink.MAV_RESULT_DENIED) in program.results())
         assert "CheckRoute" not in service.calls
+
+    run(monkeypatch, scenario)
+
+
+@pytest.mark.parametrize("number", [21, 17, 300])
+def test_return_after_a_fence_breach_is_not_repeated_after_a_later_command(
+    number: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def scenario(instance: Instance, service: Service) -> None:
+        program = Program(instance)
+        program.beat()
+        await until(lambda: instance.vehicle.granted)
+        instance.missions.mission.store.items = [WAYPOINT, WAYPOINT]
+        service.deferred.add("ReturnToLaunch")
+        await breach_fence(instance, program)
+        await until(lambda: service.calls.count("ReturnToLaunch") > 1)
+        program.command(number)
+        await until(lambda: (number, ACCEPTED) in program.results())
+        await asyncio.sleep(0.02)
+        service.calls.clear()
+        await asyncio.sleep(0.1)
+        assert "ReturnToLaunch" not in service.calls
+
+    run(monkeypatch, scenario)
+
+
+def test_return_after_a_fence_breach_ends_with_control(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def scenario(instance: Instance, service: Service) -> None:
+        program = Program(instance)
+        program.beat()
+        await until(lambda: instance.vehicle.granted)
+        service.deferred.add("ReturnToLaunch")
+        await breach_fence(instance, program)
+        await until(lambda: service.calls.count("ReturnToLaunch") > 1)
+        service.events.put_nowait(ControlEvent(state=ControlEvent.STATE_LOST))
+        await until(lambda: not instance.vehicle.granted)
+        service.calls.clear()
+        await asyncio.sleep(0.1)
+        assert "ReturnToLaunch" not in service.calls
 
     run(monkeypatch, scenario)

@@ -165,7 +165,7 @@ class Instance:
         self._steering: set[Session] = set()
         self._granted = asyncio.Event()
         self._calls: set[asyncio.Task[None]] = set()
-        self._flight: asyncio.Task[None] | None = None  # of the mission
+        self._flight: asyncio.Task[None] | None = None  # of the mission, or home after a fence breach
         self._motions = 0  # number of requests that end the motion before them
         self._in_fence = True
         kinds = ("motion", "gimbal", "speed", CHECK_MISSION, FLY_MISSION)
@@ -665,10 +665,10 @@ class Instance:
 
     @property
     def _flies_mission(self) -> bool:
-        return self._flight is not None and not self._flight.done()
+        return self.vehicle.in_mission and self._flight is not None and not self._flight.done()
 
     def _stop_flight(self) -> None:
-        """End the flight of the mission, and starts that wait for a verdict. The current item does not change."""
+        """End the flight of the mission or home, and starts that wait for a verdict. The current item does not change."""
         self._motions += 1
         self._drop_pending(self._setpoints[FLY_MISSION], REPLACED)
         if self._flight is not None:
@@ -696,7 +696,7 @@ class Instance:
             self._stop_flight()
             self._setpoints["motion"].pending = None
             self.vehicle.flying_mode = mavlink.COPTER_MODE_RTL  # refuses the targets that follow
-            self._spawn(self._return_home(self._client))
+            self._flight = self._spawn(self._return_home(self._client))
 
     async def _return_home(self, client: MobilityClient) -> None:
         try:

@@ -15,7 +15,8 @@ from fractus_services.gateway import instance as instance_module
 from fractus_services.gateway import session as session_module
 from fractus_services.gateway.instance import Instance
 from fractus_services.gateway.mobility_client import CallRefused, MobilityClient
-from fractus_services.gateway.session import Session
+from fractus_services.gateway.session import Call, Session
+from fractus_services.gateway.translate import set_speed
 from fractus_services.mavlink_server.mission_items import Item
 from google.rpc import code_pb2
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -542,5 +543,24 @@ def test_return_after_a_fence_breach_ends_with_control(monkeypatch: pytest.Monke
         service.calls.clear()
         await asyncio.sleep(0.1)
         assert "ReturnToLaunch" not in service.calls
+
+    run(monkeypatch, scenario)
+
+
+@pytest.mark.parametrize(
+    ("number", "result"), [(17, ACCEPTED), (20, ACCEPTED), (21, ACCEPTED), (400, ACCEPTED), (22, TEMPORARILY_REJECTED)]
+)
+def test_drone_is_stopped_and_landed_while_many_calls_have_no_verdict(
+    number: int, result: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def scenario(instance: Instance, service: Service) -> None:
+        program = Program(instance)
+        program.beat()
+        await until(lambda: instance.vehicle.granted)
+        service.verdict.clear()
+        for sender in range(instance_module.MAX_CALLS):
+            instance.start(program.session, Call(set_speed(3.0), "DO_CHANGE_SPEED", (sender, 1), 178))
+        program.command(number)
+        await until(lambda: (number, result) in program.results())
 
     run(monkeypatch, scenario)

@@ -56,7 +56,8 @@ RESPONSE_TIMEOUT_S = 5.0
 
 SUPERVISE_S = 0.25
 MAX_CALLS = 16
-"""Maximum number of concurrent calls of an instance."""
+MAX_CALLS_WITH_URGENT = 32
+"""Maximum numbers of concurrent calls of an instance: for most methods, and for the methods in `_URGENT`."""
 
 REPLACED = "a later command replaced this command"
 
@@ -91,6 +92,9 @@ _TIMEOUTS_S = {"Arm": ARM_TIMEOUT_S, **dict.fromkeys(_MOTIONS, 0.0)}
 _MISSION_METHODS = frozenset({FLY_MISSION, CHECK_MISSION})
 _STEERING = _MOTIONS | {"Hover", "SetVelocity"}
 """Methods that move or stop the drone. A call of one of them ends the previous motion."""
+
+_URGENT = frozenset({"Hover", "Land", "ReturnToLaunch", "Disarm"})
+"""Methods that are called although other calls of the instance have no verdict yet."""
 
 _RESULTS = {
     code_pb2.PERMISSION_DENIED: mavlink.MAV_RESULT_DENIED,
@@ -365,7 +369,8 @@ class Instance:
                 return
             if setpoint.flying is not None and setpoint.flying == call.request.message:
                 return
-        if self._client is None or len(self._calls) >= MAX_CALLS:
+        limit = MAX_CALLS_WITH_URGENT if call.request.method in _URGENT else MAX_CALLS
+        if self._client is None or len(self._calls) >= limit:
             reason = "the mobility service is not available" if self._client is None else "too many calls in progress"
             session.finish(call, mavlink.MAV_RESULT_TEMPORARILY_REJECTED, reason, self._loop.time())
             return

@@ -29,9 +29,10 @@ import yaml
 from fractus_cli.manifests import Manifests
 from fractus_core.api import Application
 from fractus_core.api.geometry import Point
+from fractus_core.api.grants import GrantSpec
 from fractus_core.api.methods import Interface
 from fractus_core.api.model import InvalidObject
-from fractus_core.geo import geodesic_m
+from fractus_core.geo import LocalFrame, area_polygon, geodesic_m
 from fractus_sim.errors import ExperimentError
 from fractus_sim.experiment import parse
 from fractus_sim.experiment.definition import NamedZone, Program
@@ -42,6 +43,8 @@ from fractus_sim.runner import ExperimentRun, Outcome
 from fractus_sim.runner.telemetry_recording import Flight
 from fractus_sim.testbeds.node_networks import NetworksUnavailable, require_networks
 from fractus_sim.testbeds.standalone_testbed import planned_grants, read_all_manifests
+from shapely import Polygon, union_all
+from shapely.geometry.base import BaseGeometry
 
 from fractus_testing.applications import App, app_of
 from fractus_testing.flight_plan import (
@@ -80,6 +83,9 @@ STEP_S = 0.25
 PROGRAM_END_S = 5.0
 """Real time for which a program may continue to run after the landing of its drone, seconds."""
 
+AREA_TOLERANCE_M = 0.5
+"""Distance by which rounding may move the border of an area that two plans share."""
+
 RECORDING_S = 0.5
 """Time for which a landed vehicle is recorded, seconds of the vehicle."""
 
@@ -94,6 +100,7 @@ class VirtualDrone:
     Attributes:
         name: Name in the test.
         node: Name of the node: the name in lower case.
+        plan_begin: Number of positions before the current flight plan applied.
     """
 
     def __init__(self, scene: Scene, name: str, setup: Resources, connection: str | None) -> None:
@@ -103,6 +110,7 @@ class VirtualDrone:
         self.connection = connection
         self.home: tuple[float, float, float] | None = None
         self.plan: FlightPlan | None = None
+        self.plan_begin = 0
         self.manifests: tuple[Path, ...] = ()
         self.apps: list[App] = []
         self.task: list[dict[str, Any]] = []
@@ -248,6 +256,11 @@ class VirtualDrone:
         return self._scene.flight(self).samples
 
     @property
+    def plan_samples(self) -> Sequence[Sample]:
+        """Positions since the current flight plan applies, in order."""
+        return self.samples[self.plan_begin :]
+
+    @property
     def waypoints(self) -> Sequence[Waypoint]:
         """Waypoints of the flight plan, or of the driver in the manifests."""
         if self.plan is not None:
@@ -354,22 +367,28 @@ class VirtualController:
 
         Raises:
             AssertionError: The moment did not come.
-            ExperimentError: A restriction is invalid.
+            ExperimentError: A restriction is invalid. The old ones then stay.
         """
         __tracebackhide__ = True
         if at is not None:
             self._scene.wait(at, TRIGGER_TIMEOUT_S)
+        before = self._restrictions
         self._restrictions = restrictions
+        try:
+            self._issue(self._scene.nodes)
+        except Exception:
+            self._restrictions = before
+            raise
         names = ", ".join(restriction.name for restriction in restrictions) or "none"
         self._scene.run.report("", f"restrictions of the controller: {names}")
-        self._issue(self._scene.nodes)
 
     def set_plan(self, drone: VirtualDrone, plan: FlightPlan, at: Trigger | None = None) -> None:
         """Replace the flight plan of a drone in flight: permitted area, waypoints and restrictions.
 
         The new Grant takes effect within one second. The vehicle's own fence stays around the area of the first plan
         until the drone lands, so the area can only become smaller. The program is not informed: `control.remaining()`
-        of the SDK contains the waypoints of the first plan.
+        of the SDK contains the waypoints of the first plan. `until(drone, reached=...)` counts the waypoints of the new
+        plan from the replacement on.
 
         Args:
             drone: Drone with a flight plan.
@@ -378,14 +397,14 @@ class VirtualController:
 
         Raises:
             AssertionError: The moment did not come.
-            ExperimentError: The drone has no flight plan, or the new one cannot be planned. The old one then stays.
+            ExperimentError: The drone has no flight plan, or the new one cannot be planned or permits an area outside of the
+                first plan. The old plan then stays.
         """
         __tracebackhide__ = True
         if at is not None:
             self._scene.wait(at, TRIGGER_TIMEOUT_S)
-        self._scene.replan(drone, plan)
+        self._scene.replan(drone, plan, self._restrictions, lambda: self._issue([drone.node]))
         self._scene.run.report(drone.node, "flight plan replaced by the controller")
-        self._issue([drone.node])
 
     def emergency_landing(self, drone: VirtualDrone, at: Trigger | None = None) -> None:
         """Land a drone at once where it is. The system takes the drone from its program.
@@ -491,6 +510,7 @@ class Scene:
         self._wind: dict[str, float] = {}
         self._issued: list[Restriction] = []
         self._manifest_paths: list[str] = []
+        self._first_paths: list[str] = []
         self._changes = itertools.count(1)
         _require_replaceable(self.folder)
         shutil.rmtree(self.folder, ignore_errors=True)
@@ -738,25 +758,39 @@ class Scene:
                 text += f"; program ended with exit code {code}: {processes.log_tail(program.name)}"
         return text
 
-    def replan(self, drone: VirtualDrone, plan: FlightPlan) -> None:
-        """Replace the flight plan of a drone. The Grants stay until `reissue`.
+    def replan(
+        self, drone: VirtualDrone, plan: FlightPlan, restrictions: Sequence[Restriction], issue: Callable[[], None]
+    ) -> None:
+        """Replace the flight plan of a drone.
+
+        Args:
+            drone: Drone with a flight plan.
+            plan: New flight plan.
+            restrictions: Additional restrictions that apply to the drone.
+            issue: Issues the Grants of the new plan, or notes that the drone gets them later.
 
         Raises:
-            ExperimentError: The drone has no flight plan, or the new one cannot be planned. The old one then stays.
+            ExperimentError: The drone has no flight plan, or the new one cannot be planned or permits an area outside of the
+                first plan. The old plan then stays.
         """
         before = drone.plan
         if before is None:
             raise ExperimentError(
                 f"{drone.name} has no flight plan that could be replaced; call its set_plan() before start_app()"
             )
+        paths = self._manifest_paths
         drone.plan = plan
-        paths = self._manifests(f"plan-{next(self._changes)}.yaml")
         try:
-            list(planned_grants(read_all_manifests([self.folder / path for path in paths])))
-        except ExperimentError:
+            self._manifest_paths = self._manifests(f"plan-{next(self._changes)}.yaml")
+            self._require_within_first_plan(drone)
+            # A drone without contact gets its Grants later, so they are compiled here to report errors now.
+            self._compile_grants(restrictions)
+            issue()
+        except Exception:
             drone.plan = before
+            self._manifest_paths = paths
             raise
-        self._manifest_paths = paths
+        drone.plan_begin = len(drone.samples)
 
     def reissue(self, restrictions: Sequence[Restriction], nodes: Iterable[str]) -> None:
         """Replace the Grants of drones by Grants with additional restrictions. The plans stay.
@@ -767,14 +801,38 @@ class Scene:
         chosen = set(nodes)
         if not chosen:
             return
+        grants = [spec for spec in self._compile_grants(restrictions) if spec.node in chosen]
+        self._issued += restrictions
+        self.run.testbed.reissue(grants)
+
+    def _compile_grants(self, restrictions: Sequence[Restriction]) -> list[GrantSpec]:
+        """Return the Grants of all drones for their current plans, with additional restrictions."""
         paths = [self.folder / path for path in self._manifest_paths]
         planned = read_all_manifests(paths)
-        self._issued += restrictions
         manifests = [manifest for restriction in restrictions for manifest in restriction.manifests()]
         if manifests:
             paths.append(self._write(f"restrictions-{next(self._changes)}.yaml", manifests))
-        grants = [spec for spec in planned_grants(planned, read_all_manifests(paths)) if spec.node in chosen]
-        self.run.testbed.reissue(grants)
+        return list(planned_grants(planned, read_all_manifests(paths)))
+
+    def _require_within_first_plan(self, drone: VirtualDrone) -> None:
+        """Check that the current plan of a drone permits no area outside of its first plan."""
+        outside = self._permitted_area(drone, self._manifest_paths).difference(
+            self._permitted_area(drone, self._first_paths).buffer(AREA_TOLERANCE_M)
+        )
+        if not outside.is_empty:
+            raise ExperimentError(
+                f"{drone.name}: the new flight plan permits {outside.area:.0f} m2 outside of the first plan, but the vehicle's"
+                " own fence stays around the first plan; choose a plan within its area"
+            )
+
+    def _permitted_area(self, drone: VirtualDrone, paths: Sequence[str]) -> BaseGeometry:
+        """Return the area in which a plan permits flights, in metres east and north of the start position."""
+        if drone.home is None:
+            return Polygon()
+        frame = LocalFrame(drone.home[0], drone.home[1])
+        specs = planned_grants(read_all_manifests([self.folder / path for path in paths]))
+        areas = [area for spec in specs if spec.node == drone.node for area in (*spec.operation_area, *spec.corridor)]
+        return union_all([area_polygon(frame, area) for area in areas])
 
     def controller_reaches(self, controller: VirtualController, node: str) -> bool:
         """Return True if a drone is in range of the controller in a common network, or if the controller has no network."""
@@ -816,6 +874,7 @@ class Scene:
         content["world"] = worlds.pop().to_dict() if worlds else {}
         if not alone:
             self._manifest_paths = self._manifests("manifests.yaml")
+            self._first_paths = self._manifest_paths
             content["manifests"] = self._manifest_paths
             content["programs"] = [program for drone in self._drones for program in self._program_entries(drone)]
             content["programs"] += [

@@ -27,6 +27,10 @@ class Observed(Protocol):
         """Positions so far, in order."""
 
     @property
+    def plan_samples(self) -> Sequence[Sample]:
+        """Positions since the current flight plan applies, in order."""
+
+    @property
     def waypoints(self) -> Sequence[tuple[float, float, float]]:
         """Waypoints of the flight plan: latitude, longitude, altitude above home."""
 
@@ -55,7 +59,8 @@ def until(
 
     Args:
         drone: Drone.
-        reached: Number of waypoints of the flight plan that the drone has reached in order, from 1.
+        reached: Number of waypoints of the current flight plan that the drone has reached in order since the plan applies,
+            from 1.
         altitude: Altitude that the drone has reached, metres above home.
         time: Seconds since all vehicles were ready.
 
@@ -72,7 +77,7 @@ def until(
             )
         return Trigger(
             f"{drone.name} reaches waypoint {number}",
-            lambda: waypoints_reached(drone.samples, drone.waypoints) >= number,
+            lambda: waypoints_reached(drone.plan_samples, drone.waypoints) >= number,
         )
     if altitude is not None:
         metres = altitude

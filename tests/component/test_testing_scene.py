@@ -10,7 +10,9 @@ from unittest.mock import Mock
 import fractus_testing.scene
 import pytest
 from fractus_core.api import Grant
+from fractus_core.api.grants import GrantSpec
 from fractus_sim.experiment import load
+from fractus_sim.report.track import Place, Sample
 from fractus_sim.testbeds.node_networks import NetworksUnavailable
 from fractus_sim.testbeds.standalone_testbed import grant_manifest, planned_grants, read_all_manifests
 from fractus_testing import (
@@ -242,3 +244,93 @@ def test_data_sent_without_a_network_is_refused_with_a_remedy(scene: Scene) -> N
     drone.start_app()
     with pytest.raises(ExperimentError, match=r"was not measured; add the drone to a NetSim before start_app\(\)"):
         scene.results().get_data_sent("vDrone-1")
+
+
+class PlannedFlight:
+    """A drone with a flight plan at its start position, and a run that only records the issued Grants."""
+
+    def __init__(self, scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.run = Mock(now_s=0.0, flights={"vdrone-1": Mock(samples=[])})
+        monkeypatch.setattr(fractus_testing.scene, "ExperimentRun", lambda *_arguments, **_options: self.run)
+        self.controller = scene.vController()
+        self.drone = scene.vDrone("vDrone-1")
+        self.drone.set_pos(HOME)
+        self.drone.set_plan(FlightPlan(path=PATH))
+        self.drone.set_app("pilot.py")
+        scene.start()
+
+    def fly_to(self, waypoint: tuple[float, float, float]) -> None:
+        self.run.flights["vdrone-1"].samples.append(Sample(0.0, Place(*waypoint), 1.0, "GUIDED", True, 1.0))
+
+    def issued(self) -> GrantSpec:
+        """Return the Grant of the current plan of the drone, as the controller issues it."""
+        self.controller.update_restrictions()
+        ((grant,),) = self.run.testbed.reissue.call_args.args
+        return grant
+
+
+@pytest.fixture
+def planned(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> PlannedFlight:
+    return PlannedFlight(scene, monkeypatch)
+
+
+HOSPITALS = tuple(no_fly("hospital", circle(50.8650, 4.6785, radius)) for radius in (20, 30))
+
+
+def test_smaller_flight_plan_replaces_the_first(planned: PlannedFlight) -> None:
+    before = planned.issued()
+    planned.controller.set_plan(planned.drone, FlightPlan(path=PATH[:1]))
+    assert planned.issued().control_points != before.control_points
+    planned.controller.set_plan(planned.drone, FlightPlan(path=PATH))
+    assert planned.issued() == before, "the area of the first plan is permitted again"
+
+
+@pytest.mark.parametrize(
+    ("plan", "message"),
+    [
+        (FlightPlan(path=PATH[:1], restrictions=HOSPITALS), "two restrictions are named hospital"),
+        (FlightPlan(path=[(51.9, 4.6785, 10.0)]), "cannot be planned"),
+        (FlightPlan(path=[(50.8642, 4.6785, 10.0)]), "m2 outside of the first plan"),
+        (FlightPlan(region=circle(50.8640, 4.6785, 60)), "m2 outside of the first plan"),
+    ],
+)
+def test_refused_flight_plan_leaves_the_old_one(planned: PlannedFlight, plan: FlightPlan, message: str) -> None:
+    before = planned.issued()
+    with pytest.raises(ExperimentError, match=message):
+        planned.controller.set_plan(planned.drone, plan)
+    assert planned.drone.waypoints == PATH
+    assert planned.issued() == before
+
+
+def test_flight_plan_whose_grants_cannot_be_issued_leaves_the_old_one(planned: PlannedFlight) -> None:
+    before = planned.issued()
+    planned.run.testbed.reissue.side_effect = ExperimentError("the disk is full")
+    with pytest.raises(ExperimentError, match="the disk is full"):
+        planned.controller.set_plan(planned.drone, FlightPlan(path=PATH[:1]))
+    planned.run.testbed.reissue.side_effect = None
+    assert planned.drone.waypoints == PATH
+    assert planned.issued() == before
+
+
+def test_flight_plan_that_contradicts_a_restriction_is_refused_without_contact(planned: PlannedFlight) -> None:
+    planned.controller.update_restrictions(HOSPITALS[0])
+    planned.controller.lose_contact(planned.drone, 10.0)
+    with pytest.raises(ExperimentError, match="hospital"):
+        planned.controller.set_plan(planned.drone, FlightPlan(path=PATH[:1], restrictions=HOSPITALS[1:]))
+    assert planned.drone.waypoints == PATH
+
+
+def test_refused_restrictions_leave_the_old_ones(planned: PlannedFlight) -> None:
+    with pytest.raises(ExperimentError, match="two restrictions are named hospital"):
+        planned.controller.update_restrictions(*HOSPITALS)
+    planned.controller.set_plan(planned.drone, FlightPlan(path=PATH[:1]))
+
+
+def test_waypoints_of_a_new_flight_plan_are_counted_from_its_replacement(planned: PlannedFlight) -> None:
+    planned.fly_to(PATH[0])
+    assert until(planned.drone, reached=1).fired()
+    planned.controller.set_plan(planned.drone, FlightPlan(path=PATH[:1]))
+    reached = until(planned.drone, reached=1)
+    assert not reached.fired()
+    planned.fly_to(PATH[0])
+    assert reached.fired()

@@ -236,6 +236,7 @@ class Observed:
     name = "vDrone-1"
     waypoints = WAYPOINTS
     samples = (sample(50.0),)
+    plan_samples = samples
     now_s = 12.0
 
 

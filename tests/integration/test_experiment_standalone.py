@@ -75,6 +75,14 @@ def test_program_flies_until_its_companion_computer_loses_power(tmp_path: Path) 
     assert takeoff is not None, "the tlog lacks the takeoff command of the service"
 
 
+def test_gateway_socket_is_in_the_directory_of_its_drone_also_with_a_long_path(tmp_path: Path) -> None:
+    folder = tmp_path / ("long" * 30)
+    with Standalone(folder) as drones:
+        drones.add_drone(DroneSetup("drone-1", HOME, gateway=True))
+        drones.processes.wait("drone-1-gateway", (folder / "drone-1" / "gateway.sock").is_socket, 10)
+        drones.check()
+
+
 def test_standalone_rejects_invalid_use_immediately(tmp_path: Path) -> None:
     with Standalone(tmp_path) as drones:
         with pytest.raises(ExperimentError, match="no drone drone-1; known: none"):

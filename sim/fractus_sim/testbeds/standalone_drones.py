@@ -20,13 +20,11 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 import sys
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
-from tempfile import mkdtemp
 from typing import Any, Self
 
 import yaml
@@ -276,6 +274,9 @@ MOBILITY_STOP_TIMEOUT_S = 40.0
 """Time for which a stopped mobility service may restore the fence and the parameters of the vehicle's owner, as in the chart."""
 
 LOOPBACK = "127.0.0.1"
+GATEWAY_SOCKET = "gateway.sock"
+"""Unix socket between mobility service and gateway, relative to their working directory because its path must be short."""
+
 _CAMERA_METHODS = ("CaptureImage", "RetrieveImage", "ListImages", "DeleteImage")
 _MOBILITY_METHODS = (
     "Arm", "Disarm", "Takeoff", "Land", "Goto", "Hover", "SetSpeed", "GetSpeed", "SetVelocity", "GetPosition",
@@ -354,7 +355,7 @@ class RunningDrone:
         self.folder = folder / setup.name
         self.grants = self.folder / "grants"
         self.audit = self.folder / "mobility.jsonl"
-        self._state = setup.state or self.folder / "state"
+        self._state = (setup.state or self.folder / "state").absolute()
         self.tlog = folder / "logs" / f"{setup.name}.tlog"
         self._processes = processes
         self._tls = tls
@@ -364,8 +365,6 @@ class RunningDrone:
         self._tap_port = free_port()
         self._mobility_port = free_port()
         self._camera_port = free_port() if setup.camera is not None else None
-        self._gateway_folder = Path(mkdtemp(prefix="fractus-")) if setup.gateway else None
-        """Directory of the Unix socket to the gateway. Its path must be short."""
         self.gateway_address = f"{setup.service_host}:{free_port()}" if setup.gateway else None
         self._world_port = free_port() if setup.camera is not None and setup.camera.world is not None else None
         self.station_link = setup.autopilot or f"tcp:{LOOPBACK}:{station}"
@@ -415,12 +414,13 @@ class RunningDrone:
             self.process("mobility"),
             self._mobility_command(),
             base_environment(),
+            self.folder,
             stop_timeout_s=MOBILITY_STOP_TIMEOUT_S,
         )
         if self._camera_port is not None:
             self._processes.start(self.process("camera"), self._camera_command(), base_environment())
         if self.gateway_address is not None:
-            self._processes.start(self.process("gateway"), self._gateway_command(), base_environment())
+            self._processes.start(self.process("gateway"), self._gateway_command(), base_environment(), self.folder)
         if wait:
             self._wait_listening("mobility", self._mobility_port, self.setup.service_host)
         if wait and self._camera_port is not None:
@@ -449,8 +449,6 @@ class RunningDrone:
         """Close the link tap after the processes have ended."""
         if self._tap is not None:
             self._tap.close()
-        if self._gateway_folder is not None:
-            shutil.rmtree(self._gateway_folder, ignore_errors=True)
 
     def _wait_listening(self, role: str, port: int, host: str = LOOPBACK) -> None:
         self._processes.wait(self.process(role), lambda: listening(port, host), START_TIMEOUT_S)
@@ -508,7 +506,7 @@ class RunningDrone:
         ]  # fmt: skip
 
     def _mobility_command(self) -> list[str]:
-        gateway = ["--gateway-socket", str(self._gateway_socket)] if self._gateway_folder is not None else []
+        gateway = ["--gateway-socket", GATEWAY_SOCKET] if self.setup.gateway else []
         return [
             *_module("fractus_services.mobility"), "serve", "--grants", str(self.grants), "--tls", str(self._tls),
             "--state", str(self._state), "--audit", str(self.audit), "--node", self.name,
@@ -516,14 +514,10 @@ class RunningDrone:
             "--description", str(self.folder / "node.yaml"), *gateway, *self.setup.service_arguments,
         ]  # fmt: skip
 
-    @property
-    def _gateway_socket(self) -> Path:
-        return (self._gateway_folder or self.folder) / "gateway.sock"
-
     def _gateway_command(self) -> list[str]:
         return [
             *_module("fractus_cli"), "gateway", "serve", "--tls", str(self._tls),
-            "--mobility-socket", str(self._gateway_socket), "--listen", str(self.gateway_address),
+            "--mobility-socket", GATEWAY_SOCKET, "--listen", str(self.gateway_address),
             "--state", str(self.folder / "gateway"), "--audit", str(self.folder / "gateway.jsonl"),
         ]  # fmt: skip
 

@@ -44,7 +44,8 @@ def floods(calls: int = 500, *, interface: Interface = "grpc") -> App:
 def wrong_frames(*, interface: Interface = "grpc") -> App:
     """Request positions with exchanged latitude and longitude, altitudes of another datum, NaN and infinity.
 
-    Over MAVLink, also in frames of reference that no leg may use.
+    Over MAVLink, also in frames of reference that no leg may use. The drone first climbs to the highest permitted altitude,
+    119 m at most.
     """
     return _app("wrong-frames", interface)
 

@@ -926,8 +926,20 @@ def _defects(verdict: Verdict, now: Situation, place: Scene) -> Iterator[str]:
     if (args.speed_mps or now.speed_setpoint_mps) > commanded_mps(place.top_mps) + 1e-6:
         yield "too fast"
     low, high = place.heights
-    if args.alt is None or not low + OVERSHOOT_M - 1e-6 <= args.alt <= high - OVERSHOOT_M + 1e-6:
+    if args.alt is None or not (
+        low + OVERSHOOT_M - 1e-6 <= args.alt <= high - OVERSHOOT_M + 1e-6 or _is_only_height(args.alt, place)
+    ):
         yield "at the wrong height"
+
+
+def _is_only_height(height: float, place: Scene) -> bool:
+    """Return True for the middle between limits whose distance leaves no room for the overshoot on both sides."""
+    for zone_low, zone_high in place.limits[place.kinds == LIMIT]:
+        low = max(place.heights[0], zone_low)
+        high = min(place.heights[1], zone_high)
+        if low <= high < low + 2 * OVERSHOOT_M and abs(height - (low + high) / 2) < 1e-6:
+            return True
+    return False
 
 
 SLOWEST_STOP_S = 20.0

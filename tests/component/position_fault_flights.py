@@ -50,7 +50,7 @@ SWERVE_MPS = 20.0
 """Documented distance by which a drone may leave its course after a jump: without delay, and in addition per second of round trip."""
 
 SLOW_TURN_S = 0.5
-SLOW_TURN_MPS = 10.0
+SLOW_TURN_MPS = 25.0
 """Documented increase of this distance for a drone that needs longer than `SLOW_TURN_S` to undo its acceleration.
 
 For this time, the drone still accelerates in the direction of the jump, although it already brakes. ArduCopter needs

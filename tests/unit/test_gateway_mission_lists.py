@@ -145,6 +145,18 @@ def test_mission_is_cleared_unless_it_is_flown(name: str, values: dict[str, Any]
     assert world.missions.mission.items == []
 
 
+def test_empty_mission_replaces_an_upload_that_waits_for_its_verdict() -> None:
+    world = World()
+    _stored(world, 16)
+    (call,) = _upload(world, 16, 16)
+    world.sent()
+    world.send("MISSION_COUNT", count=0, **TO)
+    assert _acks(world) == [mavlink.MAV_MISSION_OPERATION_CANCELLED, mavlink.MAV_MISSION_ACCEPTED]
+    world.session.finish(call, ACCEPTED, "", world.now)
+    assert _acks(world) == []
+    assert world.missions.mission.items == []
+
+
 def test_lists_of_unknown_type_are_unsupported() -> None:
     world = World()
     world.send("MISSION_CLEAR_ALL", mission_type=255, **TO)

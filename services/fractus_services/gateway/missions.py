@@ -124,6 +124,9 @@ class MissionLists:
             if self.mission.state(self._vehicle.mode) == mavlink.MISSION_STATE_ACTIVE:
                 self.problem = "the mission is being flown; change the mode to GUIDED first"
                 return mavlink.MAV_MISSION_ERROR
+            self._judged = None  # otherwise the verdict on an earlier upload would fill the list again
+            self._uploaded = False
+            self.transfers.conclude(_MISSION, mavlink.MAV_MISSION_OPERATION_CANCELLED)
             self.mission.rewind()
         return self._store(store, [])
 

@@ -159,7 +159,8 @@ def _between(a: Ground, b: Ground) -> tuple[float, float]:
 
 def _ring(ground: Ground, lat: float, lon: float) -> Floats:
     """Return the corners of an area in metres around a point, shape (n, 2), with more corners on long edges."""
-    lats, lons = ground.lats, ground.lons
+    lats = ground.lats
+    lons = ground.lons
     if ground.radius_m is None:
         ends = np.roll(lons, -1), np.roll(lats, -1)
         azimuths, _, lengths = GEOD.inv(lons, lats, *ends)
@@ -173,7 +174,8 @@ def _ring(ground: Ground, lat: float, lon: float) -> Floats:
 
 def _to_ring(points: Floats, ring: Floats) -> float:
     """Return the smallest distance of points to the area in a ring, 0 if one is inside."""
-    start, end = ring, np.roll(ring, -1, axis=0)
+    start = ring
+    end = np.roll(ring, -1, axis=0)
     x, y = points[:, None, 0], points[:, None, 1]
     with np.errstate(divide="ignore", invalid="ignore"):
         crossing = start[:, 0] + (y - start[:, 1]) * (end[:, 0] - start[:, 0]) / (end[:, 1] - start[:, 1])
@@ -192,7 +194,8 @@ def _cross(a: Floats, b: Floats) -> bool:
     b0, b1 = b[None], np.roll(b, -1, axis=0)[None]
 
     def side(p: Floats, q: Floats, r: Floats) -> Floats:
-        u, v = q - p, r - p
+        u = q - p
+        v = r - p
         return np.sign(u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0])
 
     return bool(((side(a0, a1, b0) * side(a0, a1, b1) < 0) & (side(b0, b1, a0) * side(b0, b1, a1) < 0)).any())

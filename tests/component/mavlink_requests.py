@@ -284,7 +284,7 @@ def _mask(rng: np.random.Generator) -> tuple[int, str]:
 
 
 def _motion(rng: np.random.Generator, turned: bool, heading: float) -> tuple[dict[str, Value], Target | None]:
-    """Return the fields of velocity, acceleration and yaw, and the velocity north, east and down; None if it is no number."""
+    """Return the fields of velocity, acceleration and yaw, and the velocity north, east and down; None if one is not a number."""
     forward, right = (_single(float(v)) for v in rng.uniform(-9, 9, 2))
     down = _single(float(rng.uniform(-2.5, 2.0))) if rng.random() < 0.5 else 0.0
     if rng.random() < 0.08:
@@ -302,8 +302,9 @@ def _motion(rng: np.random.Generator, turned: bool, heading: float) -> tuple[dic
 
 
 def _has_yaw(mask: int, values: Mapping[str, Value]) -> bool:
-    """Return True unless the mask selects a yaw that is no number, or a yaw rate."""
-    yaw, rate = values["yaw"], values["yaw_rate"]
+    """Return True unless the mask selects a yaw that is not a number, or a yaw rate."""
+    yaw = values["yaw"]
+    rate = values["yaw_rate"]
     assert isinstance(yaw, float)
     return bool(mask & 1024 or math.isfinite(yaw)) and bool(mask & 2048 or rate == 0.0)
 

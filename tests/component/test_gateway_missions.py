@@ -183,10 +183,10 @@ def test_program_that_dies_during_its_mission_is_brought_home(tmp_path: Path) ->
         await program.until(lambda: program.place[1] > 20)
         await program.close()
         await sky_drone.until(lambda: not world.sky.truth.armed, 180.0)
-        x, y = world.drone.autopilot.vehicle.lat, world.drone.autopilot.vehicle.lon
-        assert world.drone.autopilot.vehicle.home is not None
-        assert abs(x - world.drone.autopilot.vehicle.home.lat) * 111_319 < 3.0
-        assert abs(y - world.drone.autopilot.vehicle.home.lon) * 80_000 < 3.0
+        vehicle = world.drone.autopilot.vehicle
+        assert vehicle.home is not None
+        assert abs(vehicle.lat - vehicle.home.lat) * 111_319 < 3.0
+        assert abs(vehicle.lon - vehicle.home.lon) * 80_000 < 3.0
 
     fly(flight, tmp_path)
 

@@ -264,7 +264,7 @@ def comes_level(
 def _leaves_height(zone: PolicyZone, leg: Leg, now: Situation, grant: CompiledGrant, height_margin_m: float) -> bool:
     """Return True if a vertical leg of a drone that is too close below or above a zone restores the height margin.
 
-    A leg to another place does not count. The autopilot controls the axes independently, so during that leg, a drone beside
+    The result is False for a leg to another place. The autopilot controls the axes independently, so during that leg, a drone beside
     a zone could come over or under the zone before it reaches the altitude of the target.
     """
     west, south, east, north = shapely.bounds(leg.ground)

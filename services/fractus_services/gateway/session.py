@@ -784,9 +784,9 @@ def _fields_of(message: Message) -> _CommandFields:
 
 def _coordinates_e7(message: Message) -> tuple[int, int]:
     """Return latitude and longitude of a MISSION_ITEM or MISSION_ITEM_INT in 1e-7 degrees."""
-    lat, lon = message.real("x"), message.real("y")
-    if message.name == "MISSION_ITEM":
-        lat, lon = lat * 1e7, lon * 1e7
+    scale = 1e7 if message.name == "MISSION_ITEM" else 1.0
+    lat = message.real("x") * scale
+    lon = message.real("y") * scale
     if not (math.isfinite(lat) and math.isfinite(lon)):
         raise Untranslatable("latitude or longitude is not a number")
     return round(lat), round(lon)

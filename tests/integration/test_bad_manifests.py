@@ -46,6 +46,8 @@ CLOUD = {"name": "Store", "placement": "cloud", "container": CONTAINER}
 MUTE = CLOUD | {"name": "Mute", "container": {"image": "app"}}
 RING = {"exterior": [HERE, {"lat": 50.1, "lon": 4.0}, {"lat": 50.1, "lon": 4.1}]}
 DISC = {"circle": {"center": HERE, "radius": 10}}
+PINNED = "registry.example/app@sha256:" + "0" * 64
+WINDOW = {"start": "2026-12-01T10:00:00Z", "duration": 15}
 
 
 def body(kind: str, spec: Body) -> Body:
@@ -80,7 +82,43 @@ def zone(**spec: Any) -> Body:
     return body("Zone", {"area": DISC} | spec)
 
 
+def template(application: Body | None = None, **more: Any) -> Body:
+    """Return a template of an application, whose images get digests."""
+    spec = (application or app(DRIVER))["spec"]
+    components = [c | {"container": c["container"] | {"image": PINNED}} for c in spec["components"]]
+    altitudes = {"lower": 20, "upper": 40}
+    return body(
+        "ApplicationTemplate",
+        {"navigation": "path", "altitudes": altitudes, "template": spec | {"components": components}} | more,
+    )
+
+
+def flight(**more: Any) -> Body:
+    """Return a flight plan. A value of None removes a field."""
+    spec = {"template": "survey", "waypoints": [HERE], "window": WINDOW} | more
+    return body("FlightPlan", {name: value for name, value in spec.items() if value is not None})
+
+
 BAD: list[tuple[str, Body, str]] = [
+    ("template with a tag", template(template={"components": [DRIVER]}), "every image needs a digest, because the approval is for its content"),
+    ("template without a flight", template(app(CLOUD)), "the template needs one component that leads the flight"),
+    ("template with two control points", template(app(DRIVER | {"control": "partial", "controlPoints": [PATH, PATH]})), "the template needs one component that leads the flight"),
+    ("template of a region with a path", template(navigation="region"), "navigation region needs a driver with a control point that has a region"),
+    ("template upside down", template(altitudes={"lower": 40, "upper": 40}), "lower must be below upper"),
+    ("template without altitudes", template(altitudes={}), "spec.altitudes.upper"),
+    ("template with a long name", template() | {"metadata": {"name": "n" * 64}}, "the name of an ApplicationTemplate must have at most 63"),
+    ("template with a dot in its name", template() | {"metadata": {"name": "a.b"}}, "the name of an ApplicationTemplate must have at most 63"),
+    ("flight to nowhere", flight(waypoints=None), "give either waypoints or region, and only one of them"),
+    ("flight to waypoints and a region", flight(region=DISC, stay=5), "give either waypoints or region, and only one of them"),
+    ("flight to a region without stay", flight(waypoints=None, region=DISC), "a region needs stay"),
+    ("flight that stays at waypoints", flight(stay=5), "a region needs stay"),
+    ("flight without a window", flight(window=None), "spec.window"),
+    ("flight of no duration", flight(window=WINDOW | {"duration": 0}), "spec.window.duration"),
+    ("flight of two days", flight(window=WINDOW | {"duration": 2881}), "spec.window.duration"),
+    ("flight before 1970", flight(window=WINDOW | {"start": "1970-01-01T00:00:00+01:00"}), "start must be an RFC 3339 time after 1970"),
+    ("flight at a local time", flight(window=WINDOW | {"start": "2026-12-01T10:00:00"}), "spec.window.start"),
+    ("flight of an unknown class", flight(priorityClass="urgent"), "spec.priorityClass"),
+    ("flight with two actions for one policy", flight(policyActions=[{"policy": "p", "action": "hover"}, {"policy": "p", "action": "land"}]), "policyActions has at most one entry for each policy"),
     ("two drivers", app(DRIVER, DRIVER | {"name": "Other"}), "an application has at most one driver"),
     ("no driver and no points of interest", app(PASSENGER), "an application with drone components needs a driver, or one passenger with pointsOfInterest"),
     ("driver and points of interest", app(DRIVER, GUIDED), "an application with a driver cannot have pointsOfInterest; remove them"),
@@ -309,6 +347,12 @@ GOOD = [
     driver(path=[HERE], point={"depot": "base"}),
     app(DRIVER | {"control": "partial", "controlPoints": [PATH, PATH]}),
     app(DRIVER | {"controlPoints": [{"navigation": "regionBased", "region": DISC, "duration": 5}]}),
+    template(),
+    template(app(GUIDED)),
+    template(app(DRIVER | {"controlPoints": [{"navigation": "regionBased", "region": DISC, "duration": 5}]}), navigation="region", parameters={"type": "object", "properties": {"speed": {"type": "number"}}}),
+    flight(),
+    flight(waypoints=None, region=DISC, stay=5, drone="d", priorityClass="emergency", parameters={"speed": 2}, use="InUse"),
+    flight(policyActions=[{"policy": "p", "action": "abort", "landAt": HERE}], contactLost={"action": "abort", "landAt": HERE}, autoActivate=True),
     volume(secret="key"),
     policy("AccessControl", "denial", methods=["Arm"], validFrom="2026-01-01T00:00:00Z", validUntil="2026-02-01T00:00:00Z"),
     policy("LimitControl", "altitude", lowerLimit=1, upperLimit=2, action="refuse"),

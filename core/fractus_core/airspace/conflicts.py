@@ -9,8 +9,9 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from fractus_core.airspace.lifecycle import RESERVING, PlanState
+from fractus_core.airspace.lifecycle import RESERVING
 from fractus_core.airspace.volumes import TOLERANCE_M, Overlap, Volume4D, outlines_in_frame
+from fractus_core.api.flight_plans import PlanState
 
 _INITIAL_SLOTS = 64
 

@@ -2,16 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Literal
-
+from fractus_core.api.flight_plans import PlanState
 from fractus_core.exhaustive import exhaustive
-
-PlanState = Literal["Draft", "Rejected", "Accepted", "Activated", "Nonconforming", "Contingent", "Ended"]
-"""State of a flight plan.
-
-Draft: not decided. Rejected: not permitted. Accepted: reserves its volumes. Activated: may fly. Nonconforming: outside its
-volumes, or late. Contingent: the system has taken the drone and ends the flight. Ended: over.
-"""
 
 NEXT_STATES: dict[PlanState, tuple[PlanState, ...]] = exhaustive(
     PlanState,

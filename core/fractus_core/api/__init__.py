@@ -3,6 +3,8 @@
 from fractus_core.api.applications import Application as Application
 from fractus_core.api.components import Component as Component
 from fractus_core.api.direct_links import DirectLink as DirectLink
+from fractus_core.api.flight_plans import ApplicationTemplate as ApplicationTemplate
+from fractus_core.api.flight_plans import FlightPlan as FlightPlan
 from fractus_core.api.grants import Grant as Grant
 from fractus_core.api.grants import NodeGrants as NodeGrants
 from fractus_core.api.model import API_VERSION as API_VERSION
@@ -29,6 +31,8 @@ KINDS: tuple[type[Resource], ...] = (
     Zone,
     Policy,
     Application,
+    ApplicationTemplate,
+    FlightPlan,
     DeploymentPlan,
     Grant,
     NodeGrants,

@@ -11,7 +11,7 @@ from pydantic import Field
 
 from fractus_core.api.components import Component, ContactLoss, Placement, PointsOfInterest, ReferenceField
 from fractus_core.api.model import AGE, READY, Conditions, Model, ObservedGeneration, OpenModel, Resource, keyed
-from fractus_core.api.policies import PolicyAction
+from fractus_core.api.policies import PolicyAction, one_action_for_each_policy
 from fractus_core.api.rules import Violation, rule
 
 
@@ -115,13 +115,7 @@ class ApplicationSpec(Model):
             seen[plain] = component.name
         return None
 
-    @rule(
-        "!has(self.policyActions) || self.policyActions.all(a, self.policyActions.exists_one(b, b.policy == a.policy))",
-        "policyActions has at most one entry for each policy",
-    )
-    def _distinct_policies(self) -> Violation:
-        names = [each.policy for each in self.policy_actions]
-        return next(((f"policyActions[{i}].policy", name) for i, name in enumerate(names) if name in names[:i]), None)
+    _distinct_policies = one_action_for_each_policy()
 
     @rule(
         "self.components.filter(c, has(c.class) && c.class == 'driver').size() <= 1",

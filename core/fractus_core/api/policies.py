@@ -441,6 +441,20 @@ class PolicyAction(Model):
         return "landAt" if self.land_at is not None and self.action != "abort" else None
 
 
+def one_action_for_each_policy() -> Any:
+    """Return the rule that `policyActions` selects at most one action for each policy."""
+
+    @rule(
+        "!has(self.policyActions) || self.policyActions.all(a, self.policyActions.exists_one(b, b.policy == a.policy))",
+        "policyActions has at most one entry for each policy",
+    )
+    def distinct_policies(self: Any) -> Violation:
+        names = [each.policy for each in self.policy_actions]
+        return next(((f"policyActions[{i}].policy", name) for i, name in enumerate(names) if name in names[:i]), None)
+
+    return distinct_policies
+
+
 class Policy(Resource, plural="policies", short="pol"):
     """A rule of an authority or a provider."""
 

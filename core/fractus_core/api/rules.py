@@ -52,10 +52,11 @@ def rule(cel: str, message: str) -> Callable[[Callable[[M], Violation]], Any]:
 
 def referenced_by(kind: str, referrers: str) -> Any:
     """Return the rule that the name of an object fits into the fields of the kinds that refer to the object."""
+    article = "an" if kind[0] in "AEIOU" else "a"
 
     @rule(
         f"self.metadata.name.size() <= 63 && self.metadata.name.matches('{DNS_LABEL}')",
-        f"the name of a {kind} must have at most 63 lowercase letters, digits and hyphens, because {referrers} refer to it",
+        f"the name of {article} {kind} must have at most 63 lowercase letters, digits and hyphens, because {referrers} refer to it",
     )
     def has_label_name(self: Any) -> Violation:
         name = self.metadata.name

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 
@@ -11,7 +12,7 @@ import shapely
 from numpy.typing import NDArray
 from shapely.geometry.base import BaseGeometry
 
-from fractus_core.api.geometry import Area
+from fractus_core.api.geometry import Area, Point
 from fractus_core.api.model import InvalidObject
 from fractus_core.geo import LocalFrame, area_center, area_polygon, areas_of_shape
 from fractus_core.local_frame import ecef
@@ -87,14 +88,6 @@ class Volume4D:
         Raises:
             InvalidObject: The shape is empty, not finite or too large, or the bounds are not numbers or not in order.
         """
-        if not lower_m <= upper_m:
-            raise InvalidObject(
-                "altitudes", f"the lower bound {lower_m:g} m must not be above the upper bound {upper_m:g} m"
-            )
-        if lower_m == math.inf or upper_m == -math.inf:
-            raise InvalidObject("altitudes", "an infinite bound leaves no airspace; omit it or give a number of metres")
-        if not 0 <= begin_s <= end_s <= _MAX_TIME_S:
-            raise InvalidObject("time", "give a start after 1970 and an end that is not before the start")
         corners = shapely.get_coordinates(shape)
         if not len(corners) or not np.isfinite(corners).all():
             raise InvalidObject("area", "the area is empty, or a coordinate is not a number; correct the coordinates")
@@ -104,8 +97,39 @@ class Volume4D:
                 f"a corner is more than {MAX_REACH_M / 1000:.0f} km from the middle; divide the flight into shorter flights",
             )
         outline = shapely.transform(shapely.segmentize(shape, _PIECE_M), lambda xy: _degrees(frame, xy))
-        own_frame, center, reach_m = _sphere(outline)
-        return cls(outline, lower_m, upper_m, begin_s, end_s, own_frame, center, reach_m)
+        return cls._of_outline(outline, (lower_m, upper_m), (begin_s, end_s))
+
+    @classmethod
+    def of_corners(
+        cls, areas: Sequence[Area], *, lower_m: float, upper_m: float, begin_s: float, end_s: float
+    ) -> Volume4D:
+        """Return the volume that `areas` of a volume describes. Edges are not divided again.
+
+        Raises:
+            InvalidObject: There is no area, an area is a circle, or the bounds are not numbers or not in order.
+        """
+        polygons = [area.polygon for area in areas if area.polygon is not None]
+        if not polygons or len(polygons) < len(areas):
+            raise InvalidObject("areas", "a volume is stored as polygons; give at least one, and no circle")
+        outline = shapely.MultiPolygon([(_lonlat(p.exterior), [_lonlat(hole) for hole in p.holes]) for p in polygons])
+        return cls._of_outline(outline, (lower_m, upper_m), (begin_s, end_s))
+
+    @classmethod
+    def _of_outline(
+        cls, outline: BaseGeometry, altitudes_m: tuple[float, float], times_s: tuple[float, float]
+    ) -> Volume4D:
+        lower_m, upper_m = altitudes_m
+        begin_s, end_s = times_s
+        if not lower_m <= upper_m:
+            raise InvalidObject(
+                "altitudes", f"the lower bound {lower_m:g} m must not be above the upper bound {upper_m:g} m"
+            )
+        if lower_m == math.inf or upper_m == -math.inf:
+            raise InvalidObject("altitudes", "an infinite bound leaves no airspace; omit it or give a number of metres")
+        if not 0 <= begin_s <= end_s <= _MAX_TIME_S:
+            raise InvalidObject("time", "give a start after 1970 and an end that is not before the start")
+        frame, center, reach_m = _sphere(outline)
+        return cls(outline, lower_m, upper_m, begin_s, end_s, frame, center, reach_m)
 
     @property
     def vertices(self) -> int:
@@ -189,6 +213,10 @@ def outlines_in_frame(frame: LocalFrame, outlines: NDArray[np.object_]) -> NDArr
         outlines, lambda lonlat: frame.xy_array(lonlat[:, 1], lonlat[:, 0])
     )
     return converted
+
+
+def _lonlat(ring: Sequence[Point]) -> list[tuple[float, float]]:
+    return [(corner.lon, corner.lat) for corner in ring]
 
 
 def _degrees(frame: LocalFrame, xy: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -262,6 +262,10 @@ class FlightPlanStatus(OpenModel):
     )
     state: PlanState | None = Field(default=None, description="State of the plan; unset: Draft.")
     message: str | None = Field(default=None, description="Human-readable description of the state.")
+    priority_class: PriorityClass | None = Field(
+        default=None,
+        description="Priority class of the version that state and volumes result from; unset: not decided.",
+    )
     drone: str | None = Field(default=None, description="Name of the reserved drone.")
     rejected: tuple[Rejection, ...] = Field(default=(), description="Drones that do not fit, each with the reason.")
     volumes: tuple[ReservedVolume, ...] = Field(default=(), description="Volumes in which the flight stays.")

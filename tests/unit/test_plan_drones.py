@@ -1,9 +1,11 @@
 """Choice of the drone: a flying drone that can be shared, or an idle drone near the start."""
 
 import dataclasses
+from dataclasses import replace
 
 import pytest
 from fractus_core.planning import Infeasible, Settings, flight_of, plan
+from fractus_core.planning.inventory import Reservation
 from test_planning import (
     FRAME,
     PATH,
@@ -11,10 +13,13 @@ from test_planning import (
     application,
     at,
     drone,
+    host,
     inventory,
     navigator,
     reasons,
 )
+
+NOW_S = 1_800_000_000.0
 
 # -- sharing a flying drone --
 
@@ -131,3 +136,36 @@ def test_flight_time_message_contains_figures():
         match=r"can fly 0\.8 min with its reserve kept, with its battery at 25%; the mission takes 2\.\d min for \d+ m",
     ):
         plan(application(navigator(PATH)), inventory([drone("d", battery=0.25)]))
+
+
+@pytest.mark.parametrize(("begins_s", "suits"), [(-60, False), (60, False), (3600, True)])
+def test_drone_reserved_by_a_flight_plan_during_the_mission_is_rejected(begins_s, suits):
+    reserved = Reservation("team/morning", NOW_S + begins_s, NOW_S + begins_s + 600)
+    fleet = inventory([drone("d")], reservations={"d": [reserved]})
+    settings = Settings(time_s=NOW_S)
+    if suits:
+        assert plan(application(navigator(PATH)), fleet, settings).drone.node == "d"
+        return
+    with pytest.raises(Infeasible) as refused:
+        plan(application(navigator(PATH)), fleet, settings)
+    assert refused.value.reason == "DroneBusy"
+    (rejection,) = refused.value.rejected
+    assert rejection.reason == "Reserved"
+    assert rejection.message.startswith("flight plan team/morning has reserved it from 2027-01-15T")
+
+
+def test_drone_of_running_application_is_kept_when_a_flight_plan_reserves_it():
+    app = application(navigator(PATH))
+    before = plan(app, inventory([drone("d")]), Settings(time_s=NOW_S))
+    reserved = inventory([drone("d"), drone("e")], reservations={"d": [Reservation("a/b", NOW_S, NOW_S + 60)]})
+    assert plan(app, reserved, Settings(time_s=NOW_S), before).drone.node == "d"
+
+
+def test_later_flight_ignores_present_state_but_not_missing_services():
+    weak = drone("d", battery=0.0, ready="False")
+    unready = replace(host("d", "drone"), ready=False)
+    stocked = inventory([weak], hosts=[unready])
+    later = Settings(time_s=NOW_S, begins_later=True)
+    assert plan(application(navigator(PATH)), stocked, later).drone.node == "d"
+    with pytest.raises(Infeasible, match="Takeoff"):
+        plan(application(navigator(PATH)), inventory([drone("d", methods=["Arm"])]), later)

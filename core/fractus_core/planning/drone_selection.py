@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
 
 from fractus_core.api.components import Component
 from fractus_core.api.geometry import Point
+from fractus_core.api.model import timestamp
 from fractus_core.api.nodes import Drone
 from fractus_core.api.plans import Alternative, DroneChoice, PlannedMission
 from fractus_core.geo import ground_point
@@ -28,6 +30,8 @@ from fractus_core.planning.spatial_index import Near
 
 _DAY_MIN = 1440.0
 _ALTERNATIVES = 10
+_TAKEN = frozenset({"Claimed", "Reserved"})
+"""Reasons for the rejection of a drone that may be free later."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +81,7 @@ def choose_drone(builder: PlanBuilder, area: OperationArea, candidates: DroneCan
     """Place all drone components on the best candidate. A suitable drone of the previous plan is kept.
 
     Raises:
-        Infeasible: No candidate is suitable. The reason is DroneBusy if another application uses a suitable drone.
+        Infeasible: No candidate is suitable. The reason is DroneBusy if another application or a flight plan has a suitable drone.
     """
     components = list(builder.spec.on("drone"))
     leader = builder.spec.driver or components[0]
@@ -89,7 +93,7 @@ def choose_drone(builder: PlanBuilder, area: OperationArea, candidates: DroneCan
         if (candidate := _rank(builder, mission, drone, components, used=used)) is not None
     ]
     if not ranked:
-        busy = any(r.reason == "Claimed" for r in builder.rejections(leader))
+        busy = any(r.reason in _TAKEN for r in builder.rejections(leader))
         reason = "DroneBusy" if busy else "NoDrone"
         known = len(builder.inventory.drones)
         fallback = f"none of the {known} known drones is near the start" if known else "no Drone exists"
@@ -313,15 +317,36 @@ def _check_temporary(
         leader = builder.spec.driver or components[0]
         note = builder.range_message(leader, drone.name)
         return Check("Claimed", f"{owner[0]}/{owner[1]} uses it" + (f", and {note}" if note else ""))
-    host = check_host(builder.inventory.hosts, drone.name, builder.settings, kept=kept)
+    later = builder.settings.begins_later
+    host = check_host(builder.inventory.hosts, drone.name, builder.settings, kept=kept or later)
     if kept:
         return host
+    if not used:
+        host = host and _check_reservations(builder, drone, mission)
+    if later:
+        return host and check_resources(builder.ledger, drone.name, components)
     energy = SUITABLE
     if mission is not None and mission.needed_min > mission.available_min:
         battery = drone.status.battery if drone.status is not None else None
         share = battery.remaining if battery is not None else 1.0
         energy = _too_long(drone, mission, mission.available_min, f"with its battery at {share:.0%}")
     return host and _check_state(drone) and energy and check_resources(builder.ledger, drone.name, components)
+
+
+def _check_reservations(builder: PlanBuilder, drone: Drone, mission: Estimate | None) -> Check:
+    """Check that no flight plan has reserved the drone for the time of the mission."""
+    begin_s = builder.settings.time_s
+    if begin_s is None:
+        return SUITABLE
+    end_s = builder.settings.until_s
+    if end_s is None:
+        end_s = begin_s + (mission.needed_min if mission is not None else 0.0) * 60
+    for reserved in builder.inventory.reservations.get(drone.name, ()):
+        if reserved.begin_s <= end_s and reserved.end_s >= begin_s:
+            begin = timestamp(datetime.fromtimestamp(reserved.begin_s, UTC))
+            end = timestamp(datetime.fromtimestamp(reserved.end_s, UTC))
+            return Check("Reserved", f"flight plan {reserved.holder} has reserved it from {begin} to {end}")
+    return SUITABLE
 
 
 def _too_long(drone: Drone, mission: Estimate, available_min: float, when: str) -> Check:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -56,6 +56,21 @@ class Flight:
 
 
 @dataclass(frozen=True, slots=True)
+class Reservation:
+    """Time for which a flight plan has reserved a drone.
+
+    Attributes:
+        holder: namespace/name of the flight plan.
+        begin_s: First moment in seconds since 1970 UTC.
+        end_s: Last moment in seconds since 1970 UTC.
+    """
+
+    holder: str
+    begin_s: float
+    end_s: float
+
+
+@dataclass(frozen=True, slots=True)
 class Inventory:
     """All objects that a plan and its Grants depend on; every mapping is by object name.
 
@@ -64,6 +79,7 @@ class Inventory:
         unreadable_zones: Invalid zones with their problems.
         claimed: (namespace, name) of the application that uses a drone, by drone.
         flights: Known flights of claimed drones, by drone. Only known flights can be shared.
+        reservations: Reservations of other flight plans, by drone.
         locations: Indexes of these mappings that the caller keeps current, or None to build them when needed.
     """
 
@@ -77,6 +93,7 @@ class Inventory:
     unreadable_zones: Mapping[str, str] = field(default_factory=dict)
     claimed: Mapping[str, tuple[str, str]] = field(default_factory=dict)
     flights: Mapping[str, Flight] = field(default_factory=dict)
+    reservations: Mapping[str, Sequence[Reservation]] = field(default_factory=dict)
     locations: NodeLocations | None = field(default=None, compare=False, repr=False)
     _built: list[NodeLocations] = field(default_factory=list, init=False, compare=False, repr=False)
 
@@ -143,7 +160,10 @@ class Settings:
         near_misses: Number of nodes out of range that a plan lists for each requested location.
         near_miss_m: Maximum distance of these nodes from the location.
         rejections_listed: Maximum number of rejected nodes in a plan, so that it fits into a Kubernetes object.
-        time_s: Start of the flight in seconds since 1970, or None to skip the legality check of the route.
+        time_s: Start of the flight in seconds since 1970, or None to skip the legality check of the route and the check of
+            reservations.
+        until_s: End of the time in which the drone is needed, or None for the estimated end of the mission.
+        begins_later: True if the flight begins so much later that the present state, charge and links of nodes do not matter.
         policy_conflicts: Handling of a mission whose route the policies allow for no drone: `warn` plans it with a warning,
             `forbid` does not plan it.
         flat_terrain: True to assume terrain level with home everywhere, as in the mobility service.
@@ -163,6 +183,8 @@ class Settings:
     near_miss_m: float = 100_000.0
     rejections_listed: int = 5000
     time_s: float | None = None
+    until_s: float | None = None
+    begins_later: bool = False
     policy_conflicts: PolicyConflicts = "warn"
     flat_terrain: bool = False
     gateway: bool = True

@@ -97,7 +97,7 @@ class PlanBuilder:
 
     def check_edge(self, node: EdgeNode, component: Component) -> Check:
         """Check if an edge node can host the component. The result contains the first failed requirement, if any."""
-        kept = self.was_placed(component, node.name)
+        kept = self.was_placed(component, node.name) or self.settings.begins_later
         return (
             check_host(self.inventory.hosts, node.name, self.settings, kept=kept)
             and (SUITABLE if kept else _check_state(node))

@@ -1,0 +1,202 @@
+"""Reservations of all flight plans: their airspace, and their drones in time.
+
+The index contains what the status of each plan reports. A decision is added before its status is written, so that the next
+decision considers it.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+from fractus_core.airspace import Airspace, OperationalIntent
+from fractus_core.airspace.lifecycle import RESERVING
+from fractus_core.airspace.plan_status import intent_of
+from fractus_core.api import FlightPlan, InvalidObject
+from fractus_core.planning.inventory import Reservation
+
+from fractus_operator.kinds import Key
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class ReservedFlight:
+    """What a flight plan reserves.
+
+    Attributes:
+        uid: Uid of the plan.
+        intent: Its state and volumes.
+        drone: Its drone.
+    """
+
+    uid: str
+    intent: OperationalIntent
+    drone: str
+
+    @property
+    def begin_s(self) -> float:
+        """Start of the reservation in seconds since 1970 UTC."""
+        return min(volume.begin_s for volume in self.intent.all_volumes)
+
+    @property
+    def end_s(self) -> float:
+        """End of the reservation in seconds since 1970 UTC."""
+        return max(volume.end_s for volume in self.intent.all_volumes)
+
+    def merged(self, other: ReservedFlight) -> ReservedFlight:
+        """Return a reservation that also has the volumes of another version of the same plan."""
+        intent = replace(
+            self.intent,
+            volumes=self.intent.volumes + other.intent.volumes,
+            off_nominal=self.intent.off_nominal + other.intent.off_nominal,
+        )
+        return replace(self, intent=intent)
+
+
+def reserved_flight(plan: FlightPlan) -> ReservedFlight | None:
+    """Return what a plan reserves according to its status, or None.
+
+    Raises:
+        InvalidObject: A volume of the status is invalid.
+    """
+    status = plan.status
+    if plan.spec.dry_run or status is None or status.state not in RESERVING or status.drone is None:
+        return None
+    intent = intent_of(plan)
+    return ReservedFlight(plan.metadata.uid or "", intent, status.drone) if intent.all_volumes else None
+
+
+class FlightPlanIndex:
+    """Reservations of flight plans by name, drone and uid.
+
+    Args:
+        on_change: Called with the keys of plans whose airspace overlaps that of a changed plan.
+
+    Attributes:
+        airspace: Operational intents of all plans.
+    """
+
+    def __init__(self, on_change: Callable[[Collection[Key]], None] = lambda _: None) -> None:
+        self.airspace = Airspace()
+        self._on_change = on_change
+        self._observed: dict[Key, ReservedFlight] = {}
+        self._decided: dict[Key, ReservedFlight] = {}
+        self._present: dict[Key, ReservedFlight] = {}
+        self._by_drone: dict[str, set[Key]] = {}
+        self._keys: dict[str, Key] = {}
+        self._uids: dict[Key, str] = {}
+
+    def plan_changed(self, key: Key, plan: FlightPlan | None) -> None:
+        """Handle a change of a plan. A plan is None if it was deleted."""
+        before = self._observed.pop(key, None)
+        self._keys.pop(self._uids.pop(key, ""), None)
+        uid = plan.metadata.uid or "" if plan is not None else ""
+        decided = self._decided.get(key)
+        if decided is not None and decided.uid != uid:
+            del self._decided[key]
+        if plan is not None:
+            self._keys[uid] = key
+            self._uids[key] = uid
+            try:
+                reserved = reserved_flight(plan)
+            except InvalidObject as error:
+                log.warning(
+                    "flight plans: invalid status, the last reservation stays (plan=%s/%s error=%s)", *key, error
+                )
+                reserved = before
+            if reserved is not None:
+                self._observed[key] = reserved
+        self._update(key)
+
+    def decide(self, key: Key, decided: ReservedFlight) -> None:
+        """Reserve for a decision whose status is written next. Until `settle`, the observed reservation stays as well."""
+        self._decided[key] = decided
+        self._update(key)
+
+    def settle(self, key: Key) -> None:
+        """Drop the decision of a plan, because its status was stored or will never be."""
+        if self._decided.pop(key, None) is not None:
+            self._update(key)
+
+    def get(self, key: Key) -> ReservedFlight | None:
+        """Return what a plan reserves, or None."""
+        return self._present.get(key)
+
+    def key_of(self, uid: str) -> Key | None:
+        """Return the key of the plan with a uid, or None."""
+        return self._keys.get(uid)
+
+    def on_drone(self, drone: str) -> Iterator[tuple[Key, ReservedFlight]]:
+        """Iterate over the reservations of a drone."""
+        for key in sorted(self._by_drone.get(drone, ())):
+            yield key, self._present[key]
+
+    def reservations(self, without: str | None) -> Reservations:
+        """Return the reservations by drone, without those of the plan with a uid. The result is valid until the next change."""
+        return Reservations(self, without)
+
+    def reserved_drones(self) -> Collection[str]:
+        """Return the names of the reserved drones."""
+        return self._by_drone.keys()
+
+    def _update(self, key: Key) -> None:
+        observed = self._observed.get(key)
+        new = self._decided.get(key, observed)
+        if new is not None and observed is not None and new is not observed and new.uid == observed.uid:
+            new = new.merged(observed)
+        old = self._present.pop(key, None)
+        if new is not None:
+            self._present[key] = new
+        if old == new:
+            return
+        name = "/".join(key)
+        affected: set[str] = set()
+        for each in (old, new):
+            if each is not None:
+                affected |= {other.name for other in self.airspace.overlapping(each.intent.all_volumes, without=name)}
+        if old is not None:
+            self._by_drone[old.drone].discard(key)
+            if not self._by_drone[old.drone]:
+                del self._by_drone[old.drone]
+            self.airspace.remove(name)
+        if new is not None:
+            self._by_drone.setdefault(new.drone, set()).add(key)
+            self.airspace.put(new.intent)
+        self._on_change([_key(other) for other in sorted(affected)])
+
+
+class Reservations(Mapping[str, Sequence[Reservation]]):
+    """The reservations by drone, as one Application or flight plan sees them."""
+
+    def __init__(self, index: FlightPlanIndex, without: str | None) -> None:
+        self._index = index
+        self._without = without
+
+    def __getitem__(self, drone: str) -> Sequence[Reservation]:
+        """Return the reservations of a drone.
+
+        Raises:
+            KeyError: No flight plan has reserved the drone.
+        """
+        if drone not in self._index.reserved_drones():
+            raise KeyError(drone)
+        return [
+            Reservation("/".join(key), reserved.begin_s, reserved.end_s)
+            for key, reserved in self._index.on_drone(drone)
+            if reserved.uid != self._without
+        ]
+
+    def __iter__(self) -> Iterator[str]:
+        """Iterate over the names of the reserved drones."""
+        return iter(self._index.reserved_drones())
+
+    def __len__(self) -> int:
+        """Return the number of reserved drones."""
+        return len(self._index.reserved_drones())
+
+
+def _key(name: str) -> Key:
+    namespace, _, plan = name.partition("/")
+    return namespace, plan

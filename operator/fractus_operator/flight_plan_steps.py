@@ -1,0 +1,437 @@
+"""Steps of flight plans: the decision on a plan, its activation, and its state during the flight. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Literal
+
+from fractus_core.airspace import Airspace, OperationalIntent, Volume4D, decide, standing_overlaps
+from fractus_core.airspace.lifecycle import OFF_NOMINAL
+from fractus_core.airspace.plan_status import PRIORITIES, intent_of, plan_finding, reserved_volume
+from fractus_core.api import Application, ApplicationTemplate, FlightPlan, InvalidObject
+from fractus_core.api.conditions import ConditionUpdate
+from fractus_core.api.flight_plans import FlightPlanStatus, PlanFinding, PlanState, ReservedVolume
+from fractus_core.api.plans import Rejection
+from fractus_core.planning.inventory import Inventory, Settings
+from fractus_core.planning.ordered_application import ordered_application
+
+from fractus_operator.flight_matching import SOON_S, Match, Unfit, match_flight
+from fractus_operator.flight_progress import FlownMission, flight_progress, off_nominal_volumes
+
+START_GRACE_S = 120.0
+"""Seconds after the start of its window for which a plan waits for a suitable drone."""
+
+RETRY_S = 5.0
+"""Seconds until a plan without a suitable drone is matched again, unless an input changes earlier."""
+
+RECHECK_S = 300.0
+"""Maximum seconds until the next step of a plan. The clock may jump, so no step waits until a distant time."""
+
+STARTED = "Started"
+"""Condition of a plan whose Application was created. It is never created again."""
+
+
+@dataclass(frozen=True, slots=True)
+class PlanSituation:
+    """A flight plan with the inputs of its next step, all read at the same time.
+
+    Attributes:
+        plan: The plan.
+        template: Its template, or None if the template does not exist.
+        inventory: Returns the inventory for a flight in the window of the plan.
+        settings: Settings of planning.
+        airspace: Operational intents of all plans.
+        mission: The Application of the plan.
+        now_s: Time in seconds since 1970 UTC.
+    """
+
+    plan: FlightPlan
+    template: ApplicationTemplate | None
+    inventory: Callable[[], Inventory]
+    settings: Settings
+    airspace: Airspace
+    mission: FlownMission
+    now_s: float
+
+    @property
+    def name(self) -> str:
+        """namespace/name of the plan."""
+        return f"{self.plan.metadata.namespace or 'default'}/{self.plan.name}"
+
+    @property
+    def status(self) -> FlightPlanStatus:
+        """Status of the plan, empty if the plan has none."""
+        return self.plan.status or FlightPlanStatus()
+
+    @property
+    def state(self) -> PlanState:
+        """State of the plan."""
+        return self.status.state or "Draft"
+
+    @property
+    def changed(self) -> bool:
+        """True if the present version of the plan was not considered yet."""
+        return self.status.observed_generation != self.plan.metadata.generation
+
+    @property
+    def closing(self) -> bool:
+        """True if the user ends the plan."""
+        return self.plan.spec.use == "Closed" or self.plan.metadata.deletion_timestamp is not None
+
+    @property
+    def may_start(self) -> bool:
+        """True if the user permits the takeoff at the start of the window."""
+        return self.plan.spec.use == "InUse" or self.plan.spec.auto_activate
+
+    @property
+    def end_s(self) -> float:
+        """End of the window in force in seconds since 1970 UTC."""
+        ends = [volume.end.timestamp() for volume in self.status.volumes]
+        return max(ends, default=self.plan.spec.window.end_s)
+
+
+@dataclass(frozen=True, slots=True)
+class PlanStep:
+    """The next step of a plan.
+
+    Attributes:
+        status: Its new status. The conditions are in `conditions`.
+        conditions: The conditions of the plan.
+        start: Application to create after the status is stored.
+        end: True to delete the Application.
+        next_s: Seconds until the next step, unless an input changes earlier.
+    """
+
+    status: FlightPlanStatus
+    conditions: tuple[ConditionUpdate, ...]
+    start: Application | None = None
+    end: bool = False
+    next_s: float = RECHECK_S
+
+
+def plan_step(now: PlanSituation) -> PlanStep:
+    """Return the next step of a plan."""
+    match now.state:
+        case "Draft":
+            step = _decide_new(now)
+        case "Rejected":
+            step = _decide_new(now) if now.changed and not now.closing else _keep(now)
+        case "Accepted":
+            step = _follow_accepted(now)
+        case "Activated" | "Nonconforming" | "Contingent":
+            step = _follow_flight(now)
+        case "Ended":
+            step = _keep(now)
+    return replace(step, next_s=max(min(step.next_s, RECHECK_S), 0.1))
+
+
+# -- decision --
+
+
+def _decide_new(now: PlanSituation) -> PlanStep:
+    """Decide on a plan that is not in force: Accepted, Rejected, or Draft while the user must select actions."""
+    if now.closing:
+        return _rejected(now, Unfit("Closed", "the plan was closed before it was accepted"))
+    try:
+        match = _match(now)
+    except Unfit as unfit:
+        return _rejected(now, unfit)
+    if match.undecided:
+        names = ", ".join(match.undecided)
+        message = f"select an action for each policy with choices in spec.policyActions: {names}"
+        status = _status_of(now, match, "Draft", message).model_copy(
+            update={"drone": None, "volumes": (), "decided_for": None}
+        )
+        needed = ConditionUpdate("ActionNeeded", "True", "ChoicesMissing", message, adverse=True)
+        return PlanStep(status, (needed,))
+    intent = _intent(now, "Accepted", match.volumes)
+    decision = decide(intent, None, now.airspace, now.now_s)
+    if not decision.accepted:
+        refusals = tuple(map(plan_finding, decision.refusals))
+        return _rejected(now, Unfit(refusals[0].reason, refusals[0].message), refusals)
+    return _accepted(now, match, intent)
+
+
+def _accepted(now: PlanSituation, match: Match, intent: OperationalIntent) -> PlanStep:
+    status = _status_of(now, match, "Accepted", f"{match.drone} is reserved")
+    status = status.model_copy(update={"advisories": match.advisories + _overlaps(intent, now)})
+    return PlanStep(status, _conditions(status), next_s=_until_start_s(now))
+
+
+def _rejected(now: PlanSituation, unfit: Unfit, refusals: tuple[PlanFinding, ...] = ()) -> PlanStep:
+    refusals = refusals or (PlanFinding(reason=unfit.reason, message=unfit.message),)
+    status = FlightPlanStatus(
+        observed_generation=now.plan.metadata.generation,
+        decided_for=now.plan.metadata.generation,
+        state="Rejected",
+        message=unfit.message,
+        priority_class=now.plan.spec.priority_class,
+        rejected=unfit.rejected,
+        refusals=refusals,
+    )
+    return PlanStep(status, (ConditionUpdate("Accepted", "False", unfit.reason, unfit.message),))
+
+
+# -- before the flight --
+
+
+def _follow_accepted(now: PlanSituation) -> PlanStep:
+    """Follow a plan until its start: consider changes, match it again if its drone is lost, and activate it."""
+    if now.closing:
+        return _ended(now, "the plan was closed before its flight")
+    begin_s = now.plan.spec.window.begin_s
+    if now.may_start and begin_s <= now.now_s <= now.plan.spec.window.end_s:
+        return _activate(now)
+    if now.changed:
+        return _redecide(now)
+    if now.now_s > now.end_s:
+        return _ended(now, "the window ended without a flight")
+    soon = begin_s - SOON_S <= now.now_s
+    if soon or now.status.drone not in now.inventory().drones:
+        return _rematch(now)
+    return replace(_keep(now), next_s=_until_start_s(now))
+
+
+def _redecide(now: PlanSituation) -> PlanStep:
+    """Decide on a changed plan. If the change is refused, the earlier version stays in force."""
+    before = intent_of(now.plan)
+    try:
+        match = _match(now)
+    except Unfit as unfit:
+        return _refuse_change(now, (PlanFinding(reason=unfit.reason, message=unfit.message),))
+    if match.undecided:
+        names = ", ".join(match.undecided)
+        message = f"select an action for each policy with choices in spec.policyActions: {names}"
+        return _refuse_change(now, (PlanFinding(reason="ChoicesMissing", message=message),))
+    intent = _intent(now, "Accepted", match.volumes)
+    decision = decide(intent, before, now.airspace, now.now_s)
+    if not decision.accepted:
+        return _refuse_change(now, tuple(map(plan_finding, decision.refusals)))
+    return _accepted(now, match, intent)
+
+
+def _refuse_change(now: PlanSituation, refusals: tuple[PlanFinding, ...]) -> PlanStep:
+    status = now.status.model_copy(update={"observed_generation": now.plan.metadata.generation, "refusals": refusals})
+    return PlanStep(status, _conditions(status, now), next_s=_until_start_s(now))
+
+
+def _rematch(now: PlanSituation) -> PlanStep:
+    """Check shortly before the flight that a drone is suitable. Select another drone if the reserved one is not."""
+    try:
+        match = _match(now)
+    except Unfit as unfit:
+        if now.now_s > now.plan.spec.window.begin_s + START_GRACE_S and now.may_start:
+            return _rejected(now, unfit)
+        return _not_startable(now, unfit.reason, unfit.message, unfit.rejected)
+    if match.drone == now.status.drone:
+        return replace(_keep(now), next_s=_until_start_s(now))
+    intent = _intent(now, "Accepted", match.volumes)
+    decision = decide(intent, intent_of(now.plan), now.airspace, now.now_s)
+    if not decision.accepted:
+        finding = decision.refusals[0]
+        return _not_startable(now, finding.reason, finding.message)
+    return _accepted(now, match, intent)
+
+
+def _activate(now: PlanSituation) -> PlanStep:
+    """Activate a plan whose window has begun. Everything is decided again, because its inputs may have changed.
+
+    The reservation lasts for the rest of the window, in which the flight must fit.
+    """
+    try:
+        match = _match(now)
+    except Unfit as unfit:
+        permanent = unfit.reason in {"Invalid", "TemplateMissing"}
+        late = now.now_s > now.plan.spec.window.begin_s + START_GRACE_S
+        if now.state == "Accepted" and (permanent or late):
+            return _rejected(now, unfit)
+        return _not_startable(now, unfit.reason, unfit.message, unfit.rejected)
+    intent = _intent(now, "Activated", match.volumes)
+    decision = decide(intent, intent_of(now.plan), now.airspace, now.now_s)
+    if match.undecided or not decision.accepted:
+        reason = "ChoicesMissing"
+        message = f"select an action in spec.policyActions for {', '.join(match.undecided)}"
+        if not match.undecided:
+            reason = decision.refusals[0].reason
+            message = decision.refusals[0].message
+        return _not_startable(now, reason, message)
+    status = _status_of(now, match, "Activated", f"{match.drone} starts the flight").model_copy(
+        update={"application": match.application.name, "advisories": match.advisories + _overlaps(intent, now)}
+    )
+    return PlanStep(status, _conditions(status), start=match.application, next_s=RETRY_S)
+
+
+def _not_startable(now: PlanSituation, reason: str, message: str, rejected: tuple[Rejection, ...] = ()) -> PlanStep:
+    status = now.status.model_copy(update={"message": message, "rejected": rejected or now.status.rejected})
+    startable = ConditionUpdate("Startable", "False", reason, message)
+    return PlanStep(status, (*_conditions(status, now), startable), next_s=RETRY_S)
+
+
+# -- flight --
+
+
+def _follow_flight(now: PlanSituation) -> PlanStep:
+    """Follow the flight of an activated plan."""
+    if not now.mission.started:
+        if now.closing or now.now_s > now.end_s:
+            return _ended(now, "the plan ended before its Application was created")
+        return _activate(now)
+    if now.changed and not now.closing:
+        step = _change_in_flight(now)
+        if step is not None:
+            return step
+    progress = flight_progress(now.mission, now.state, now.status, closing=now.closing, now_s=now.now_s)
+    if progress.state == "Ended":
+        return _ended(now, progress.message)
+    off_nominal: tuple[ReservedVolume, ...] = ()
+    if progress.state in OFF_NOMINAL:
+        off_nominal = off_nominal_volumes(now.mission, now.status, now.now_s)
+    status = now.status.model_copy(
+        update={
+            "observed_generation": now.plan.metadata.generation,
+            "state": progress.state,
+            "message": progress.message,
+            "off_nominal_volumes": off_nominal,
+        }
+    )
+    intent = intent_of(now.plan.model_copy(update={"status": status}))
+    status = status.model_copy(update={"advisories": _overlaps(intent, now)})
+    next_s = RETRY_S if progress.state in OFF_NOMINAL else now.end_s - now.now_s
+    return PlanStep(status, _conditions(status, now), end=progress.end, next_s=max(next_s, 1.0))
+
+
+def _change_in_flight(now: PlanSituation) -> PlanStep | None:
+    """Decide on a changed plan whose flight has begun. Only the end of its window may change.
+
+    Returns:
+        None if nothing of the flight changes.
+    """
+    try:
+        digest = _ordered(now).spec.mission_digest
+    except (InvalidObject, Unfit) as error:
+        return _refuse_change(now, (PlanFinding(reason="Invalid", message=str(error)),))
+    if digest != now.mission.digest:
+        message = (
+            "the flight has begun, so its place, actions and parameters cannot change; undo the change, or create another"
+            " flight plan"
+        )
+        return _refuse_change(now, (PlanFinding(reason="ChangeNotPermitted", message=message),))
+    before = intent_of(now.plan)
+    end_s = now.plan.spec.window.end_s
+    if end_s == now.end_s:
+        return None
+    if now.state != "Activated" or end_s < now.now_s:
+        message = f"the window cannot change while the plan is {now.state}"
+        if end_s < now.now_s:
+            message = "the changed window is over; set spec.use: Closed to end the flight"
+        return _refuse_change(now, (PlanFinding(reason="ChangeNotPermitted", message=message),))
+    intent = replace(before, volumes=tuple(replace(volume, end_s=end_s) for volume in before.volumes))
+    decision = decide(intent, before, now.airspace, now.now_s)
+    if not decision.accepted:
+        return _refuse_change(now, tuple(map(plan_finding, decision.refusals)))
+    status = now.status.model_copy(
+        update={
+            "observed_generation": now.plan.metadata.generation,
+            "decided_for": now.plan.metadata.generation,
+            "volumes": tuple(map(reserved_volume, intent.volumes)),
+            "refusals": (),
+        }
+    )
+    return PlanStep(status, _conditions(status, now), next_s=RETRY_S)
+
+
+def _ended(now: PlanSituation, message: str) -> PlanStep:
+    status = now.status.model_copy(
+        update={
+            "observed_generation": now.plan.metadata.generation,
+            "state": "Ended",
+            "message": message,
+            "off_nominal_volumes": (),
+            "advisories": (),
+        }
+    )
+    return PlanStep(status, _conditions(status, now))
+
+
+# -- parts --
+
+
+def _match(now: PlanSituation) -> Match:
+    return match_flight(now.plan, now.template, now.inventory(), now.settings, now.now_s, preferred=now.status.drone)
+
+
+def _ordered(now: PlanSituation) -> Application:
+    if now.template is None:
+        name = now.plan.spec.template
+        raise Unfit("TemplateMissing", f"there is no ApplicationTemplate {name}; apply it, or correct spec.template")
+    return ordered_application(now.plan, now.template)
+
+
+def _intent(now: PlanSituation, state: PlanState, volumes: tuple[Volume4D, ...]) -> OperationalIntent:
+    return OperationalIntent(now.name, state, PRIORITIES[now.plan.spec.priority_class], volumes)
+
+
+def _overlaps(intent: OperationalIntent, now: PlanSituation) -> tuple[PlanFinding, ...]:
+    return tuple(map(plan_finding, standing_overlaps(intent, now.airspace)))
+
+
+def _status_of(now: PlanSituation, match: Match, state: PlanState, message: str) -> FlightPlanStatus:
+    generation = now.plan.metadata.generation
+    return FlightPlanStatus(
+        observed_generation=generation,
+        decided_for=generation,
+        state=state,
+        message=message,
+        priority_class=now.plan.spec.priority_class,
+        drone=match.drone,
+        rejected=match.rejected,
+        volumes=tuple(map(reserved_volume, match.volumes)),
+        restrictions=match.restrictions,
+        advisories=match.advisories,
+    )
+
+
+def _keep(now: PlanSituation) -> PlanStep:
+    """Keep the state of a plan, and update its overlaps with other plans."""
+    status = now.status.model_copy(update={"observed_generation": now.plan.metadata.generation})
+    if now.state == "Accepted":
+        policies = tuple(each for each in status.advisories if each.plan is None)
+        status = status.model_copy(
+            update={
+                "advisories": policies + _overlaps(intent_of(now.plan), now),
+                "message": f"{status.drone} is reserved",
+            }
+        )
+    return PlanStep(status, _conditions(status, now))
+
+
+def _conditions(status: FlightPlanStatus, now: PlanSituation | None = None) -> tuple[ConditionUpdate, ...]:
+    """Return the conditions of a plan with a status, from the status and the Application."""
+    value: Literal["True", "False"] = "False" if status.state == "Rejected" else "True"
+    reason = status.refusals[0].reason if status.state == "Rejected" and status.refusals else str(status.state)
+    updates = [ConditionUpdate("Accepted", value, reason, status.message or "")]
+    if status.state != "Rejected" and status.refusals:
+        refusal = status.refusals[0]
+        message = f"the earlier version stays in force: {refusal.message}"
+        updates.append(ConditionUpdate("ChangeRefused", "True", refusal.reason, message, adverse=True))
+    conflicts = [
+        each for each in status.advisories if each.reason in {"OverlapsHigherPriority", "OverlapsEqualPriority"}
+    ]
+    if conflicts:
+        updates.append(
+            ConditionUpdate("ConflictArose", "True", conflicts[0].reason, conflicts[0].message, adverse=True)
+        )
+    if now is not None and now.mission.started:
+        updates.append(
+            ConditionUpdate(STARTED, "True", "ApplicationCreated", f"Application {status.application} flies")
+        )
+    return tuple(updates)
+
+
+def _until_start_s(now: PlanSituation) -> float:
+    """Return the seconds until the preparation, the start or the end of an accepted plan, whichever is next."""
+    window = now.plan.spec.window
+    times = (window.begin_s - SOON_S, window.begin_s, max(window.end_s, now.end_s))
+    left = [time - now.now_s for time in times if time > now.now_s]
+    return min(left, default=1.0)

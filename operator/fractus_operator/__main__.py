@@ -26,6 +26,7 @@ from fractus_operator.cache import ClusterCache
 from fractus_operator.cleanup import ORPHANED_PODS_PERIOD_S, OrphanedObjects, OrphanedPods
 from fractus_operator.csr_controller import CsrController
 from fractus_operator.drone_events import DroneEventRecorder
+from fractus_operator.flight_plan_controller import FlightPlanController
 from fractus_operator.kinds import Key, Kind
 from fractus_operator.labels import LEASE_NAME
 from fractus_operator.link_events import LinkEventRecorder
@@ -89,10 +90,21 @@ async def run(settings: Settings, stop: asyncio.Event | None = None) -> None:
         liveness = NodeLivenessController(cache, conditions, clock.now_s)
         services = ServiceRollout(store, cache, conditions, time.monotonic)
         orphaned_pods = OrphanedPods(store, cache)
+        flights = FlightPlanController(store, cache, _now, settings.planning)
+        for kind, listener in (
+            (kinds.FLIGHT_PLAN, flights.changed),
+            (kinds.APPLICATION, flights.application_changed),
+            (kinds.DEPLOYMENT_PLAN, flights.application_changed),
+            (kinds.DRONE, flights.drone_changed),
+        ):
+            cache.add_listener(kind, listener)
         links = LinkEventRecorder(store, _now)
         parts: list[Coroutine[Any, Any, None]] = [
             *(informer.run() for informer in (*cache.informers, links.informer)),
-            *(queue.run() for queue in (*work_queues(store, cache, csr, conditions), links.work_queue)),
+            *(
+                queue.run()
+                for queue in (*work_queues(store, cache, csr, conditions), links.work_queue, flights.work_queue)
+            ),
             run_periodically("node liveness", liveness.step, node_liveness.LIVENESS_PERIOD_S),
             run_periodically("service rollout", services.step, service_rollout.ROLLOUT_PERIOD_S),
             run_periodically("orphaned pods", orphaned_pods.step, ORPHANED_PODS_PERIOD_S),

@@ -25,6 +25,7 @@ from fractus_operator.cache import ClusterCache, ObservedApplication
 from fractus_operator.child_objects import ChildObjects, NameTaken
 from fractus_operator.cleanup import FinishedPods
 from fractus_operator.drone_claims import shared_flight_outcome
+from fractus_operator.flight_matching import other_drones
 from fractus_operator.kinds import Key
 from fractus_operator.labels import FINALIZER
 from fractus_operator.operator_metrics import phase as timed
@@ -388,6 +389,9 @@ class ApplicationController:
         state.excluded = {node: (end, reason) for node, (end, reason) in state.excluded.items() if end > now}
         state.excluded |= {node: (now + EXCLUSION, reason) for node, reason in stuck.items()}
         excluded = {node: reason for node, (_, reason) in state.excluded.items()}
+        reserved = self._cache.reserved_drone(observed.key)
+        if reserved is not None:
+            excluded |= other_drones(inventory.drones, reserved, f"the flight plan has Drone {reserved}")
         settings = replace(self._settings, excluded=excluded, time_s=now.timestamp())
         unchecked = observed.plan
         if unchecked is not None and not mission_changed(application, unchecked):

@@ -2,21 +2,36 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+import logging
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
-from fractus_core.api import DeploymentPlan, Depot, DirectLink, Drone, EdgeNode, Grant, Policy, Zone
+from fractus_core.api import (
+    ApplicationTemplate,
+    DeploymentPlan,
+    Depot,
+    DirectLink,
+    Drone,
+    EdgeNode,
+    FlightPlan,
+    Grant,
+    Policy,
+    Zone,
+)
 from fractus_core.api.names import NODE_SIGNER
 from fractus_core.api.plans import DeploymentPlanSpec
 from fractus_core.planning.candidates import readiness
 from fractus_core.planning.inventory import Flight, Host, Inventory
+from fractus_core.planning.ordered_application import application_name
 from fractus_core.planning.spatial_index import NodeLocations
 
 from fractus_operator import kinds
 from fractus_operator.active_plans import ActivePlans
 from fractus_operator.bookings import BookedHosts, Bookings, ByName
-from fractus_operator.drone_claims import DroneHolders, Fleet, offered_flights, shared_flight_lost
+from fractus_operator.drone_claims import Claim, DroneHolders, Fleet, offered_flights, shared_flight_lost
+from fractus_operator.flight_matching import SOON_S
+from fractus_operator.flight_plan_index import FlightPlanIndex
 from fractus_operator.kinds import Body, Key, Kind
 from fractus_operator.labels import label_key
 from fractus_operator.node_objects import NodeObjects
@@ -34,6 +49,8 @@ from fractus_operator.pods import (
 )
 from fractus_operator.store import Informer, Store
 from fractus_operator.work_queue import Subscriptions
+
+log = logging.getLogger(__name__)
 
 _WITHOUT_STATUS = frozenset({kinds.DEPLOYMENT, kinds.DIRECT_LINK})
 """Kinds of child objects whose status changes often and is used by no decision."""
@@ -99,6 +116,11 @@ class ClusterCache:
         self.zones = Informer(store, kinds.ZONE, tolerant_parser(Zone), self._zone_changed)
         self.policies = Informer(store, kinds.POLICY, tolerant_parser(Policy), self._policy_changed)
         self.applications = Informer(store, kinds.APPLICATION, parse_application, self._application_changed)
+        self.templates = Informer(
+            store, kinds.APPLICATION_TEMPLATE, optional_parser(ApplicationTemplate), self._ignored
+        )
+        self.flight_plans = Informer(store, kinds.FLIGHT_PLAN, tolerant_parser(FlightPlan), self._flight_plan_changed)
+        self.flights = FlightPlanIndex(self._flight_plans_affected)
         self.signing_requests = Informer(
             store,
             kinds.SIGNING_REQUEST,
@@ -178,6 +200,7 @@ class ClusterCache:
             unreadable_policies={p.name: p.problem for p in self.policies.values() if isinstance(p, Unreadable)},
             claimed=DroneHolders(self.fleet.claims(), uid),
             flights=flights or {},
+            reservations=self.flights.reservations(self._plan_uid_of(key)),
             locations=self._locations,
         )
 
@@ -215,6 +238,50 @@ class ClusterCache:
             return inventory, None
         message = shared_flight_lost(application, plan, observed.host[1], flights.get(node), radius_m)
         return inventory, ("SharedFlightLost", message) if message is not None else None
+
+    def flight_inventory(self, plan: FlightPlan, now_s: float) -> Inventory:
+        """Return the input for matching a flight plan with a drone. The result is valid until the next await.
+
+        Claims that end before the window are missing, and bookings are missing if the window begins later than `SOON_S`.
+        """
+        begin_s = max(plan.spec.window.begin_s, now_s)
+        inventory = self.snapshot(("", ""), "")
+        claimed = {
+            drone: claim.holder(None)
+            for drone, claim in self.fleet.claims().items()
+            if self._claimed_until_s(claim, now_s) >= begin_s
+        }
+        return replace(
+            inventory,
+            hosts=ByName(self.hosts) if begin_s - now_s > SOON_S else inventory.hosts,
+            claimed=claimed,
+            reservations=self.flights.reservations(plan.metadata.uid),
+        )
+
+    def reserved_drone(self, key: Key) -> str | None:
+        """Return the drone that a flight plan has reserved for its Application, or None for other Applications."""
+        plan = self.flights.key_of(self._plan_uid_of(key) or "")
+        reserved = self.flights.get(plan) if plan is not None else None
+        return reserved.drone if reserved is not None else None
+
+    def _plan_uid_of(self, key: Key) -> str | None:
+        """Return the uid of the flight plan whose Application has a key, or None.
+
+        The name must match as well, because every user may name a plan as the owner of an Application.
+        """
+        submitted = self.applications.get(key)
+        if submitted is None or not submitted.metadata.owner_references:
+            return None
+        owner = submitted.metadata.owner_references[0]
+        plan = self.flights.key_of(owner.uid)
+        of_plan = plan is not None and plan[0] == key[0] and key[1] == application_name(owner.uid)
+        return owner.uid if of_plan else None
+
+    def _claimed_until_s(self, claim: Claim, now_s: float) -> float:
+        """Return until when an Application may need its drone: the duration of its mission from now."""
+        plan = self.plans.get(claim.key, claim.uid)
+        mission = plan.drone.mission if plan is not None and plan.drone is not None else None
+        return now_s + (mission.duration * 60 if mission is not None else SOON_S)
 
     def is_being_deleted(self, namespace: str) -> bool:
         """Return True if a namespace is being deleted."""
@@ -347,6 +414,26 @@ class ClusterCache:
                 self.subscriptions.wake_waiting()
         self.subscriptions.wake(key, urgent=_changed_by_user(old, new))
 
+    def _flight_plan_changed(
+        self, key: Key, _old: FlightPlan | Unreadable | None, new: FlightPlan | Unreadable | None
+    ) -> None:
+        if isinstance(new, Unreadable):
+            # The last known reservation stays.
+            log.warning("cache: invalid FlightPlan ignored (plan=%s/%s error=%s)", *key, new.problem)
+            return
+        before = self.flights.get(key)
+        self.flights.plan_changed(key, new)
+        if before is not None and self.flights.get(key) != before:
+            self.subscriptions.wake_waiting()
+        self._notify(kinds.FLIGHT_PLAN, key)
+
+    def _flight_plans_affected(self, plans: Collection[Key]) -> None:
+        for key in plans:
+            self._notify(kinds.FLIGHT_PLAN, key)
+
+    def _ignored(self, _key: Key, _old: object, _new: object) -> None:
+        """Ignore a change, because the next step of each flight plan reads its template."""
+
     def _child_changed(self, key: Key, old: Body | None, new: Body | None) -> None:
         body = new or old or {}
         if body.get("kind") == Grant.KIND:
@@ -356,6 +443,7 @@ class ClusterCache:
             self.plans.plan_object_changed(key, new)
             if new is None:
                 self.subscriptions.wake_waiting()
+            self._notify(kinds.DEPLOYMENT_PLAN, key)
         elif body.get("kind") == DirectLink.KIND:
             self._notify(kinds.DIRECT_LINK, key)
         self.subscriptions.wake(application_label_key(body))

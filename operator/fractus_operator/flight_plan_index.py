@@ -47,10 +47,12 @@ class ReservedFlight:
 
     def merged(self, other: ReservedFlight) -> ReservedFlight:
         """Return a reservation that also has the volumes of another version of the same plan."""
+        mine = self.intent
+        theirs = other.intent
         intent = replace(
-            self.intent,
-            volumes=self.intent.volumes + other.intent.volumes,
-            off_nominal=self.intent.off_nominal + other.intent.off_nominal,
+            mine,
+            volumes=mine.volumes + tuple(each for each in theirs.volumes if each not in mine.volumes),
+            off_nominal=mine.off_nominal + tuple(each for each in theirs.off_nominal if each not in mine.off_nominal),
         )
         return replace(self, intent=intent)
 

@@ -112,6 +112,9 @@ class PlanStep:
 
 def plan_step(now: PlanSituation) -> PlanStep:
     """Return the next step of a plan."""
+    if now.plan.spec.dry_run and now.state != "Draft":
+        # A dry run reserves nothing and is never flown.
+        return _decide_new(now) if now.changed else _keep(now)
     match now.state:
         case "Draft":
             step = _decide_new(now)

@@ -5,11 +5,13 @@ from __future__ import annotations
 from fractus_core.api import (
     API_VERSION,
     Application,
+    ApplicationTemplate,
     DeploymentPlan,
     Depot,
     DirectLink,
     Drone,
     EdgeNode,
+    FlightPlan,
     Grant,
     NodeGrants,
     Policy,
@@ -26,6 +28,8 @@ def _fractus_kind(model: type[Resource]) -> Kind:
 
 
 APPLICATION = _fractus_kind(Application)
+APPLICATION_TEMPLATE = _fractus_kind(ApplicationTemplate)
+FLIGHT_PLAN = _fractus_kind(FlightPlan)
 DEPLOYMENT_PLAN = _fractus_kind(DeploymentPlan)
 GRANT = _fractus_kind(Grant)
 NODE_GRANTS = _fractus_kind(NodeGrants)

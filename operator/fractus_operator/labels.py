@@ -45,6 +45,10 @@ FINISHED_LABEL = f"{GROUP}/finished"
 FINISHED_FORMAT = "%Y%m%dT%H%M%SZ"
 
 FINALIZER = f"{GROUP}/teardown"
+
+LANDING_FINALIZER = f"{GROUP}/landing"
+"""Finalizer of FlightPlans whose drones may fly. It keeps the reserved airspace until the landing."""
+
 DEPOT_LABEL = f"{GROUP}/depot"
 GEOHASH_LABEL = f"{GROUP}/geohash"
 INTERFACE_LABEL = f"{GROUP}/interface-"

@@ -14,6 +14,11 @@ PARAMETERS = "FLIGHT_PARAMETERS"
 """Environment variable of every container with the parameters of the plan as JSON."""
 
 
+def application_name(uid: str) -> str:
+    """Return the name of the Application that flies the flight plan with a uid."""
+    return f"flight-{uid}"
+
+
 def ordered_application(plan: FlightPlan, template: ApplicationTemplate) -> Application:
     """Return the Application that flies a plan. Its name contains the uid of the plan, so it is created at most once.
 
@@ -58,7 +63,7 @@ def _body(plan: FlightPlan, spec: ApplicationSpec) -> dict[str, Any]:
         "apiVersion": API_VERSION,
         "kind": Application.KIND,
         "metadata": {
-            "name": f"flight-{uid}",
+            "name": application_name(uid),
             "namespace": plan.metadata.namespace or "default",
             "ownerReferences": [owner],
         },

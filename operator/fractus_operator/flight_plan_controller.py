@@ -1,0 +1,253 @@
+"""Controller of FlightPlans: carries out their steps one after another, and reports their status."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable
+from dataclasses import replace
+from datetime import datetime
+
+from fractus_core.api import Application, FlightPlan
+from fractus_core.api.conditions import merge_conditions
+from fractus_core.api.flight_plans import FlightPlanStatus
+from fractus_core.planning.inventory import Settings
+from fractus_core.planning.ordered_application import application_name
+
+from fractus_operator import kinds
+from fractus_operator.cache import ClusterCache
+from fractus_operator.flight_matching import SOON_S
+from fractus_operator.flight_plan_index import reserved_flight
+from fractus_operator.flight_plan_steps import STARTED, PlanSituation, PlanStep, plan_step
+from fractus_operator.flight_progress import FlownMission
+from fractus_operator.kinds import Body, Key, key_of
+from fractus_operator.labels import FINALIZER, LANDING_FINALIZER
+from fractus_operator.parsing import Submitted, Unreadable, parse_application, parse_object
+from fractus_operator.status_reporter import create_events, transition_events
+from fractus_operator.store import Conflict, ContentType, KubeError, NotFound, Store
+from fractus_operator.work_queue import WorkQueue
+
+log = logging.getLogger(__name__)
+
+DRY_RUN_S = 60.0
+"""Seconds for which a dry run is kept."""
+
+_FLYING = frozenset({"Activated", "Nonconforming", "Contingent"})
+
+
+class FlightPlanController:
+    """Decides FlightPlans one after another, creates and deletes their Applications, and follows their flights.
+
+    There is no await between reading the inventory and the airspace, the decision, and its reservation. Everything is derived
+    from observed objects, so an operator that was killed between two writes continues:
+
+    1. The status Activated is stored. It reserves drone and airspace.
+    2. The Application is created. Its name contains the uid of the plan, so it exists at most once.
+    3. The condition Started is stored. Afterwards the Application is never created again.
+
+    Attributes:
+        work_queue: Queue of plans. The caller runs it.
+    """
+
+    def __init__(
+        self, store: Store, cache: ClusterCache, clock: Callable[[], datetime], settings: Settings | None = None
+    ) -> None:
+        self.work_queue = WorkQueue("flight plan", self.reconcile, after=cache.synced)
+        self._store = store
+        self._cache = cache
+        self._clock = clock
+        self._settings = settings or Settings()
+        self._timers: dict[Key, asyncio.TimerHandle] = {}
+        self._seen: set[str] = set()
+        """Uids of plans whose Applications this process has observed."""
+
+    # -- changes of inputs --
+
+    def changed(self, key: Key) -> None:
+        """Handle a change of a plan, or of a plan that overlaps it."""
+        self.work_queue.add(key)
+
+    def application_changed(self, key: Key) -> None:
+        """Handle a change of an Application or of its DeploymentPlan."""
+        submitted = self._cache.applications.get(key)
+        uid = key[1].removeprefix(application_name(""))
+        if submitted is not None and _owned_by(submitted, uid):
+            self._seen.add(uid)
+        plan = self._cache.flights.key_of(uid)
+        if plan is not None:
+            self.work_queue.add(plan)
+
+    def drone_changed(self, key: Key) -> None:
+        """Handle a change of a drone. Plans that begin later are only matched again if the drone was deleted."""
+        now_s = self._clock().timestamp()
+        missing = self._cache.drone(key[1]) is None
+        for plan, reserved in self._cache.flights.on_drone(key[1]):
+            if missing or reserved.intent.state in _FLYING or reserved.begin_s - SOON_S <= now_s:
+                self.work_queue.add(plan)
+
+    # -- steps --
+
+    async def reconcile(self, key: Key) -> None:
+        """Take the next step of one plan. If the operator is killed at any point, the step can be repeated.
+
+        Raises:
+            KubeError: The API server refused a write, or could not be reached.
+        """
+        timer = self._timers.pop(key, None)
+        if timer is not None:
+            timer.cancel()
+        plan = self._cache.flight_plans.get(key)
+        if plan is None or isinstance(plan, Unreadable):
+            return
+        now = self._clock()
+        if plan.spec.dry_run and await self._expire(plan, now):
+            return
+        step = plan_step(self._situation(plan, now))
+        reserved = reserved_flight(plan.model_copy(update={"status": step.status}))
+        if reserved is not None:
+            self._cache.flights.decide(key, reserved)
+        try:
+            if step.status.state in _FLYING:
+                await self._set_finalizer(plan, wanted=True)
+            await self._report(plan, step, now)
+        except KubeError as error:
+            if 400 <= error.status < 500:
+                self._cache.flights.settle(key)
+            raise
+        self._cache.flights.settle(key)
+        if step.start is not None:
+            await self._start(key, step.start)
+        if step.end:
+            await self._store.delete(kinds.APPLICATION, (key[0], application_name(plan.metadata.uid or "")))
+        if step.status.state not in _FLYING:
+            await self._set_finalizer(plan, wanted=False)
+        loop = asyncio.get_running_loop()
+        self._timers[key] = loop.call_later(step.next_s, self.work_queue.add, key)
+
+    def _situation(self, plan: FlightPlan, now: datetime) -> PlanSituation:
+        now_s = now.timestamp()
+        template = self._cache.templates.get(("", plan.spec.template))
+        return PlanSituation(
+            plan,
+            template,
+            lambda: self._cache.flight_inventory(plan, now_s),
+            self._settings,
+            self._cache.flights.airspace,
+            self._mission(plan),
+            now_s,
+        )
+
+    def _mission(self, plan: FlightPlan) -> FlownMission:
+        """Return the Application of a plan, as observed."""
+        status = plan.status or FlightPlanStatus()
+        uid = plan.metadata.uid or ""
+        key = (plan.metadata.namespace or "", application_name(uid))
+        submitted = self._cache.applications.get(key)
+        if submitted is not None and not _owned_by(submitted, uid):
+            submitted = None
+        recorded = any(each.type == STARTED and each.status == "True" for each in status.conditions)
+        mission = FlownMission(started=submitted is not None or recorded or uid in self._seen)
+        record = None
+        if submitted is not None:
+            planned = self._cache.plans.latest(key, submitted.uid)
+            record = planned.flown if planned is not None else None
+            application = submitted.application
+            mission = replace(
+                mission,
+                exists=True,
+                leaving=submitted.metadata.deletion_timestamp is not None,
+                digest=application.spec.mission_digest if application is not None else None,
+                record=record,
+            )
+        drone = self._cache.drone(status.drone or "")
+        reported = drone.status if drone is not None else None
+        home = drone.spec.home if drone is not None else None
+        landed = record is not None and record.landed
+        return replace(
+            mission,
+            in_air=status.drone is not None and self._cache.fleet.is_in_flight(status.drone) and not landed,
+            position=reported.position if reported is not None else None,
+            home_m=home.alt if home is not None else None,
+        )
+
+    async def _expire(self, plan: FlightPlan, now: datetime) -> bool:
+        """Delete a dry run that is old enough. Return True if it was deleted."""
+        created = plan.metadata.creation_timestamp
+        if created is None or plan.status is None or (now - created).total_seconds() < DRY_RUN_S:
+            return False
+        await self._store.delete(kinds.FLIGHT_PLAN, (plan.metadata.namespace or "", plan.name), plan.metadata.uid)
+        return True
+
+    # -- writes --
+
+    async def _report(self, plan: FlightPlan, step: PlanStep, now: datetime) -> None:
+        """Write the status of a plan if it changed, and then an Event for each transition.
+
+        Raises:
+            KubeError: The API server refused the status, or could not be reached.
+        """
+        before = plan.status.conditions if plan.status is not None else ()
+        conditions, transitions = merge_conditions(before, step.conditions, plan.metadata.generation, now)
+        status = step.status.model_copy(update={"conditions": conditions})
+        if status == plan.status:
+            return
+        key = (plan.metadata.namespace or "", plan.name)
+        header = kinds.FLIGHT_PLAN.header(plan.name, key[0], uid=plan.metadata.uid)
+        body: Body = {**header, "status": status.to_dict()}
+        applied = await self._store.apply(kinds.FLIGHT_PLAN, body, subresource="status")
+        if parse_object(FlightPlan, applied).status != status:
+            # An apply does not remove fields of other writers, such as volumes that a user added.
+            applied = await self._store.replace_status(kinds.FLIGHT_PLAN, applied, status.to_dict())
+        self._cache.flight_plans.record_write(key_of(applied), applied)
+        log.info("flight plans: status written (plan=%s/%s state=%s)", *key, status.state)
+        await create_events(self._store, header, transition_events(transitions), now)
+
+    async def _start(self, plan: Key, application: Application) -> None:
+        """Create the Application of a plan. It gets the finalizer of Applications at once, so that no deletion is missed.
+
+        Raises:
+            KubeError: The API server refused the Application, or another Application has its name.
+        """
+        body = application.to_dict()
+        body["metadata"]["finalizers"] = [FINALIZER]
+        key = (plan[0], application.name)
+        owner = application.metadata.owner_references[0].uid
+        try:
+            created = await self._store.create(kinds.APPLICATION, body)
+        except Conflict:
+            created = await self._store.get(kinds.APPLICATION, application.name, plan[0])
+            present = parse_application(created)
+            digest = present.application.spec.mission_digest if present.application is not None else None
+            if not _owned_by(present, owner) or digest != application.spec.mission_digest:
+                message = f"Application {application.name} exists, but is not the flight of FlightPlan {'/'.join(plan)}; delete it"
+                raise KubeError(409, "NameTaken", message) from None
+        log.info("flight plans: Application created (plan=%s/%s application=%s)", *plan, application.name)
+        self._seen.add(owner)
+        self._cache.applications.record_write(key, created)
+        self.work_queue.add(plan)
+
+    async def _set_finalizer(self, plan: FlightPlan, *, wanted: bool) -> None:
+        """Add the finalizer of flying plans to a plan, or remove it."""
+        key = (plan.metadata.namespace or "", plan.name)
+        present = self._cache.flight_plans.get(key)
+        if present is None or isinstance(present, Unreadable):
+            return
+        finalizers = present.metadata.finalizers
+        has = LANDING_FINALIZER in finalizers
+        if has == wanted or (wanted and present.metadata.deletion_timestamp is not None):
+            return
+        kept = [each for each in finalizers if each != LANDING_FINALIZER]
+        changes = {
+            "finalizers": [*kept, LANDING_FINALIZER] if wanted else kept,
+            "resourceVersion": present.metadata.resource_version,
+        }
+        try:
+            patched = await self._store.patch(kinds.FLIGHT_PLAN, key, {"metadata": changes}, ContentType.MERGE)
+        except NotFound:
+            return
+        if not patched["metadata"].get("deletionTimestamp"):
+            self._cache.flight_plans.record_write(key, patched)
+
+
+def _owned_by(submitted: Submitted, uid: str) -> bool:
+    return any(owner.kind == FlightPlan.KIND and owner.uid == uid for owner in submitted.metadata.owner_references)

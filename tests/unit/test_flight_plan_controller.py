@@ -1,0 +1,376 @@
+"""Controller of flight plans: writes in their order, exactly one Application for each plan, and restarts of the operator."""
+
+from __future__ import annotations
+
+import copy
+import itertools
+from datetime import UTC, datetime
+from typing import Any
+
+import pytest
+from fractus_core.api.plans import DeploymentPlanSpec, MissionRecord
+from fractus_core.planning import Settings
+from fractus_operator import kinds
+from fractus_operator.cache import ClusterCache
+from fractus_operator.flight_plan_controller import FlightPlanController
+from fractus_operator.kinds import Body, Key, Kind
+from fractus_operator.labels import FINALIZER, LANDING_FINALIZER
+from fractus_operator.store import Conflict, KubeError, NotFound, Store
+from test_airspace_flights import located
+from test_flight_plan_steps import BEGIN_S, DAY_BEFORE_S, END_S, accepted
+from test_ordered_applications import flight, template
+from test_planning import inventory
+
+PLAN = ("team", "morning")
+FLIGHT = ("team", "flight-3e0a")
+
+
+class Killed(BaseException):
+    """The operator process ends."""
+
+
+class Api(Store):
+    """Fake API server. It can end the operator at a write, before or after the write takes effect.
+
+    Attributes:
+        writes: Method and kind of each write that took effect.
+        kill_at: Number of the write at which the operator is killed.
+        effective: True if this write takes effect.
+        lose_status: True if statuses are stored, but no response arrives.
+    """
+
+    def __init__(self) -> None:
+        self.field_manager = "test"
+        self.objects: dict[str, Body] = {}
+        self.writes: list[tuple[str, str]] = []
+        self.kill_at: int | None = None
+        self.effective = False
+        self.lose_status = False
+        self._attempts = 0
+        self._versions = itertools.count(1)
+
+    def put(self, kind: Kind, body: Body) -> None:
+        namespace = body["metadata"].get("namespace", "") if kind.namespaced else ""
+        body["metadata"].setdefault("uid", f"uid of {body['metadata']['name']}")
+        body["metadata"]["resourceVersion"] = str(next(self._versions))
+        self.objects[kind.path(namespace, body["metadata"]["name"])] = body
+
+    def find(self, kind: Kind, key: Key) -> Body | None:
+        return self.objects.get(kind.path(*key))
+
+    async def request(self, method: str, path: str, body: Any = None, **_: Any) -> Any:
+        target = path.removesuffix("/status")
+        if method == "GET":
+            if target not in self.objects:
+                raise NotFound(404, "NotFound", path)
+            return copy.deepcopy(self.objects[target])
+        if "/events" in path:
+            return {}
+        self._attempts += 1
+        if self._attempts == self.kill_at and not self.effective:
+            raise Killed
+        response = self._write(method, path, target, copy.deepcopy(body))
+        if self._attempts == self.kill_at:
+            raise Killed
+        if self.lose_status and path.endswith("/status"):
+            raise KubeError(0, "Unreachable", "no response")
+        return response
+
+    def _write(self, method: str, path: str, target: str, body: Any) -> Any:
+        if method == "POST":
+            target = f"{path}/{body['metadata']['name']}"
+            if target in self.objects:
+                raise Conflict(409, "AlreadyExists", target)
+            body["metadata"]["uid"] = f"uid of {target}"
+            body["metadata"]["generation"] = 1
+            self.objects[target] = body
+        elif target not in self.objects:
+            raise NotFound(404, "NotFound", path)
+        elif method == "DELETE":
+            self.writes.append((method, self.objects[target]["kind"]))
+            self.objects[target]["metadata"]["deletionTimestamp"] = "2027-01-15T08:00:00Z"
+            if not self.objects[target]["metadata"].get("finalizers"):
+                del self.objects[target]
+            return {"kind": "Status"}
+        elif path != target:
+            self.objects[target]["status"] = body["status"]
+        else:
+            self.objects[target]["metadata"]["finalizers"] = body["metadata"]["finalizers"]
+        self.objects[target]["metadata"]["resourceVersion"] = str(next(self._versions))
+        self.writes.append((method, self.objects[target]["kind"]))
+        return copy.deepcopy(self.objects[target])
+
+
+class World:
+    """A cluster with a drone, a template and flight plans."""
+
+    def __init__(self, *plans: Any, drones: Any = None) -> None:
+        self.api = Api()
+        self.now_s = DAY_BEFORE_S
+        stock = inventory(drones or [located("d")])
+        for drone in stock.drones.values():
+            self.api.put(kinds.DRONE, drone.to_dict())
+        for depot in stock.depots.values():
+            self.api.put(kinds.DEPOT, depot.to_dict())
+        for host in stock.hosts.values():
+            body = kinds.NODE.header(host.name, labels=dict(host.labels))
+            amounts = {name: str(amount) for name, amount in host.allocatable.items()}
+            ready = [{"type": "Ready", "status": "True"}]
+            self.api.put(kinds.NODE, body | {"status": {"allocatable": amounts, "conditions": ready}})
+        self.api.put(kinds.APPLICATION_TEMPLATE, template().to_dict())
+        for plan in plans or [flight(use="InUse")]:
+            self.api.put(kinds.FLIGHT_PLAN, plan.to_dict())
+        self.lead()
+
+    def lead(self) -> None:
+        """Start another operator that reads all objects."""
+        self.cache = ClusterCache(self.api)
+        self.controller = FlightPlanController(self.api, self.cache, self.clock, Settings())
+        self.cache.add_listener(kinds.APPLICATION, self.controller.application_changed)
+        for informer in self.cache.informers:
+            informer.synced.set()
+        self.watch()
+
+    def clock(self) -> datetime:
+        return datetime.fromtimestamp(self.now_s, UTC)
+
+    def watch(self) -> None:
+        """Deliver the present objects to the informers."""
+        watched = (
+            (kinds.NODE, self.cache.hosts), (kinds.DRONE, self.cache.drones), (kinds.DEPOT, self.cache.depots),
+            (kinds.APPLICATION_TEMPLATE, self.cache.templates), (kinds.FLIGHT_PLAN, self.cache.flight_plans),
+            (kinds.APPLICATION, self.cache.applications),
+        )  # fmt: skip
+        for kind, informer in watched:
+            bodies = {
+                (b["metadata"].get("namespace", ""), b["metadata"]["name"]): b
+                for b in self.api.objects.values()
+                if b["kind"] == kind.name
+            }
+            for key, body in bodies.items():
+                informer.record_write(key, copy.deepcopy(body))
+            for key in [key for key, _ in informer.items() if key not in bodies]:
+                informer._drop(key)
+
+    async def step(self, key: Key = PLAN, times: int = 1) -> Body:
+        """Take steps of a plan, and return its status."""
+        for _ in range(times):
+            await self.controller.reconcile(key)
+            self.watch()
+        return self.status(key)
+
+    def status(self, key: Key = PLAN) -> Body:
+        return (self.api.find(kinds.FLIGHT_PLAN, key) or {}).get("status") or {}
+
+    def change(self, kind: Kind, key: Key, **fields: Any) -> None:
+        body = self.api.find(kind, key)
+        assert body is not None
+        body["spec"] |= fields
+        body["metadata"]["generation"] += 1
+        self.api.put(kind, body)
+        self.watch()
+
+    def flies(self, state: str) -> None:
+        body = self.api.find(kinds.DRONE, ("", "d"))
+        assert body is not None
+        body["status"]["flightState"] = state
+        self.api.put(kinds.DRONE, body)
+        self.watch()
+
+    def application(self) -> Body | None:
+        return self.api.find(kinds.APPLICATION, FLIGHT)
+
+    def created(self) -> int:
+        return self.api.writes.count(("POST", "Application"))
+
+
+async def started() -> World:
+    world = World()
+    await world.step()
+    world.now_s = BEGIN_S
+    await world.step(times=2)
+    assert world.application() is not None
+    return world
+
+
+def plan_named(name: str, uid: str, **spec: Any) -> Any:
+    plan = flight(**spec)
+    return plan.model_copy(update={"metadata": plan.metadata.model_copy(update={"name": name, "uid": uid})})
+
+
+async def test_accepted_plan_reserves_its_drone_for_other_applications() -> None:
+    world = World()
+    assert (await world.step())["state"] == "Accepted"
+    ((drone, (reservation,)),) = world.cache.snapshot(("team", "other"), "u").reservations.items()
+    assert (drone, reservation.holder, reservation.begin_s) == ("d", "team/morning", BEGIN_S)
+
+
+@pytest.mark.parametrize("lost", [False, True])
+async def test_second_plan_is_rejected_also_if_the_response_to_the_first_write_was_lost(lost: bool) -> None:
+    world = World(flight(), plan_named("noon", "u2"))
+    world.api.lose_status = lost
+    if lost:
+        with pytest.raises(KubeError):
+            await world.controller.reconcile(PLAN)
+        world.api.lose_status = False
+    else:
+        await world.step()
+    await world.controller.reconcile(("team", "noon"))
+    assert world.status()["state"] == "Accepted"
+    assert world.status(("team", "noon"))["state"] == "Rejected"
+
+
+async def test_plan_starts_at_its_time_with_one_application() -> None:
+    world = await started()
+    body = world.application()
+    assert body is not None
+    assert body["metadata"]["finalizers"] == [FINALIZER]
+    assert body["metadata"]["ownerReferences"][0]["uid"] == "3e0a"
+    status = world.status()
+    assert (status["state"], status["application"]) == ("Activated", "flight-3e0a")
+    assert {c["type"]: c["status"] for c in status["conditions"]}["Started"] == "True"
+    plan = world.api.find(kinds.FLIGHT_PLAN, PLAN)
+    assert plan is not None
+    assert plan["metadata"]["finalizers"] == [LANDING_FINALIZER]
+    writes = len(world.api.writes)
+    await world.step(times=3)
+    assert len(world.api.writes) == writes, "an unchanged plan is not written again"
+
+
+@pytest.mark.parametrize("effective", [False, True])
+@pytest.mark.parametrize("write", range(1, 6))
+async def test_operator_killed_at_any_write_starts_the_flight_exactly_once(write: int, effective: bool) -> None:
+    world = World()
+    world.api.kill_at = write
+    world.api.effective = effective
+    killed = False
+    for now_s in (DAY_BEFORE_S, BEGIN_S, BEGIN_S + 1, BEGIN_S + 2, BEGIN_S + 3):
+        world.now_s = now_s
+        try:
+            await world.controller.reconcile(PLAN)
+            world.watch()
+        except Killed:
+            killed = True
+            world.lead()
+    assert killed
+    assert (world.created(), world.status()["state"]) == (1, "Activated")
+
+
+async def test_application_deleted_by_a_user_is_not_created_again_by_the_next_operator() -> None:
+    world = await started()
+    del world.api.objects[kinds.APPLICATION.path(*FLIGHT)]
+    world.lead()
+    status = await world.step()
+    assert (status["state"], status["message"]) == ("Ended", "the Application was deleted")
+    await world.step(times=2)
+    assert world.created() == 1
+
+
+async def test_application_deleted_before_it_was_recorded_is_not_created_again() -> None:
+    world = World()
+    await world.step()
+    world.now_s = BEGIN_S
+    await world.step()
+    body = world.application()
+    assert body is not None
+    body["metadata"]["deletionTimestamp"] = "2027-01-15T08:00:01Z"
+    world.lead()
+    del world.api.objects[kinds.APPLICATION.path(*FLIGHT)]
+    world.watch()
+    assert (await world.step())["state"] == "Ended"
+    assert world.created() == 1
+
+
+async def test_closed_plan_keeps_its_airspace_until_the_landing() -> None:
+    world = await started()
+    world.flies("flying")
+    world.change(kinds.FLIGHT_PLAN, PLAN, use="Closed")
+    assert (await world.step())["state"] == "Contingent"
+    assert ("DELETE", "Application") in world.api.writes
+    del world.api.objects[kinds.APPLICATION.path(*FLIGHT)]
+    world.watch()
+    world.now_s = END_S + 60
+    assert (await world.step())["state"] == "Contingent"
+    assert world.cache.flights.get(PLAN) is not None
+    world.flies("inactive")
+    assert (await world.step())["state"] == "Ended"
+    assert world.cache.flights.get(PLAN) is None
+    plan = world.api.find(kinds.FLIGHT_PLAN, PLAN)
+    assert plan is not None
+    assert plan["metadata"]["finalizers"] == []
+
+
+async def test_deleted_plan_ends_its_flight() -> None:
+    world = await started()
+    world.flies("flying")
+    await world.api.delete(kinds.FLIGHT_PLAN, PLAN)
+    world.watch()
+    assert (await world.step())["state"] == "Contingent"
+    assert ("DELETE", "Application") in world.api.writes
+
+
+async def test_plan_follows_the_record_of_its_mission() -> None:
+    world = await started()
+    body = world.application()
+    assert body is not None
+    world.flies("flying")
+    record = MissionRecord(outcome="Failed", message="the battery is low")
+    planned = DeploymentPlanSpec(application="flight-3e0a", flown=record)
+    world.cache.plans.decide(FLIGHT, body["metadata"]["uid"], planned)
+    status = await world.step()
+    assert (status["state"], status["message"]) == (
+        "Contingent",
+        "the system ends the flight of d: the battery is low",
+    )
+
+
+async def test_application_of_plan_gets_the_reserved_drone() -> None:
+    world = await started()
+    assert world.cache.reserved_drone(FLIGHT) == "d"
+    assert world.cache.snapshot(FLIGHT, "u").reservations["d"] == []
+
+
+async def test_application_that_names_a_plan_as_its_owner_gets_no_reserved_drone() -> None:
+    world = await started()
+    body = copy.deepcopy(world.application())
+    assert body is not None
+    body["metadata"]["name"] = "thief"
+    world.api.put(kinds.APPLICATION, body)
+    world.watch()
+    assert world.cache.reserved_drone(("team", "thief")) is None
+    assert world.cache.snapshot(("team", "thief"), "u").reservations["d"]
+
+
+async def test_other_application_with_the_name_of_the_flight_is_not_adopted() -> None:
+    world = World()
+    await world.step()
+    foreign = kinds.APPLICATION.header("flight-3e0a", "team", generation=1) | {"spec": {"components": []}}
+    world.api.put(kinds.APPLICATION, foreign)
+    world.now_s = BEGIN_S
+    with pytest.raises(KubeError, match="is not the flight of FlightPlan team/morning; delete it"):
+        await world.controller.reconcile(PLAN)
+
+
+async def test_dry_run_is_decided_without_a_reservation_and_deleted() -> None:
+    plan = flight(dryRun=True, autoActivate=True)
+    created = datetime.fromtimestamp(DAY_BEFORE_S, UTC)
+    plan = plan.model_copy(update={"metadata": plan.metadata.model_copy(update={"creation_timestamp": created})})
+    world = World(plan)
+    assert (await world.step())["state"] == "Accepted"
+    assert world.cache.flights.get(PLAN) is None
+    world.now_s += 61
+    await world.step()
+    assert world.api.find(kinds.FLIGHT_PLAN, PLAN) is None
+
+
+async def test_dry_run_is_never_flown() -> None:
+    world = World(flight(dryRun=True, autoActivate=True))
+    await world.step()
+    world.now_s = BEGIN_S
+    await world.step(times=2)
+    assert world.created() == 0
+
+
+async def test_next_operator_knows_all_reservations() -> None:
+    world = World(accepted(), plan_named("noon", "u2"))
+    assert (await world.step(("team", "noon")))["state"] == "Rejected"

@@ -101,7 +101,8 @@ def match_flight(
         application = ordered_application(flight, template)
         check_application(application, inventory.depots)
         planned = _planned(application, inventory, settings, flight.spec.drone, preferred)
-        assert planned.drone is not None
+        if planned.drone is None:
+            raise Unfit("Invalid", f"no component of ApplicationTemplate {template.name} runs on a drone")
         drone = inventory.drones[planned.drone.node]
         # The Grants limit a flight only by the maximum altitude of the drone, so nothing smaller may be reserved.
         volumes = flight_volumes(application, drone, inventory, settings, begin_s=begin_s, end_s=window.end_s)

@@ -9,7 +9,7 @@ from dataclasses import replace
 from datetime import datetime
 
 from fractus_core.api import Application, FlightPlan
-from fractus_core.api.conditions import merge_conditions
+from fractus_core.api.conditions import ConditionUpdate, merge_conditions
 from fractus_core.api.flight_plans import FlightPlanStatus
 from fractus_core.planning.inventory import Settings
 from fractus_core.planning.ordered_application import application_name
@@ -116,7 +116,7 @@ class FlightPlanController:
             raise
         self._cache.flights.settle(key)
         if step.start is not None:
-            await self._start(key, step.start)
+            await self._start(plan, step.start)
         if step.end:
             await self._store.delete(kinds.APPLICATION, (key[0], application_name(plan.metadata.uid or "")))
         if step.status.state not in _FLYING:
@@ -165,6 +165,7 @@ class FlightPlanController:
         landed = record is not None and record.landed
         return replace(
             mission,
+            drone_exists=drone is not None,
             in_air=status.drone is not None and self._cache.fleet.is_in_flight(status.drone) and not landed,
             position=reported.position if reported is not None else None,
             home_m=home.alt if home is not None else None,
@@ -202,29 +203,44 @@ class FlightPlanController:
         log.info("flight plans: status written (plan=%s/%s state=%s)", *key, status.state)
         await create_events(self._store, header, transition_events(transitions), now)
 
-    async def _start(self, plan: Key, application: Application) -> None:
-        """Create the Application of a plan. It gets the finalizer of Applications at once, so that no deletion is missed.
+    async def _start(self, plan: FlightPlan, application: Application) -> None:
+        """Create the Application of a plan, and report a failure by an Event.
 
         Raises:
             KubeError: The API server refused the Application, or another Application has its name.
         """
+        key = (plan.metadata.namespace or "", plan.name)
+        try:
+            created = await self._create(application, plan)
+        except KubeError as error:
+            failed = ConditionUpdate(STARTED, "False", error.reason, f"the Application is not created: {error}")
+            header = kinds.FLIGHT_PLAN.header(plan.name, key[0], uid=plan.metadata.uid)
+            await create_events(self._store, header, [failed], self._clock())
+            raise
+        log.info("flight plans: Application created (plan=%s/%s application=%s)", *key, application.name)
+        self._seen.add(plan.metadata.uid or "")
+        self._cache.applications.record_write((key[0], application.name), created)
+        self.work_queue.add(key)
+
+    async def _create(self, application: Application, plan: FlightPlan) -> Body:
+        """Create the Application of a plan, or return the one that exists.
+
+        The Application gets the finalizer of Applications at once, so that its deletion is always observed.
+        """
         body = application.to_dict()
         body["metadata"]["finalizers"] = [FINALIZER]
-        key = (plan[0], application.name)
-        owner = application.metadata.owner_references[0].uid
         try:
-            created = await self._store.create(kinds.APPLICATION, body)
+            return await self._store.create(kinds.APPLICATION, body)
         except Conflict:
-            created = await self._store.get(kinds.APPLICATION, application.name, plan[0])
-            present = parse_application(created)
-            digest = present.application.spec.mission_digest if present.application is not None else None
-            if not _owned_by(present, owner) or digest != application.spec.mission_digest:
-                message = f"Application {application.name} exists, but is not the flight of FlightPlan {'/'.join(plan)}; delete it"
-                raise KubeError(409, "NameTaken", message) from None
-        log.info("flight plans: Application created (plan=%s/%s application=%s)", *plan, application.name)
-        self._seen.add(owner)
-        self._cache.applications.record_write(key, created)
-        self.work_queue.add(plan)
+            existing = await self._store.get(kinds.APPLICATION, application.name, plan.metadata.namespace or "")
+        present = parse_application(existing)
+        digest = present.application.spec.mission_digest if present.application is not None else None
+        if not _owned_by(present, plan.metadata.uid or "") or digest != application.spec.mission_digest:
+            message = (
+                f"Application {application.name} exists, but is not the flight of FlightPlan {plan.name}; delete it"
+            )
+            raise KubeError(409, "NameTaken", message)
+        return existing
 
     async def _set_finalizer(self, plan: FlightPlan, *, wanted: bool) -> None:
         """Add the finalizer of flying plans to a plan, or remove it."""

@@ -191,7 +191,7 @@ def _follow_accepted(now: PlanSituation) -> PlanStep:
     if now.now_s > now.end_s:
         return _ended(now, "the window ended without a flight")
     soon = begin_s - SOON_S <= now.now_s
-    if soon or now.status.drone not in now.inventory().drones:
+    if soon or not now.mission.drone_exists:
         return _rematch(now)
     return replace(_keep(now), next_s=_until_start_s(now))
 
@@ -290,7 +290,11 @@ def _follow_flight(now: PlanSituation) -> PlanStep:
     off_nominal: tuple[ReservedVolume, ...] = ()
     if progress.state in OFF_NOMINAL:
         off_nominal = off_nominal_volumes(now.mission, now.status, now.now_s)
-    status = now.status.model_copy(
+    status = now.status
+    if now.changed and not now.closing:
+        # The present version describes the flight, also if an earlier change was refused.
+        status = status.model_copy(update={"decided_for": now.plan.metadata.generation, "refusals": ()})
+    status = status.model_copy(
         update={
             "observed_generation": now.plan.metadata.generation,
             "state": progress.state,

@@ -33,6 +33,7 @@ class FlownMission:
         leaving: True if it is being deleted.
         digest: Digest of its mission, or None if it does not exist or is invalid.
         record: Record of its mission, or None before the takeoff.
+        drone_exists: True if the Drone of the plan exists.
         in_air: True if the drone of the plan is in the air.
         position: Last reported position of the drone.
         home_m: Ground elevation of the home of the drone above mean sea level, if known.
@@ -43,6 +44,7 @@ class FlownMission:
     leaving: bool = False
     digest: str | None = None
     record: MissionRecord | None = None
+    drone_exists: bool = True
     in_air: bool = False
     position: Position | None = None
     home_m: float | None = None

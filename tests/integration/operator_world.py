@@ -262,7 +262,16 @@ class World:
         for pod in self.api.list("/api/v1/pods"):
             path = f"/api/v1/namespaces/{pod['metadata']['namespace']}/pods/{pod['metadata']['name']}"
             self._delete(path, grace_s=0)
-        for plural in ("drones", "edgenodes", "depots", "zones", "policies", "grants", "directlinks"):
+        for plural in (
+            "drones",
+            "edgenodes",
+            "depots",
+            "zones",
+            "policies",
+            "grants",
+            "directlinks",
+            "applicationtemplates",
+        ):
             for item in self.api.list(f"{FRACTUS}/{plural}"):
                 self._delete(f"{FRACTUS}/{plural}/{item['metadata']['name']}")
         for path in NODE_OBJECTS:

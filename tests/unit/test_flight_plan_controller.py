@@ -347,7 +347,7 @@ async def test_other_application_with_the_name_of_the_flight_is_not_adopted() ->
     foreign = kinds.APPLICATION.header("flight-3e0a", "team", generation=1) | {"spec": {"components": []}}
     world.api.put(kinds.APPLICATION, foreign)
     world.now_s = BEGIN_S
-    with pytest.raises(KubeError, match="is not the flight of FlightPlan team/morning; delete it"):
+    with pytest.raises(KubeError, match="is not the flight of FlightPlan morning; delete it"):
         await world.controller.reconcile(PLAN)
 
 
@@ -369,6 +369,14 @@ async def test_dry_run_is_never_flown() -> None:
     world.now_s = BEGIN_S
     await world.step(times=2)
     assert world.created() == 0
+
+
+async def test_deleted_drone_is_replaced_long_before_the_flight() -> None:
+    world = World(drones=[located("d"), located("e", battery=0.5)])
+    assert (await world.step())["drone"] == "d"
+    del world.api.objects[kinds.DRONE.path("", "d")]
+    world.watch()
+    assert (await world.step())["drone"] == "e"
 
 
 async def test_next_operator_knows_all_reservations() -> None:

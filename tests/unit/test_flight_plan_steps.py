@@ -200,7 +200,8 @@ def test_accepted_change_replaces_the_volumes():
 
 def test_lost_drone_is_replaced_before_the_flight():
     plan = accepted()
-    step = plan_step(situation(plan, stock=inventory([located("e")])))
+    lost = FlownMission(drone_exists=False)
+    step = plan_step(situation(plan, stock=inventory([located("e")]), mission=lost))
     assert (step.status.state, step.status.drone) == ("Accepted", "e")
 
 
@@ -366,6 +367,15 @@ def test_place_of_flight_cannot_change_after_its_start():
     moved = changed(activated(), waypoints=[at(10, 10, 20)])
     step = flown(moved, in_air=True, position=position(0, 0))
     assert conditions(step)["ChangeRefused"] == ("True", "ChangeNotPermitted")
+
+
+def test_undone_change_in_flight_is_no_longer_reported_as_refused():
+    moved = changed(activated(), waypoints=[at(10, 10, 20)])
+    plan = stored(moved, flown(moved, in_air=True, position=position(0, 0)))
+    undone = changed(plan, 3, waypoints=flight().to_dict()["spec"]["waypoints"])
+    step = flown(undone, in_air=True, position=position(0, 0))
+    assert "ChangeRefused" not in conditions(step)
+    assert step.status.decided_for == 3
 
 
 def test_end_of_window_can_change_in_flight():

@@ -104,7 +104,7 @@ def match_flight(
         if planned.drone is None:
             raise Unfit("Invalid", f"no component of ApplicationTemplate {template.name} runs on a drone")
         drone = inventory.drones[planned.drone.node]
-        # The Grants limit a flight only by the maximum altitude of the drone, so nothing smaller may be reserved.
+        # Grants have a maximum altitude but no minimum altitude, so the volumes begin at the ground.
         volumes = flight_volumes(application, drone, inventory, settings, begin_s=begin_s, end_s=window.end_s)
         return Match(
             application,

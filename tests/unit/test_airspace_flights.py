@@ -200,3 +200,15 @@ def test_application_without_drone_component_is_refused():
 def test_flight_over_the_maximum_distance_is_refused():
     with pytest.raises(InvalidObject, match="divide the flight into shorter flights"):
         volumes(application(navigator([at(100, 0, 10), at(65_000, 0, 10)])), end_s=BEGIN_S + 86_400)
+
+
+@pytest.mark.parametrize(("limit_m", "expected_m"), [(40, 40), (500, 80)])
+def test_maximum_altitude_of_application_limits_its_volumes(limit_m, expected_m):
+    app = application(navigator(PATH))
+    limited = app.model_copy(update={"spec": app.spec.model_copy(update={"max_altitude": limit_m})})
+    (volume,) = volumes(limited)
+    assert volume.upper_m == pytest.approx(GROUND_M + expected_m + HEIGHT_MARGIN_M)
+    granted = flight_grant(
+        limited, located(), inventory([located()]), operation_area(app.spec, inventory().depots, SAFETY_M)
+    )
+    assert granted.limits.max_altitude == expected_m

@@ -83,6 +83,14 @@ def test_parameters_are_an_environment_variable_of_every_container():
     assert not ordered_application(flight(), template()).spec.components[0].container.env
 
 
+@pytest.mark.parametrize(("own", "expected"), [(None, 40), (30, 30), (90, 40)])
+def test_flight_stays_below_the_altitude_of_the_template(own, expected):
+    base = template()
+    limited = {"maxAltitude": own} if own is not None else {}
+    app = ordered_application(flight(), template(template=base.spec.template.to_dict() | limited))
+    assert app.spec.max_altitude == expected
+
+
 def test_actions_of_plan_override_those_of_the_template():
     base = template()
     spec = base.spec.template.to_dict() | {

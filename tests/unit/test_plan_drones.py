@@ -169,3 +169,11 @@ def test_later_flight_ignores_present_state_but_not_missing_services():
     assert plan(application(navigator(PATH)), stocked, later).drone.node == "d"
     with pytest.raises(Infeasible, match="Takeoff"):
         plan(application(navigator(PATH)), inventory([drone("d", methods=["Arm"])]), later)
+
+
+def test_path_above_the_maximum_altitude_of_the_application_is_rejected():
+    app = application(navigator([at(100, 0, 30)]))
+    low = app.model_copy(update={"spec": app.spec.model_copy(update={"max_altitude": 29})})
+    assert plan(app, inventory([drone("d")])).drone.node == "d"
+    with pytest.raises(Infeasible, match="it climbs to 29 m; the path goes up to 30 m"):
+        plan(low, inventory([drone("d")]))

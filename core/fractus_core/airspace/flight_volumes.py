@@ -17,7 +17,7 @@ from fractus_core.geo import area_polygon, ground_point
 from fractus_core.planning.grant_compiler import flight_grant, stand_of
 from fractus_core.planning.inventory import Inventory, Settings
 from fractus_core.planning.landing_places import landing_places
-from fractus_core.planning.mission import MissionEstimator
+from fractus_core.planning.mission import MissionEstimator, altitude_limit_m
 from fractus_core.planning.operation_area import OperationArea, operation_area
 from fractus_core.policy.compiled_grant import altitude_above_home_m
 from fractus_core.policy.decision_types import Home, Situation
@@ -60,7 +60,7 @@ def flight_volumes(
         begin_s: Start of the window in seconds since 1970 UTC.
         end_s: End of the window, at which the drone is home again.
         floor_m: Lowest altitude above home at a distance from depot and landing places; None: the ground.
-        ceiling_m: Highest altitude above home; None: the maximum altitude of the drone.
+        ceiling_m: Highest altitude above home; None: the maximum altitude of application and drone.
 
     Raises:
         InvalidObject: The application does not fly, an altitude is unknown or outside the limits, the mission takes longer
@@ -69,7 +69,7 @@ def flight_volumes(
     area = operation_area(application.spec, inventory.depots, settings.safety_radius_m)
     if area is None:
         raise InvalidObject("components", "no component runs on a drone; a flight needs one")
-    limits = _altitude_limits(drone, floor_m, ceiling_m)
+    limits = _altitude_limits(application, drone, floor_m, ceiling_m)
     _check_altitudes(area, limits, settings)
     mission = MissionEstimator(application.spec, area, settings).estimate(limits.place, drone)
     _check_duration(mission.needed_min * 60, end_s - begin_s)
@@ -103,7 +103,9 @@ class _AltitudeLimits:
     ceiling_m: float
 
 
-def _altitude_limits(drone: Drone, floor_m: float | None, ceiling_m: float | None) -> _AltitudeLimits:
+def _altitude_limits(
+    application: Application, drone: Drone, floor_m: float | None, ceiling_m: float | None
+) -> _AltitudeLimits:
     mobility = drone.spec.services.mobility
     home = drone.spec.home
     if mobility is None:
@@ -114,7 +116,7 @@ def _altitude_limits(drone: Drone, floor_m: float | None, ceiling_m: float | Non
         raise InvalidObject(
             "home", f"the ground elevation of the home of Drone {drone.name} is unknown; set spec.home with alt"
         )
-    highest_m = mobility.max_altitude if ceiling_m is None else ceiling_m
+    highest_m = altitude_limit_m(application.spec, mobility) if ceiling_m is None else ceiling_m
     lowest_m = 0.0 if floor_m is None else floor_m
     # A negated comparison, so that NaN is refused.
     if not 0 <= lowest_m < highest_m <= mobility.max_altitude:

@@ -81,6 +81,12 @@ class ApplicationSpec(Model):
         default=None,
         description="Reaction when the drone loses contact with the API server; unset: the mission continues.",
     )
+    max_altitude: float | None = Field(
+        default=None,
+        gt=0,
+        le=20_000,
+        description="Maximum altitude of the flight in metres above home; unset: that of the drone.",
+    )
     update_policy: Literal["OnGround", "Immediate"] = Field(
         default="OnGround",
         description="When changes of a running application take effect. OnGround: after the drone has landed. Immediate: also"

@@ -19,6 +19,7 @@ from fractus_core.planning.legality import MAX_ROUTES, MissionRoute, RouteJudge
 from fractus_core.planning.mission import (
     Estimate,
     MissionEstimator,
+    altitude_limit_m,
     first_missed,
     home_of,
     remaining_minutes,
@@ -295,8 +296,9 @@ def _check_permanent(
     if mobility is None:
         # Components may not request the service: without a driver, the system flies the drone.
         return SUITABLE if kept else Check("ServiceMissing", "it has no mobility service, which every flight requires")
-    if mission.top_m > mobility.max_altitude:
-        message = f"it climbs to {mobility.max_altitude:g} m; the path goes up to {mission.top_m:g} m"
+    highest_m = altitude_limit_m(builder.spec, mobility)
+    if mission.top_m > highest_m:
+        message = f"it climbs to {highest_m:g} m; the path goes up to {mission.top_m:g} m"
         return Check("TooHigh", message)
     full = (1 - builder.settings.battery_reserve) * mobility.max_flight_time
     if not kept and mission.needed_min > full:

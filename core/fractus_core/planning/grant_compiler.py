@@ -30,6 +30,7 @@ from fractus_core.geo import (
     ground_point,
 )
 from fractus_core.planning.inventory import Inventory, Settings
+from fractus_core.planning.mission import altitude_limit_m
 from fractus_core.planning.operation_area import MAX_CROSSINGS, OperationArea, operation_area
 from fractus_core.policy.decision_types import distinct
 from fractus_core.policy.engine import PICTURE_METHODS
@@ -171,6 +172,10 @@ def _drone_grant(
     shape = _outlined(area.shape)
     stand = area_polygon(area.frame, stand_of(drone, inventory.depots, area))
     corridor = shapely.union(shape, stand).convex_hull
+    limits = None
+    if mobility is not None:
+        highest_m = altitude_limit_m(application.spec, mobility)
+        limits = GrantedLimits(max_altitude=highest_m, max_speed=mobility.max_speed)
     return GrantSpec(
         node=drone.name,
         application=application_reference(application),
@@ -180,7 +185,7 @@ def _drone_grant(
         corridor=areas_of_shape(area.frame, corridor.simplify(ROUNDING_M)),
         depot=depot.spec.location if depot is not None else None,
         home=drone.spec.home,
-        limits=GrantedLimits(max_altitude=mobility.max_altitude, max_speed=mobility.max_speed) if mobility else None,
+        limits=limits,
         contact_lost=application.spec.contact_lost,
     )
 

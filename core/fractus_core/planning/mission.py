@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from fractus_core.api.applications import Application, ApplicationSpec
 from fractus_core.api.geometry import Point, Position, Reference
-from fractus_core.api.nodes import Depot, Drone
+from fractus_core.api.nodes import Depot, Drone, MobilityFeatures
 from fractus_core.api.plans import TransitLeg
 from fractus_core.exhaustive import exhaustive
 from fractus_core.geo import LocalFrame, center_of, distance_m
@@ -111,6 +111,12 @@ def remaining_minutes(drone: Drone) -> float:
         return 0.0
     battery = drone.status.battery if drone.status else None
     return mobility.max_flight_time * (battery.remaining if battery else 1.0)
+
+
+def altitude_limit_m(spec: ApplicationSpec, mobility: MobilityFeatures) -> float:
+    """Return the maximum altitude of a flight in metres above home: the lower limit of application and drone."""
+    limit_m: float = mobility.max_altitude
+    return limit_m if spec.max_altitude is None else min(limit_m, spec.max_altitude)
 
 
 def stay_minutes(spec: ApplicationSpec) -> float:

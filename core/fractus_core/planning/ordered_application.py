@@ -43,8 +43,10 @@ def ordered_application(plan: FlightPlan, template: ApplicationTemplate) -> Appl
         _with_parameters(_led(each, plan.spec) if each is leader else each, plan.spec) for each in spec.components
     ]
     selected = {action.policy: action for action in (*spec.policy_actions, *plan.spec.policy_actions)}
+    highest_m = template.spec.altitudes.upper
     changed = spec.model_copy(
         update={
+            "max_altitude": highest_m if spec.max_altitude is None else min(highest_m, spec.max_altitude),
             "components": tuple(components),
             "policy_actions": tuple(selected.values()),
             "contact_lost": plan.spec.contact_lost or spec.contact_lost,

@@ -20,6 +20,7 @@ from control_plane import ControlPlane, wait_for
 from fractus_cluster.ports import free_port
 from operator_world import OperatorProcess, World, traffic
 from test_operator import deployed, end_mission, gone
+from test_operator_flight_plans import approved_template, started, status, submit
 
 EXPECTED = {
     "application is taken": {"PATCH applications", "PATCH applications/status", "POST deploymentplans"},
@@ -181,8 +182,8 @@ def test_operator_killed_after_any_write_reaches_same_state(
         wait_for(lambda: sum(name.startswith("secrets/") for name in world.children(namespace)) == 7, operator.log, 600)
         world.run_pods(namespace)
         wait_for(lambda: world.condition(namespace, "Ready").get("status") == "True", operator.log, 600)
-        status = deployed(world, namespace)
-        assert (status["drone"], status["pods"]) == ("drone-1", "7/7")
+        ready = deployed(world, namespace)
+        assert (ready["drone"], ready["pods"]) == ("drone-1", "7/7")
         grants = [grant["spec"]["instance"] for grant in world.grants(namespace)]
         assert len(grants) == len(set(grants)) == 4
         assert len(world.pods(namespace)) == 7
@@ -197,3 +198,31 @@ def test_operator_killed_after_any_write_reaches_same_state(
         wait_for(lambda: gone(world, namespace) and not world.pods(namespace), operator.log, 600)
         for when, steps in EXPECTED.items():
             assert steps <= set(points.reached), f"{when}: {steps - set(points.reached)}"
+
+
+@pytest.mark.timeout(600)
+@pytest.mark.parametrize(
+    "write",
+    [
+        "POST applications",
+        pytest.param("PATCH flightplans/status", marks=pytest.mark.slow),
+        pytest.param("PATCH flightplans", marks=pytest.mark.slow),
+    ],
+)
+def test_operator_killed_after_write_for_flight_plan_starts_the_flight_once(
+    control_plane: ControlPlane, world: World, namespace: str, tmp_path: Path, write: str
+) -> None:
+    approved_template(world)
+    with killed_after_writes(control_plane, tmp_path, {write}) as (operator, points):
+        submit(world, namespace, in_s=5, autoActivate=True)
+        wait_for(lambda: started(world, namespace), operator.log, 120)
+        assert write in points.reached
+        applications = f"/apis/fractus.dev/v1alpha1/namespaces/{namespace}/applications"
+        (application,) = world.api.list(applications)
+        plan = world.api.get(f"/apis/fractus.dev/v1alpha1/namespaces/{namespace}/flightplans/flight")
+        assert plan is not None
+        assert application["metadata"]["name"] == f"flight-{plan['metadata']['uid']}"
+        world.api.delete(f"{applications}/{application['metadata']['name']}")
+        wait_for(lambda: not world.api.list(applications), operator.log, 120)
+        wait_for(lambda: status(world, namespace).get("state") == "Ended", operator.log, 120)
+        assert not world.api.list(applications)

@@ -38,6 +38,12 @@ def status(world: World, namespace: str, name: str = "flight") -> Body:
     return (plan or {}).get("status") or {}
 
 
+def started(world: World, namespace: str) -> bool:
+    """Return True if the operator has recorded that the Application of the plan was created."""
+    conditions = status(world, namespace).get("conditions") or ()
+    return any((each["type"], each["status"]) == ("Started", "True") for each in conditions)
+
+
 def reaches(world: World, namespace: str, state: str, name: str = "flight") -> Body:
     wait_for(
         lambda: status(world, namespace, name).get("state") == state,
@@ -71,8 +77,6 @@ def test_plan_flies_at_its_time_and_ends_with_its_mission(
     path = f"{FRACTUS}/grants/{world.grants(namespace, name)[0]['metadata']['name']}/status"
     world.api.merge(path, {"status": {"phase": "Complete", "message": "all waypoints reached"}})
     assert "all waypoints reached" in reaches(world, namespace, "Ended")["message"]
-    plan = world.api.get(f"{FRACTUS}/namespaces/{namespace}/flightplans/flight")
-    assert plan is not None
     wait_for(lambda: world.status(namespace).get("drone") == "drone-1", "the other Application to get the drone")
 
 

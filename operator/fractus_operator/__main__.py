@@ -39,6 +39,7 @@ from fractus_operator.service_rollout import ServiceRollout
 from fractus_operator.settings import BadSetting, Settings
 from fractus_operator.standby import health_endpoint, wait_for_kinds
 from fractus_operator.store import KubeError, LeaseThread, LostLease, Store, Unconfigured
+from fractus_operator.template_controller import TemplateController
 from fractus_operator.work_queue import WorkQueue, run_periodically
 
 log = logging.getLogger("fractus_operator")
@@ -160,6 +161,7 @@ def work_queues(
     policies = PolicyController(store, cache, _now)
     missions = MissionConditionController(store, cache, conditions, _now)
     events = DroneEventRecorder(store, cache, missions.granted_applications, _now)
+    templates = WorkQueue("template", TemplateController(store, cache, _now).reconcile)
     node_queue = WorkQueue("node", NodeLabelController(store, cache).reconcile, after=cache.synced)
     csr_queue = WorkQueue("signing request", csr.reconcile)
     zone_queue = WorkQueue("zone", policies.reconcile_zone)
@@ -191,6 +193,7 @@ def work_queues(
     listeners: list[tuple[Kind, Callable[[Key], None]]] = [
         *((kind, node_queue.add) for kind in (kinds.NODE, kinds.DRONE, kinds.EDGE_NODE)),
         (kinds.SIGNING_REQUEST, csr_queue.add),
+        (kinds.APPLICATION_TEMPLATE, templates.add),
         (kinds.ZONE, zone_queue.add),
         (kinds.ZONE, enqueue_policies_of_zone),
         (kinds.DEPOT, enqueue_policies_with_zones),
@@ -203,7 +206,16 @@ def work_queues(
     ]
     for kind, listener in listeners:
         cache.add_listener(kind, listener)
-    queues = [node_queue, csr_queue, zone_queue, policy_queue, *orphan_queues.values(), drone_queue, events.work_queue]
+    queues = [
+        templates,
+        node_queue,
+        csr_queue,
+        zone_queue,
+        policy_queue,
+        *orphan_queues.values(),
+        drone_queue,
+        events.work_queue,
+    ]
     return [*queues, *NodeGrantsController(store, cache).work_queues()]
 
 

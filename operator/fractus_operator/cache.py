@@ -117,7 +117,10 @@ class ClusterCache:
         self.policies = Informer(store, kinds.POLICY, tolerant_parser(Policy), self._policy_changed)
         self.applications = Informer(store, kinds.APPLICATION, parse_application, self._application_changed)
         self.templates = Informer(
-            store, kinds.APPLICATION_TEMPLATE, optional_parser(ApplicationTemplate), self._ignored
+            store,
+            kinds.APPLICATION_TEMPLATE,
+            optional_parser(ApplicationTemplate),
+            lambda key, _old, _new: self._notify(kinds.APPLICATION_TEMPLATE, key),
         )
         self.flight_plans = Informer(store, kinds.FLIGHT_PLAN, tolerant_parser(FlightPlan), self._flight_plan_changed)
         self.flights = FlightPlanIndex(self._flight_plans_affected)
@@ -430,9 +433,6 @@ class ClusterCache:
     def _flight_plans_affected(self, plans: Collection[Key]) -> None:
         for key in plans:
             self._notify(kinds.FLIGHT_PLAN, key)
-
-    def _ignored(self, _key: Key, _old: object, _new: object) -> None:
-        """Ignore a change, because the next step of each flight plan reads its template."""
 
     def _child_changed(self, key: Key, old: Body | None, new: Body | None) -> None:
         body = new or old or {}

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import itertools
+import random
 from datetime import UTC, datetime
 from typing import Any
 
 import pytest
+from depth import examples
 from fractus_core.api.plans import DeploymentPlanSpec, MissionRecord
 from fractus_core.planning import Settings
 from fractus_operator import kinds
@@ -46,7 +49,7 @@ class Api(Store):
         self.kill_at: int | None = None
         self.effective = False
         self.lose_status = False
-        self._attempts = 0
+        self.attempts = 0
         self._versions = itertools.count(1)
 
     def put(self, kind: Kind, body: Body) -> None:
@@ -66,11 +69,11 @@ class Api(Store):
             return copy.deepcopy(self.objects[target])
         if "/events" in path:
             return {}
-        self._attempts += 1
-        if self._attempts == self.kill_at and not self.effective:
+        self.attempts += 1
+        if self.attempts == self.kill_at and not self.effective:
             raise Killed
         response = self._write(method, path, target, copy.deepcopy(body))
-        if self._attempts == self.kill_at:
+        if self.attempts == self.kill_at:
             raise Killed
         if self.lose_status and path.endswith("/status"):
             raise KubeError(0, "Unreachable", "no response")
@@ -218,6 +221,26 @@ async def test_second_plan_is_rejected_also_if_the_response_to_the_first_write_w
     await world.controller.reconcile(("team", "noon"))
     assert world.status()["state"] == "Accepted"
     assert world.status(("team", "noon"))["state"] == "Rejected"
+
+
+@pytest.mark.parametrize("seed", range(examples(40, 4)))
+async def test_one_of_many_overlapping_plans_is_accepted_although_the_operator_is_killed(seed: int) -> None:
+    source = random.Random(seed)
+    names = [f"p{i}" for i in range(10)]
+    world = World(*(plan_named(name, f"u-{name}") for name in names), drones=[located(f"d{i}") for i in range(10)])
+    while undecided := [name for name in names if not world.status(("team", name))]:
+        world.api.kill_at = world.api.attempts + source.randint(1, 4)
+        world.api.effective = source.random() < 0.5
+        world.api.lose_status = source.random() < 0.3
+        try:
+            with contextlib.suppress(KubeError):
+                await world.controller.reconcile(("team", source.choice(undecided)))
+            if source.random() < 0.5:
+                world.watch()
+        except Killed:
+            world.lead()
+    states = sorted(world.status(("team", name))["state"] for name in names)
+    assert states == ["Accepted", *["Rejected"] * 9]
 
 
 async def test_plan_starts_at_its_time_with_one_application() -> None:

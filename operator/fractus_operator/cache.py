@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from fractus_core.airspace import Volume4D
 from fractus_core.api import (
     ApplicationTemplate,
     DeploymentPlan,
@@ -123,7 +124,7 @@ class ClusterCache:
             lambda key, _old, _new: self._notify(kinds.APPLICATION_TEMPLATE, key),
         )
         self.flight_plans = Informer(store, kinds.FLIGHT_PLAN, tolerant_parser(FlightPlan), self._flight_plan_changed)
-        self.flights = FlightPlanIndex(self._flight_plans_affected)
+        self.flights = FlightPlanIndex(self._reservation_changed)
         self.signing_requests = Informer(
             store,
             kinds.SIGNING_REQUEST,
@@ -430,9 +431,11 @@ class ClusterCache:
             self.subscriptions.wake_waiting()
         self._notify(kinds.FLIGHT_PLAN, key)
 
-    def _flight_plans_affected(self, plans: Collection[Key]) -> None:
-        for key in plans:
-            self._notify(kinds.FLIGHT_PLAN, key)
+    def _reservation_changed(self, key: Key, volumes: Sequence[Volume4D]) -> None:
+        # During the first list every plan is queued anyway.
+        if self.flight_plans.synced.is_set():
+            for plan in self.flights.overlapping(key, volumes):
+                self._notify(kinds.FLIGHT_PLAN, plan)
 
     def _child_changed(self, key: Key, old: Body | None, new: Body | None) -> None:
         body = new or old or {}

@@ -10,7 +10,7 @@ import logging
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from fractus_core.airspace import Airspace, OperationalIntent
+from fractus_core.airspace import Airspace, OperationalIntent, Volume4D
 from fractus_core.airspace.lifecycle import RESERVING
 from fractus_core.airspace.plan_status import intent_of
 from fractus_core.api import FlightPlan, InvalidObject
@@ -74,13 +74,13 @@ class FlightPlanIndex:
     """Reservations of flight plans by name, drone and uid.
 
     Args:
-        on_change: Called with the keys of plans whose airspace overlaps that of a changed plan.
+        on_change: Called with the key of each plan whose reservation changed, and its volumes before and after the change.
 
     Attributes:
         airspace: Operational intents of all plans.
     """
 
-    def __init__(self, on_change: Callable[[Collection[Key]], None] = lambda _: None) -> None:
+    def __init__(self, on_change: Callable[[Key, Sequence[Volume4D]], None] = lambda _key, _volumes: None) -> None:
         self.airspace = Airspace()
         self._on_change = on_change
         self._observed: dict[Key, ReservedFlight] = {}
@@ -130,6 +130,10 @@ class FlightPlanIndex:
         """Return the key of the plan with a uid, or None."""
         return self._keys.get(uid)
 
+    def overlapping(self, key: Key, volumes: Sequence[Volume4D]) -> list[Key]:
+        """Return the keys of other plans that overlap volumes of a plan."""
+        return [_key(other.name) for other in self.airspace.overlapping(volumes, without="/".join(key))]
+
     def on_drone(self, drone: str) -> Iterator[tuple[Key, ReservedFlight]]:
         """Iterate over the reservations of a drone."""
         for key in sorted(self._by_drone.get(drone, ())):
@@ -154,10 +158,6 @@ class FlightPlanIndex:
         if old == new:
             return
         name = "/".join(key)
-        affected: set[str] = set()
-        for each in (old, new):
-            if each is not None:
-                affected |= {other.name for other in self.airspace.overlapping(each.intent.all_volumes, without=name)}
         if old is not None:
             self._by_drone[old.drone].discard(key)
             if not self._by_drone[old.drone]:
@@ -166,7 +166,8 @@ class FlightPlanIndex:
         if new is not None:
             self._by_drone.setdefault(new.drone, set()).add(key)
             self.airspace.put(new.intent)
-        self._on_change([_key(other) for other in sorted(affected)])
+        volumes = [volume for each in (old, new) if each is not None for volume in each.intent.all_volumes]
+        self._on_change(key, volumes)
 
 
 class Reservations(Mapping[str, Sequence[Reservation]]):

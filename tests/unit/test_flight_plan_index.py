@@ -11,7 +11,7 @@ KEY = ("team", "morning")
 
 def index_with(*plans):
     woken = []
-    index = FlightPlanIndex(woken.extend)
+    index = FlightPlanIndex(lambda key, volumes: woken.extend(index.overlapping(key, volumes)))
     for plan in plans:
         index.plan_changed((plan.metadata.namespace, plan.name), plan)
     return index, woken
@@ -90,7 +90,7 @@ def test_new_plan_under_the_same_name_does_not_inherit_a_decision():
     assert reserved(index) == {}
 
 
-def test_plans_that_overlap_a_changed_plan_are_woken():
+def test_plans_that_overlap_a_changed_plan_are_found():
     index, woken = index_with(accepted())
     index.plan_changed(("team", "rescue"), named(accepted(flight(priorityClass="elevated")), "rescue", "u2"))
     assert woken == [KEY]

@@ -303,7 +303,7 @@ def _follow_flight(now: PlanSituation) -> PlanStep:
         }
     )
     intent = intent_of(now.plan.model_copy(update={"status": status}))
-    status = status.model_copy(update={"advisories": _overlaps(intent, now)})
+    status = status.model_copy(update={"advisories": _policy_advisories(status) + _overlaps(intent, now)})
     next_s = RETRY_S if progress.state in OFF_NOMINAL else now.end_s - now.now_s
     return PlanStep(status, _conditions(status, now), end=progress.end, next_s=max(next_s, 1.0))
 
@@ -383,6 +383,10 @@ def _overlaps(intent: OperationalIntent, now: PlanSituation) -> tuple[PlanFindin
     return tuple(map(plan_finding, standing_overlaps(intent, now.airspace)))
 
 
+def _policy_advisories(status: FlightPlanStatus) -> tuple[PlanFinding, ...]:
+    return tuple(each for each in status.advisories if each.plan is None)
+
+
 def _status_of(now: PlanSituation, match: Match, state: PlanState, message: str) -> FlightPlanStatus:
     generation = now.plan.metadata.generation
     return FlightPlanStatus(
@@ -403,10 +407,9 @@ def _keep(now: PlanSituation) -> PlanStep:
     """Keep the state of a plan, and update its overlaps with other plans."""
     status = now.status.model_copy(update={"observed_generation": now.plan.metadata.generation})
     if now.state == "Accepted":
-        policies = tuple(each for each in status.advisories if each.plan is None)
         status = status.model_copy(
             update={
-                "advisories": policies + _overlaps(intent_of(now.plan), now),
+                "advisories": _policy_advisories(status) + _overlaps(intent_of(now.plan), now),
                 "message": f"{status.drone} is reserved",
             }
         )

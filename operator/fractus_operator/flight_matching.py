@@ -65,6 +65,13 @@ class Match:
         """Policies for which the user must select an action."""
         return tuple(each.policy for each in self.restrictions if each.chosen is None)
 
+    @property
+    def choices_problem(self) -> str:
+        """Sentence about the policies for which the user must select an action, or an empty string."""
+        if not self.undecided:
+            return ""
+        return f"select an action in spec.policyActions for each policy with choices: {', '.join(self.undecided)}"
+
 
 def match_flight(
     flight: FlightPlan,
@@ -91,18 +98,17 @@ def match_flight(
     Raises:
         Unfit: No drone is suitable, or the plan or its template is invalid.
     """
-    if template is None:
-        name = flight.spec.template
-        raise Unfit("TemplateMissing", f"there is no ApplicationTemplate {name}; apply it, or correct spec.template")
     window = flight.spec.window
+    if not now_s < window.end_s:
+        raise Unfit("WindowOver", "the window of the plan is over; choose a later time")
     begin_s = max(window.begin_s, now_s)
     settings = replace(settings, time_s=begin_s, until_s=window.end_s, begins_later=window.begin_s - now_s > SOON_S)
     try:
-        application = ordered_application(flight, template)
+        application = application_of(flight, template)
         check_application(application, inventory.depots)
         planned = _planned(application, inventory, settings, flight.spec.drone, preferred)
         if planned.drone is None:
-            raise Unfit("Invalid", f"no component of ApplicationTemplate {template.name} runs on a drone")
+            raise Unfit("Invalid", f"no component of ApplicationTemplate {flight.spec.template} runs on a drone")
         drone = inventory.drones[planned.drone.node]
         # Grants have a maximum altitude but no minimum altitude, so the volumes begin at the ground.
         volumes = flight_volumes(application, drone, inventory, settings, begin_s=begin_s, end_s=window.end_s)
@@ -116,6 +122,19 @@ def match_flight(
         )
     except InvalidObject as error:
         raise Unfit("Invalid", str(error)) from error
+
+
+def application_of(flight: FlightPlan, template: ApplicationTemplate | None) -> Application:
+    """Return the Application that flies a plan.
+
+    Raises:
+        Unfit: The template does not exist.
+        InvalidObject: The template is not approved, or does not fit the plan.
+    """
+    if template is None:
+        name = flight.spec.template
+        raise Unfit("TemplateMissing", f"there is no ApplicationTemplate {name}; apply it, or correct spec.template")
+    return ordered_application(flight, template)
 
 
 def _planned(

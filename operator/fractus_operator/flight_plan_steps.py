@@ -14,9 +14,8 @@ from fractus_core.api.conditions import ConditionUpdate
 from fractus_core.api.flight_plans import FlightPlanStatus, PlanFinding, PlanState, ReservedVolume
 from fractus_core.api.plans import Rejection
 from fractus_core.planning.inventory import Inventory, Settings
-from fractus_core.planning.ordered_application import ordered_application
 
-from fractus_operator.flight_matching import SOON_S, Match, Unfit, match_flight
+from fractus_operator.flight_matching import SOON_S, Match, Unfit, application_of, match_flight
 from fractus_operator.flight_progress import FlownMission, flight_progress, off_nominal_volumes
 
 START_GRACE_S = 120.0
@@ -140,9 +139,7 @@ def _decide_new(now: PlanSituation) -> PlanStep:
         match = _match(now)
     except Unfit as unfit:
         return _rejected(now, unfit)
-    if match.undecided:
-        names = ", ".join(match.undecided)
-        message = f"select an action for each policy with choices in spec.policyActions: {names}"
+    if message := match.choices_problem:
         status = _status_of(now, match, "Draft", message).model_copy(
             update={"drone": None, "volumes": (), "decided_for": None}
         )
@@ -203,9 +200,7 @@ def _redecide(now: PlanSituation) -> PlanStep:
         match = _match(now)
     except Unfit as unfit:
         return _refuse_change(now, (PlanFinding(reason=unfit.reason, message=unfit.message),))
-    if match.undecided:
-        names = ", ".join(match.undecided)
-        message = f"select an action for each policy with choices in spec.policyActions: {names}"
+    if message := match.choices_problem:
         return _refuse_change(now, (PlanFinding(reason="ChoicesMissing", message=message),))
     intent = _intent(now, "Accepted", match.volumes)
     decision = decide(intent, before, now.airspace, now.now_s)
@@ -252,13 +247,11 @@ def _activate(now: PlanSituation) -> PlanStep:
         return _not_startable(now, unfit.reason, unfit.message, unfit.rejected)
     intent = _intent(now, "Activated", match.volumes)
     decision = decide(intent, intent_of(now.plan), now.airspace, now.now_s)
-    if match.undecided or not decision.accepted:
-        reason = "ChoicesMissing"
-        message = f"select an action in spec.policyActions for {', '.join(match.undecided)}"
-        if not match.undecided:
-            reason = decision.refusals[0].reason
-            message = decision.refusals[0].message
-        return _not_startable(now, reason, message)
+    if message := match.choices_problem:
+        return _not_startable(now, "ChoicesMissing", message)
+    if not decision.accepted:
+        finding = decision.refusals[0]
+        return _not_startable(now, finding.reason, finding.message)
     status = _status_of(now, match, "Activated", f"{match.drone} starts the flight").model_copy(
         update={"application": match.application.name, "advisories": match.advisories + _overlaps(intent, now)}
     )
@@ -315,7 +308,7 @@ def _change_in_flight(now: PlanSituation) -> PlanStep | None:
         None if nothing of the flight changes.
     """
     try:
-        digest = _ordered(now).spec.mission_digest
+        digest = application_of(now.plan, now.template).spec.mission_digest
     except (InvalidObject, Unfit) as error:
         return _refuse_change(now, (PlanFinding(reason="Invalid", message=str(error)),))
     if digest != now.mission.digest:
@@ -366,13 +359,6 @@ def _ended(now: PlanSituation, message: str) -> PlanStep:
 
 def _match(now: PlanSituation) -> Match:
     return match_flight(now.plan, now.template, now.inventory(), now.settings, now.now_s, preferred=now.status.drone)
-
-
-def _ordered(now: PlanSituation) -> Application:
-    if now.template is None:
-        name = now.plan.spec.template
-        raise Unfit("TemplateMissing", f"there is no ApplicationTemplate {name}; apply it, or correct spec.template")
-    return ordered_application(now.plan, now.template)
 
 
 def _intent(now: PlanSituation, state: PlanState, volumes: tuple[Volume4D, ...]) -> OperationalIntent:

@@ -103,6 +103,11 @@ def test_plan_without_template_is_rejected_with_the_remedy():
     assert "apply it, or correct spec.template" in step.status.message
 
 
+def test_plan_whose_window_is_over_is_rejected():
+    step = plan_step(situation(now_s=END_S))
+    assert (step.status.state, step.status.refusals[0].reason) == ("Rejected", "WindowOver")
+
+
 def test_plan_of_unapproved_template_is_rejected():
     step = plan_step(situation(using=template(approved=2)))
     assert (step.status.state, step.status.refusals[0].reason) == ("Rejected", "Invalid")

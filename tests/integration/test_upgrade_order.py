@@ -12,40 +12,42 @@ from pathlib import Path
 import pytest
 from chart import render
 from control_plane import ControlPlane, wait_for
-from fractus_core.api import DeploymentPlan, NodeGrants
+from fractus_core.api import ApplicationTemplate, DeploymentPlan, FlightPlan, NodeGrants
 from fractus_core.api.crd import crd
+from fractus_core.api.model import Resource
 from fractus_runtime.kubernetes import KubeError
 from operator_world import FRACTUS, NODES, SYSTEM, OperatorProcess, World
 from test_uninstall_chart import with_lookups
 
 pytestmark = pytest.mark.slow
 
-KIND = "/apis/apiextensions.k8s.io/v1/customresourcedefinitions/nodegrants.fractus.dev"
+CRDS = "/apis/apiextensions.k8s.io/v1/customresourcedefinitions"
 OBJECTS = f"{FRACTUS}/namespaces/{NODES}/nodegrants"
 LEASE = f"/apis/coordination.k8s.io/v1/namespaces/{SYSTEM}/leases/fractus-operator"
 
 
-def is_served(world: World) -> bool:
-    return any(each["kind"] == "NodeGrants" for each in world.api.call("GET", FRACTUS)["resources"])
+def is_served(world: World, kind: type[Resource]) -> bool:
+    return any(each["kind"] == kind.KIND for each in world.api.call("GET", FRACTUS)["resources"])
 
 
-def is_stored(world: World) -> bool:
+def is_stored(world: World, kind: type[Resource]) -> bool:
     try:
-        return world.api.get(OBJECTS) is not None
+        return world.api.get(f"{FRACTUS}/{kind.PLURAL}") is not None
     except KubeError:
         # the API server answers "storage is (re)initializing"
         return False
 
 
 @contextmanager
-def without_kind(world: World) -> Iterator[None]:
-    world.api.delete(KIND)
-    wait_for(lambda: world.api.get(KIND) is None and not is_served(world), "the kind to be deleted")
+def without_kind(world: World, kind: type[Resource]) -> Iterator[None]:
+    path = f"{CRDS}/{kind.PLURAL}.fractus.dev"
+    world.api.delete(path)
+    wait_for(lambda: world.api.get(path) is None and not is_served(world, kind), "the kind to be deleted")
     try:
         yield
     finally:
-        world.api.apply(KIND, crd(NodeGrants))
-        wait_for(lambda: is_served(world) and is_stored(world), "the kind to be served again")
+        world.api.apply(path, crd(kind))
+        wait_for(lambda: is_served(world, kind) and is_stored(world, kind), "the kind to be served again")
 
 
 def test_operator_with_missing_kind_leaves_lease_to_previous_release(
@@ -61,7 +63,7 @@ def test_operator_with_missing_kind_leaves_lease_to_previous_release(
 
     world.api.delete(LEASE)
     try:
-        with without_kind(world):
+        with without_kind(world, NodeGrants):
             process.start()
             wait_for(lambda: "operator: waiting for kinds" in process.log(), process.log)
             assert "upgrade the chart fractus-crds (missing=NodeGrants)" in process.log()
@@ -75,16 +77,17 @@ def test_operator_with_missing_kind_leaves_lease_to_previous_release(
 
 
 @pytest.mark.parametrize("arguments", [(), ("--is-upgrade",)])
-def test_chart_is_refused_when_kind_is_missing(world: World, arguments: tuple[str, ...]) -> None:
+@pytest.mark.parametrize("kind", [NodeGrants, ApplicationTemplate, FlightPlan])
+def test_chart_is_refused_when_kind_is_missing(world: World, kind: type[Resource], arguments: tuple[str, ...]) -> None:
     assert render(*with_lookups(world, *arguments))
-    with without_kind(world), pytest.raises(subprocess.CalledProcessError) as refused:
+    with without_kind(world, kind), pytest.raises(subprocess.CalledProcessError) as refused:
         render(*with_lookups(world, *arguments))
     assert "install or upgrade the chart fractus-crds first" in refused.value.stderr
 
 
 def test_chart_is_refused_when_kind_cannot_record_outcomes(world: World) -> None:
     """The API server would refuse the outcome of a mission, and the operator would then not remove its Grants."""
-    path = KIND.replace("nodegrants", "deploymentplans")
+    path = f"{CRDS}/deploymentplans.fractus.dev"
     older = copy.deepcopy(crd(DeploymentPlan))
     del older["spec"]["versions"][0]["schema"]["openAPIV3Schema"]["properties"]["spec"]["properties"]["flown"]
     present = world.api.get(path) or {}

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from fractus_core.airspace import Volume4D, flight_volumes
 from fractus_core.api import Application, ApplicationTemplate, Drone, FlightPlan, InvalidObject
 from fractus_core.api.flight_plans import PlanFinding, PlanRestriction
-from fractus_core.api.plans import DeploymentPlanSpec, Rejection
+from fractus_core.api.plans import Alternative, DeploymentPlanSpec, Rejection
 from fractus_core.planning.grant_compiler import compile_grants
 from fractus_core.planning.inventory import Inventory, Settings
 from fractus_core.planning.legality import with_legality
@@ -48,6 +48,7 @@ class Match:
         application: Application that flies.
         drone: Name of the drone.
         volumes: Airspace of the whole flight.
+        candidates: Drones that fit, best first.
         rejected: Drones that do not fit, each with the reason.
         restrictions: Policies that apply to the flight.
         advisories: Permitted conflicts with policies.
@@ -56,6 +57,7 @@ class Match:
     application: Application
     drone: str
     volumes: tuple[Volume4D, ...]
+    candidates: tuple[Alternative, ...] = ()
     rejected: tuple[Rejection, ...] = ()
     restrictions: tuple[PlanRestriction, ...] = ()
     advisories: tuple[PlanFinding, ...] = ()
@@ -116,6 +118,7 @@ def match_flight(
             application,
             drone.name,
             volumes,
+            (Alternative(node=drone.name, score=planned.drone.score or 0), *planned.drone.alternatives),
             _drones(planned.rejected, inventory),
             _restrictions(application, planned, inventory, settings),
             _policy_conflicts(application, planned, inventory, settings),

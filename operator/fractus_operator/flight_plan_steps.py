@@ -382,6 +382,7 @@ def _status_of(now: PlanSituation, match: Match, state: PlanState, message: str)
         message=message,
         priority_class=now.plan.spec.priority_class,
         drone=match.drone,
+        candidates=match.candidates if now.plan.spec.dry_run else (),
         rejected=match.rejected,
         volumes=tuple(map(reserved_volume, match.volumes)),
         restrictions=match.restrictions,

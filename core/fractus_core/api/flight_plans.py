@@ -22,7 +22,7 @@ from fractus_core.api.model import (
     Timestamp,
 )
 from fractus_core.api.names import Name
-from fractus_core.api.plans import Rejection
+from fractus_core.api.plans import Alternative, Rejection
 from fractus_core.api.policies import PolicyAction, one_action_for_each_policy
 from fractus_core.api.rules import Violation, one_of, referenced_by, rule
 
@@ -267,6 +267,9 @@ class FlightPlanStatus(OpenModel):
         description="Priority class of the version that state and volumes result from; unset: not decided.",
     )
     drone: str | None = Field(default=None, description="Name of the reserved drone.")
+    candidates: tuple[Alternative, ...] = Field(
+        default=(), description="Drones that fit, best first. Only dry runs list them."
+    )
     rejected: tuple[Rejection, ...] = Field(default=(), description="Drones that do not fit, each with the reason.")
     volumes: tuple[ReservedVolume, ...] = Field(default=(), description="Volumes in which the flight stays.")
     off_nominal_volumes: tuple[ReservedVolume, ...] = Field(
@@ -279,7 +282,7 @@ class FlightPlanStatus(OpenModel):
     conditions: Conditions = ()
 
 
-class FlightPlan(Resource, plural="flightplans", short="fpl", namespaced=True):
+class FlightPlan(Resource, plural="flightplans", short="fpl", namespaced=True, selectable=(".status.drone",)):
     """A flight of an approved application at a place, in a time window."""
 
     COLUMNS = (

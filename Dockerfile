@@ -35,6 +35,8 @@ FROM build AS camera-environment
 RUN --mount=type=cache,target=/root/.cache/uv $SYNC --extra services
 FROM build AS view-environment
 RUN --mount=type=cache,target=/root/.cache/uv $SYNC --extra view
+FROM build AS management-environment
+RUN --mount=type=cache,target=/root/.cache/uv $SYNC --extra management
 FROM build AS sim-environment
 RUN --mount=type=cache,target=/root/.cache/uv $SYNC --package fractus-sim
 
@@ -70,6 +72,10 @@ COPY --from=code /fractus_drones /opt/fractus
 FROM unprivileged AS view
 COPY --from=view-environment /opt/fractus /opt/fractus
 ENTRYPOINT ["fractus", "view"]
+COPY --from=code /fractus_drones /opt/fractus
+FROM unprivileged AS management
+COPY --from=management-environment /opt/fractus /opt/fractus
+ENTRYPOINT ["fractus", "api"]
 COPY --from=code /fractus_drones /opt/fractus
 FROM base AS agent
 COPY --from=agent-environment /opt/fractus /opt/fractus

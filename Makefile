@@ -131,12 +131,13 @@ format: env ## Format the code
 	$(RUN) ruff format
 
 .PHONY: generate
-generate: env ## Generate the CRDs, the JSON schema of manifests, the stubs of the .proto files, the types of the page's events, the chart's defaults and the charts' README.md
+generate: env ## Generate the CRDs, the JSON schema of manifests, the description of the management API, the stubs of the .proto files, the types of the page's events, the chart's defaults and the charts' README.md
 	$(RUN) python -m fractus_core.api.crd crds
 	$(RUN) fractus schema > examples/fractus.schema.json
 	$(RUN) python -m grpc_tools.protoc -Iproto --python_out=proto --pyi_out=proto --grpc_python_out=proto \
 		proto/fractus_proto/v1/*.proto
 	$(RUN) python -m fractus_view.typescript view/web/src/events.ts
+	$(RUN) fractus api openapi > management/openapi.json
 	cp charts/fractus/values.yaml charts/fractus/files/values.yaml
 	$(RUN) python docs/pages.py
 
@@ -167,7 +168,7 @@ release: env ## Set VERSION=X.Y.Z of the package and the charts, before it is de
 	$(UV) lock --quiet
 
 # Extras of the shipped distribution, without development tools.
-SHIPPED := --frozen --no-dev --extra operator --extra agent --extra services --extra view --extra tracing
+SHIPPED := --frozen --no-dev --extra operator --extra agent --extra services --extra view --extra management --extra tracing
 LICENSES = $(UV) run --quiet --isolated $(SHIPPED) --with pip-licenses==5.5.5 pip-licenses
 
 # Charts of a checkout name its local images (localhost/fractus/NAME:dev). Charts of a release name the released images.

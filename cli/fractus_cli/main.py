@@ -17,6 +17,7 @@ from fractus_cli.output import printable
 _MARKERS = {
     "geometry": "shapely",
     "kube": "kubernetes",
+    "management": "fastapi",
     "model": "pydantic",
     "operator": "cryptography",
     "services": "cv2",
@@ -60,6 +61,7 @@ class Entry:
 
 
 COMMANDS: dict[str, Entry] = {
+    "api": Entry("fractus_management.command:api", "Serve the REST API for flights as a service.", "management"),
     "audit": Entry("fractus_cli.audit:audit", "Verify, show and export audit logs of a node's services and agent.", "services"),
     "camera": Entry("fractus_services.commands:camera", "Run the camera service of a node.", "services"),
     "camera-world": Entry("fractus_world.__main__:camera_world", "Serve images of a camera above a simulated world.", "sim"),
@@ -70,7 +72,6 @@ COMMANDS: dict[str, Entry] = {
     "doctor": Entry("fractus_cli.doctor:doctor", "Check a cluster and print a remedy for each problem.", "operator"),
     "experiment": Entry("fractus_sim.experiment_command:experiment", "Run experiments with faults, checks and a report.", "sim"),
     "explain": Entry("fractus_cli.explain:explain", "Explain the plan of an Application.", "kube"),
-    "flights": Entry("fractus_cli.flights:flights", "Order, start, watch and end flights of approved applications.", "operator"),
     "gateway": Entry("fractus_services.commands:gateway", "Run the gateway for MAVLink programs.", "services"),
     "grants": Entry("fractus_cli.grants:grants", "Sign Grants and issue certificates, without Kubernetes.", "operator"),
     "images": Entry("fractus_cluster.images.cli:images", "Build the container images of Fractus with buildah.", "sim"),

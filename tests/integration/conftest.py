@@ -11,8 +11,9 @@ from pathlib import Path
 import chart as fractus_chart
 import pytest
 from control_plane import ControlPlane, programs, wait_for
+from management_server import ManagementServer, User, user_token
 from mobility_rig import Rig
-from operator_world import OperatorProcess, World, fresh_namespace
+from operator_world import FRACTUS, OperatorProcess, World, approved_template, fresh_namespace
 
 # Background jobs of a shell ignore SIGINT, and nohup ignores SIGHUP. Programs that tests start would also ignore them.
 for number in (signal.SIGINT, signal.SIGHUP):
@@ -113,3 +114,41 @@ def namespace(world: World, request: pytest.FixtureRequest) -> Iterator[str]:
     name = "t-" + hashlib.sha256(f"{request.node.nodeid}{os.getpid()}".encode()).hexdigest()[:10]
     with fresh_namespace(world, name) as fresh:
         yield fresh
+
+
+@pytest.fixture(scope="session")
+def management(control_plane: ControlPlane, tmp_path_factory: pytest.TempPathFactory) -> Iterator[ManagementServer]:
+    """The management API as a process, without credentials."""
+    server = ManagementServer(control_plane, tmp_path_factory.mktemp("management") / "log")
+    yield server
+    assert server.stop() == 0
+
+
+@pytest.fixture
+def pilot(
+    chart: None, world: World, operator: OperatorProcess, management: ManagementServer, namespace: str
+) -> Iterator[User]:
+    """A user who may order flights of an approved template."""
+    approved_template(world)
+    token = user_token(
+        world,
+        namespace,
+        "pilot",
+        ("fractus-flightplan-editor",),
+        ("fractus-drone-viewer", "fractus-applicationtemplate-viewer"),
+    )
+    user = User(management, token, namespace)
+    wait_for(lambda: user("GET", "/v1/plans").status == 200, "the role of the pilot")
+    yield user
+    # A plan that is left would reserve the drone.
+    for item in world.api.list(f"{FRACTUS}/flightplans"):
+        world.api.delete(f"{FRACTUS}/namespaces/{item['metadata']['namespace']}/flightplans/{item['metadata']['name']}")
+    wait_for(lambda: not world.api.list(f"{FRACTUS}/flightplans"), "the plans to be deleted")
+
+
+@pytest.fixture
+def observer(pilot: User, world: World, management: ManagementServer, namespace: str) -> User:
+    """A user who may only read."""
+    user = User(management, user_token(world, namespace, "observer", ("fractus-flightplan-viewer",), ()), namespace)
+    wait_for(lambda: user("GET", "/v1/plans").status == 200, "the role of the observer")
+    return user

@@ -295,6 +295,16 @@ class World:
         wait_for(deleted, f"{path} to be deleted")
 
 
+def approved_template(world: World, name: str = "survey") -> None:
+    """Publish and approve a template of a flight along waypoints."""
+    leader = navigator()
+    leader["container"]["image"] = "registry.test/component@sha256:" + "0" * 64
+    spec = {"navigation": "path", "altitudes": {"upper": 60}, "template": {"components": [leader]}}
+    body = world.put(fractus_object("ApplicationTemplate", name, spec))
+    approval = {"generation": body["metadata"]["generation"], "by": "admin", "at": "2026-01-01T00:00:00Z"}
+    world.api.merge(f"{FRACTUS}/applicationtemplates/{name}/status", {"status": {"approval": approval}})
+
+
 def _namespace(name: str) -> Body:
     return {"apiVersion": "v1", "kind": "Namespace", "metadata": {"name": name}}
 

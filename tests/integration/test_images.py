@@ -28,6 +28,7 @@ PACKAGES = {
     "mobility": ["fractus_services.mobility"],
     "camera": ["fractus_services"],
     "view": ["fractus_view"],
+    "management": ["fractus_management"],
     "sim": ["fractus_vehicle", "fractus_world", "fractus_radio", "fractus_sim", "fractus_cluster"],
 }
 """Packages whose modules the image must be able to import, by image. All other images contain a component."""
@@ -35,6 +36,7 @@ LACKING = {
     "component": {"cv2", "kubernetes", "fractus_vehicle"},
     "operator": {"cv2", "fractus_vehicle"},
     "agent": {"numpy", "shapely", "cv2", "fractus_vehicle"},
+    "management": {"numpy", "shapely", "cv2", "fractus_vehicle"},
     "mobility": {"cv2", "kubernetes", "fractus_vehicle"},
     "camera": {"kubernetes", "fractus_vehicle"},
 }

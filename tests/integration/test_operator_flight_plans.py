@@ -9,21 +9,19 @@ import chart as fractus_chart
 import pytest
 from control_plane import ControlPlane, wait_for
 from fractus_runtime.kubernetes import KubeError
-from operator_world import FRACTUS, OperatorProcess, World, at, component, fractus_object, navigator, traffic
+from operator_world import (
+    FRACTUS,
+    OperatorProcess,
+    World,
+    approved_template,
+    at,
+    component,
+    fractus_object,
+    navigator,
+    traffic,
+)
 
 Body = dict[str, Any]
-PINNED = "registry.test/component@sha256:" + "0" * 64
-
-
-def pinned(body: Body) -> Body:
-    return body | {"container": body["container"] | {"image": PINNED}}
-
-
-def approved_template(world: World) -> None:
-    spec = {"navigation": "path", "altitudes": {"upper": 60}, "template": {"components": [pinned(navigator())]}}
-    body = world.put(fractus_object("ApplicationTemplate", "survey", spec))
-    approval = {"generation": body["metadata"]["generation"], "by": "admin", "at": "2026-01-01T00:00:00Z"}
-    world.api.merge(f"{FRACTUS}/applicationtemplates/survey/status", {"status": {"approval": approval}})
 
 
 def submit(world: World, namespace: str, name: str = "flight", *, in_s: float = 3600, **more: Any) -> None:

@@ -15,7 +15,7 @@ import pytest
 ROOT = Path(__file__).parents[2]
 EXAMPLES = sorted({path.parent for path in (ROOT / "examples").rglob("*.py")})
 SIMULATOR = ("cluster", "radio", "sim", "vehicle", "world")
-SHIPPED = ("agent", "cli", "core", "operator", "proto", "runtime", "services", "view")
+SHIPPED = ("agent", "cli", "core", "management", "operator", "proto", "runtime", "services", "view")
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
 
 
@@ -65,7 +65,7 @@ def test_shipped_wheel_does_not_require_simulator_or_its_libraries(wheels: dict[
     required = " ".join(metadata.get_all("Requires-Dist", []))
     assert not [library for library in ("fractus-sim", "matplotlib", "pytest", "scipy") if library in required]
     assert set(metadata.get_all("Provides-Extra", [])) == {
-        "agent", "geometry", "keys", "kube", "mobility", "model", "operator", "services", "tracing", "view",
+        "agent", "geometry", "keys", "kube", "management", "mobility", "model", "operator", "services", "tracing", "view",
     }  # fmt: skip
 
 

@@ -15,7 +15,7 @@ NON_METRIC_NAMES = {"fractus_agent", "fractus_call", "fractus_operator"}
 
 
 def test_metrics_page_lists_exactly_the_metrics_of_the_code() -> None:
-    folders = ("runtime", "operator", "agent", "services", "view", "core")
+    folders = ("runtime", "operator", "agent", "services", "view", "management", "core")
     code = "".join(file.read_text() for folder in folders for file in (DOCS.parent / folder).rglob("*.py"))
     assert set(re.findall(r'"(fractus_[a-z_]+)"', code)) - NON_METRIC_NAMES == documented().keys()
 

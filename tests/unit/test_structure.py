@@ -13,7 +13,7 @@ import grimp
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-SOURCE_ROOTS = ("core", "runtime", "operator", "agent", "services", "cli", "view", "sdk", "sim")
+SOURCE_ROOTS = ("core", "runtime", "operator", "agent", "services", "cli", "view", "management", "sdk", "sim")
 
 
 def packages() -> list[str]:

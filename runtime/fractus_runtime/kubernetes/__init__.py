@@ -10,6 +10,7 @@ from fractus_runtime.kubernetes.access import (
     in_cluster,
     kubeconfig,
     with_certificate,
+    without_credentials,
 )
 from fractus_runtime.kubernetes.blocking import BlockingClient
 from fractus_runtime.kubernetes.client import POD, Client, Page
@@ -45,4 +46,5 @@ __all__ = [
     "key_of",
     "kubeconfig",
     "with_certificate",
+    "without_credentials",
 ]

@@ -114,6 +114,25 @@ def with_certificate(
         configuration.cert_file, configuration.key_file = map(str, certificate)
     if token:
         configuration.api_key["BearerToken"] = f"Bearer {token}"
+    return unchanging(configuration)
+
+
+def without_credentials(configuration: Configuration) -> Access:
+    """Return the access to an API server without any credentials.
+
+    Args:
+        configuration: Configuration of another access to the same API server. Its credentials are not used.
+    """
+    anonymous = copy.copy(configuration)
+    anonymous.cert_file = None
+    anonymous.key_file = None
+    anonymous.api_key = {}
+    anonymous.refresh_api_key_hook = None
+    return unchanging(anonymous)
+
+
+def unchanging(configuration: Configuration) -> Access:
+    """Return the access with a configuration whose credentials never change."""
 
     async def keep() -> None:
         """Do nothing, because neither the certificate nor the token changes."""

@@ -7,13 +7,14 @@ the official client has no limit on silence, and its lists have no pages.
 from __future__ import annotations
 
 import asyncio
+import copy
 import json
 from collections.abc import AsyncGenerator, AsyncIterator, Callable, Mapping, Sequence
 from functools import partial
 
 import aiohttp
 
-from fractus_runtime.kubernetes.access import with_tokens
+from fractus_runtime.kubernetes.access import unchanging, with_tokens
 from fractus_runtime.kubernetes.connection import Connection, ContentType, translated
 from fractus_runtime.kubernetes.errors import Conflict, NotFound, from_status
 from fractus_runtime.kubernetes.objects import Body, Key, Kind, key_of
@@ -84,6 +85,17 @@ class Client(Connection):
         access = with_tokens(self._access.configuration, token, _TOKEN_LIFE_S / 2)
         return Client(access, self.field_manager, trust_env=self._trust_env)
 
+    def on_behalf_of(self, token: str) -> Client:
+        """Return a client that sends a bearer token instead of the credentials of this client, over the same connections.
+
+        This client must not have a client certificate, which would authenticate the connections (`without_credentials`).
+        """
+        configuration = copy.copy(self._access.configuration)
+        configuration.api_key = {"BearerToken": f"Bearer {token}"}
+        client = copy.copy(self)
+        client._access = unchanging(configuration)
+        return client
+
     async def get(self, kind: Kind, name: str, namespace: str = "") -> Body:
         """Read an object.
 
@@ -150,7 +162,7 @@ class Client(Connection):
         timeout_s: int,
         silence_s: float,
         opened: Callable[[], None] = lambda: None,
-    ) -> AsyncIterator[tuple[str, Body]]:
+    ) -> AsyncGenerator[tuple[str, Body], None]:
         """Watch a collection: yield (ADDED | MODIFIED | DELETED | BOOKMARK, object) until the API server ends the watch.
 
         Args:

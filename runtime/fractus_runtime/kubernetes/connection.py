@@ -51,6 +51,7 @@ class Connection:
         field_manager: Owner of the written fields.
         may_write_s: Returns the seconds for which writes may still take effect. 0 if another process may write instead.
         trust_env: Use the proxies of the environment.
+        max_connections: Maximum number of connections. Each open watch occupies one.
 
     Attributes:
         succeeded_at: Monotonic time of the last response that reported success.
@@ -66,11 +67,13 @@ class Connection:
         *,
         may_write_s: Callable[[], float] = lambda: REQUEST_TIMEOUT_S,
         trust_env: bool = True,
+        max_connections: int = MAX_CONNECTIONS,
     ) -> None:
         self.field_manager = field_manager
         self._access = access
         self._may_write_s = may_write_s
         self._trust_env = trust_env
+        self._max_connections = max_connections
         self.succeeded_at = -math.inf
         self._closed = False
         # Python 3.13 rejects certificates without an authority key identifier by default. Kubernetes and kubectl accept them.
@@ -202,7 +205,7 @@ class Connection:
                 trace_configs=[no_redirects],
                 connector=aiohttp.TCPConnector(
                     ssl=self._rest.ssl_context,
-                    limit=MAX_CONNECTIONS,
+                    limit=self._max_connections,
                     keepalive_timeout=_KEPT_OPEN_S,
                     socket_factory=_socket,
                 ),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 from fractus_runtime.kubernetes.objects import Body
@@ -13,11 +14,13 @@ class KubeError(Exception):
     Attributes:
         status: HTTP status. 0 if there was no response.
         reason: CamelCase reason of Kubernetes, such as Forbidden. "Unreachable" if there was no response.
+        causes: Causes of an invalid object, each with `reason`, `message` and `field`, if the API server reported them.
     """
 
-    def __init__(self, status: int, reason: str, message: str) -> None:
+    def __init__(self, status: int, reason: str, message: str, causes: Sequence[Body] = ()) -> None:
         self.status = status
         self.reason = reason
+        self.causes = causes
         super().__init__(message)
 
 
@@ -55,4 +58,5 @@ def from_status(code: int, status: Any) -> KubeError:
     body: Body = status if isinstance(status, dict) else {"message": str(status)[:500]}
     code = int(body.get("code") or code)
     message = str(body.get("message") or f"HTTP {code}")
-    return _BY_STATUS.get(code, KubeError)(code, str(body.get("reason") or "Unknown"), message)
+    causes = (body.get("details") or {}).get("causes") or ()
+    return _BY_STATUS.get(code, KubeError)(code, str(body.get("reason") or "Unknown"), message, causes)

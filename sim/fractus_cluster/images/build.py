@@ -25,7 +25,7 @@ BASE_IMAGE = f"{PREFIX}/base:trixie"
 
 _SOURCES = (
     "Dockerfile", ".dockerignore", "pyproject.toml", "uv.lock", "sim/pyproject.toml", "README.md", "LICENSE",
-    "core", "runtime", "operator", "agent", "services", "cli", "view/fractus_view", "sdk", "proto",
+    "core", "runtime", "operator", "agent", "services", "cli", "view/fractus_view", "management", "sdk", "proto",
 )  # fmt: skip
 """Sources of every image, because each image contains the whole distribution fractus-drones."""
 _MORE_SOURCES: Mapping[str, tuple[str, ...]] = MappingProxyType(
@@ -36,6 +36,7 @@ _MORE_SOURCES: Mapping[str, tuple[str, ...]] = MappingProxyType(
         "mobility": (),
         "camera": (),
         "view": (),
+        "management": (),
         "sim": ("sim",),
         "example-traffic-monitoring": ("examples/traffic-monitoring",),
         "example-field": ("examples/field",),

@@ -1,0 +1,38 @@
+"""Settings of the management API."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+DEFAULT_NAMESPACE = "default"
+DEFAULT_REQUESTS_PER_S = 20.0
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """Settings of the management API.
+
+    Attributes:
+        namespace: Namespace of plans if a request names none.
+        decision_timeout_s: Seconds for which a request waits for the decision of the operator.
+        max_body_bytes: Maximum size of a request body in bytes.
+        body_timeout_s: Seconds within which a request body must arrive.
+        requests_per_s: Requests that a token may send per second in the long run. It may send five times as many at once.
+        max_streams: Maximum number of open event streams of this process.
+        max_streams_of_token: Maximum number of open event streams of a token.
+        keepalive_s: Seconds without an event after which a stream sends a comment.
+    """
+
+    namespace: str = DEFAULT_NAMESPACE
+    decision_timeout_s: float = 10.0
+    max_body_bytes: int = 2**20
+    body_timeout_s: float = 30.0
+    requests_per_s: float = DEFAULT_REQUESTS_PER_S
+    max_streams: int = 256
+    max_streams_of_token: int = 16
+    keepalive_s: float = 15.0
+
+    @property
+    def burst(self) -> float:
+        """Requests that a token may send at once."""
+        return 5 * self.requests_per_s

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import hashlib
 import json
+import logging
 import re
 import secrets
 from collections.abc import Callable
@@ -26,6 +27,8 @@ from fractus_management.api_server import Caller, CallerOf, Continue, Limit, Nam
 from fractus_management.openapi import etag_header, located, problems
 from fractus_management.problem_details import invalid, refused
 from fractus_management.request_bodies import merged, parsed_spec, spec_of
+
+log = logging.getLogger(__name__)
 
 PLAN = kind_of(FlightPlan)
 REQUEST_DIGEST = f"{GROUP}/request-digest"
@@ -250,10 +253,13 @@ async def progress(caller: CallerOf, name: ObjectName, namespace: Namespace = No
         if other is None:
             continue
         try:
-            found[part] = (await caller.client.get(kind, other, place)).get("status") or {}
+            read_status = (await caller.client.get(kind, other, place)).get("status")
         except KubeError as error:
             if error.status not in {HTTPStatus.FORBIDDEN, HTTPStatus.NOT_FOUND}:
                 raise
+            continue
+        if read_status:
+            found[part] = read_status
     return JSONResponse(found)
 
 
@@ -307,10 +313,10 @@ async def _write(
 
 
 async def _decided(caller: Caller, plan: Body) -> Body:
-    """Return a plan after the operator has considered its version, or its latest state after the time limit.
+    """Return a plan after the operator has considered its version, or its latest known state after the time limit.
 
     Raises:
-        KubeError: The plan was deleted meanwhile, or the API server did not respond.
+        NotFound: The plan was deleted meanwhile.
     """
     metadata = plan["metadata"]
     generation = metadata["generation"]
@@ -318,7 +324,7 @@ async def _decided(caller: Caller, plan: Body) -> Body:
     try:
         async with asyncio.timeout(timeout_s):
             while not _considered(plan, generation):
-                watch = caller.client.watch(
+                changes = caller.client.watch(
                     PLAN,
                     resource_version=plan["metadata"]["resourceVersion"],
                     namespace=metadata["namespace"],
@@ -326,8 +332,8 @@ async def _decided(caller: Caller, plan: Body) -> Body:
                     timeout_s=int(timeout_s) + 1,
                     silence_s=timeout_s + 5,
                 )
-                async with aclosing(watch):
-                    async for type_, body in watch:
+                async with aclosing(changes):
+                    async for type_, body in changes:
                         if type_ == "DELETED":
                             raise NotFound(404, "NotFound", f"the plan {metadata['name']} was deleted")
                         if type_ != "BOOKMARK":
@@ -336,10 +342,11 @@ async def _decided(caller: Caller, plan: Body) -> Body:
                             break
     except TimeoutError:
         pass
+    except NotFound:
+        raise
     except KubeError as error:
-        # Without permission to watch, the plan is returned as it was written.
-        if error.status != HTTPStatus.FORBIDDEN:
-            raise
+        # The plan is stored, so the request has succeeded. The caller may lack the permission to watch.
+        log.info("management: decision not observed (plan=%s error=%s)", metadata["name"], error)
     return plan
 
 

@@ -118,7 +118,7 @@ def namespace(world: World, request: pytest.FixtureRequest) -> Iterator[str]:
 
 @pytest.fixture(scope="session")
 def management(control_plane: ControlPlane, tmp_path_factory: pytest.TempPathFactory) -> Iterator[ManagementServer]:
-    """The management API as a process, without credentials."""
+    """The management API as a process."""
     server = ManagementServer(control_plane, tmp_path_factory.mktemp("management") / "log")
     yield server
     assert server.stop() == 0

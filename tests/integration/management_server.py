@@ -42,13 +42,18 @@ class Reply:
 
 
 class ManagementServer:
-    """`fractus api serve` on a free port. It gets the address of the API server and no credentials."""
+    """`fractus api serve` on a free port.
+
+    By default, it gets the kubeconfig of the administrator, whose credentials it must not use.
+    """
 
     def __init__(self, plane: ControlPlane, log: Path, *options: str) -> None:
         port = free_port()
         self.url = f"http://127.0.0.1:{port}"
         self.log = log
-        argv = ["api", "serve", f"--listen=127.0.0.1:{port}", f"--server={plane.server}", f"--ca={plane.ca}", *options]
+        argv = ["api", "serve", f"--listen=127.0.0.1:{port}", *options]
+        if not any(option.startswith("--server") for option in options):
+            argv.append(f"--kubeconfig={plane.kubeconfig}")
         with log.open("ab") as output:
             self._process = subprocess.Popen(
                 [sys.executable, "-m", "fractus_cli", *argv],

@@ -52,6 +52,9 @@ POLICIES = (
     "fractus-flight-system",
     "fractus-flight-node-status",
     "fractus-flight-kinds",
+    "fractus-flight-priority",
+    "fractus-flight-applications",
+    "fractus-template-approval",
 )
 SIDECAR = "fractus-mavlink"
 """Container of the operator that connects a MAVLink program to the gateway of its drone."""

@@ -73,8 +73,20 @@ def open_cluster(config: str | None) -> Iterator[ClusterReader]:
         Unconfigured: There are no credentials.
         ClickException: The API server rejected a request or is unreachable.
     """
-    with kube_errors_explained(), BlockingClient(asyncio.run(access_to(config)), "fractus", trust_env=True) as client:
+    with open_client(config) as client:
         yield ClusterReader(client)
+
+
+@contextmanager
+def open_client(config: str | None) -> Iterator[BlockingClient]:
+    """Open a client for the cluster of a kubeconfig, or for the default cluster of kubectl.
+
+    Raises:
+        Unconfigured: There are no credentials.
+        ClickException: The API server rejected a request or is unreachable.
+    """
+    with kube_errors_explained(), BlockingClient(asyncio.run(access_to(config)), "fractus", trust_env=True) as client:
+        yield client
 
 
 async def access_to(config: str | None) -> Access:
@@ -116,13 +128,27 @@ def get_application(cluster: ClusterReader, namespace: str, name: str) -> Body:
     Raises:
         ClickException: The Application does not exist. The message suggests the closest name.
     """
-    body = cluster.get(f"{GROUP}/namespaces/{namespace}/applications/{name}")
+    return _get_named(cluster, "Application", namespace, name, "`fractus status` lists Applications")
+
+
+def get_flight_plan(cluster: ClusterReader, namespace: str, name: str) -> Body:
+    """Return a FlightPlan.
+
+    Raises:
+        ClickException: The FlightPlan does not exist. The message suggests the closest name.
+    """
+    return _get_named(cluster, "FlightPlan", namespace, name, "`fractus flights list` lists FlightPlans")
+
+
+def _get_named(cluster: ClusterReader, kind: str, namespace: str, name: str, remedy: str) -> Body:
+    collection = f"{GROUP}/namespaces/{namespace}/{kind.lower()}s"
+    body = cluster.get(f"{collection}/{name}")
     if body is not None:
         return body
-    bodies = cluster.list_permitted(f"{GROUP}/namespaces/{namespace}/applications") or ()
+    bodies = cluster.list_permitted(collection) or ()
     similar = difflib.get_close_matches(name, [b["metadata"]["name"] for b in bodies], n=1)
-    hint = f"did you mean {similar[0]}?" if similar else "`fractus status` lists Applications"
-    raise click.ClickException(f"Application {namespace}/{name} not found; {hint}")
+    hint = f"did you mean {similar[0]}?" if similar else remedy
+    raise click.ClickException(f"{kind} {namespace}/{name} not found; {hint}")
 
 
 def conditions_of(body: Body) -> dict[str, Body]:

@@ -72,6 +72,7 @@ COMMANDS: dict[str, Entry] = {
     "doctor": Entry("fractus_cli.doctor:doctor", "Check a cluster and print a remedy for each problem.", "operator"),
     "experiment": Entry("fractus_sim.experiment_command:experiment", "Run experiments with faults, checks and a report.", "sim"),
     "explain": Entry("fractus_cli.explain:explain", "Explain the plan of an Application.", "kube"),
+    "flights": Entry("fractus_cli.flights:flights", "Order, start, watch and end flights of approved applications.", "operator"),
     "gateway": Entry("fractus_services.commands:gateway", "Run the gateway for MAVLink programs.", "services"),
     "grants": Entry("fractus_cli.grants:grants", "Sign Grants and issue certificates, without Kubernetes.", "operator"),
     "images": Entry("fractus_cluster.images.cli:images", "Build the container images of Fractus with buildah.", "sim"),

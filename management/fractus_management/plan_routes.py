@@ -13,6 +13,7 @@ from contextlib import aclosing
 from http import HTTPStatus
 from typing import Annotated, Any
 
+import fastapi
 from fastapi import APIRouter, Header, Response
 from fastapi.responses import JSONResponse
 from fractus_core.api import GROUP, Application, Drone, FlightPlan, InvalidObject
@@ -59,7 +60,9 @@ def _object(value: Any) -> Any:
     return value
 
 
-MergePatch = Annotated[dict[str, Any], BeforeValidator(_object)]
+MergePatch = Annotated[
+    dict[str, Any], fastapi.Body(media_type="application/merge-patch+json"), BeforeValidator(_object)
+]
 
 
 class PlanList(Model):

@@ -31,6 +31,9 @@ def flight_lines(plan: Body) -> Iterator[str]:
         yield f"Drone: {status['drone']}"
     if status.get("application"):
         yield f"Application: {status['application']}"
+    if status.get("candidates"):
+        fitting = ", ".join(f"{each['node']} ({each['score']:.3g})" for each in status["candidates"])
+        yield f"Suitable drones, best first: {fitting}"
     yield from _findings("Refused", status.get("refusals") or ())
     if status.get("rejected"):
         yield "Rejected drones:"

@@ -118,10 +118,12 @@ def test_order_without_name_lets_the_server_choose_one(run: Run, api: FakeApi) -
     assert "Next: fractus flights start survey-x7k2p -n team" in output
 
 
-def test_check_orders_a_dry_run(run: Run, api: FakeApi) -> None:
+def test_check_orders_a_dry_run_and_lists_suitable_drones(run: Run, api: FakeApi) -> None:
+    api.decision["candidates"] = [{"node": "drone-1", "score": 12.5}, {"node": "drone-2", "score": 3}]
     _, output = run("order", "survey", *PLACE, *WINDOW, "-n", "team", "--check")
     assert api.plans["survey-x7k2p"]["spec"]["dryRun"] is True
     assert "a check that reserves nothing" in output
+    assert "Suitable drones, best first: drone-1 (12.5), drone-2 (3)" in output
     assert "Next:" not in output
 
 

@@ -69,7 +69,17 @@ def create_app(settings: Settings, client: Client | None = None) -> FastAPI:
         app.include_router(router, prefix="/v1")
     app.include_router(thesis_routes.router)
     app.include_router(health)
+    if settings.automated_testing is not None:
+        _include_automated_testing(app)
     return app
+
+
+def _include_automated_testing(app: FastAPI) -> None:
+    # Only this adapter needs the packages of the extra `geometry`.
+    from fractus_management.interuss import routes as interuss_routes  # noqa: PLC0415
+
+    app.state.kept_responses = interuss_routes.KeptResponses()
+    app.include_router(interuss_routes.router)
 
 
 def collect(app: FastAPI) -> Iterator[Metric]:

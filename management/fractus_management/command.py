@@ -7,6 +7,7 @@ import os
 import signal
 from collections.abc import Awaitable
 from contextlib import aclosing
+from importlib.util import find_spec
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -28,7 +29,7 @@ from fractus_runtime.open_files import TooFewOpenFiles, raise_open_files
 
 from fractus_management.app import collect, create_app
 from fractus_management.openapi import text
-from fractus_management.settings import DEFAULT_NAMESPACE, DEFAULT_REQUESTS_PER_S, Settings
+from fractus_management.settings import DEFAULT_NAMESPACE, DEFAULT_REQUESTS_PER_S, AutomatedTesting, Settings
 
 DEFAULT_LISTEN = "127.0.0.1:8660"
 GRACE_S = 20
@@ -89,6 +90,15 @@ def _address(_context: click.Context, _option: click.Parameter, value: str) -> t
 @click.option(
     "--metrics", default="", metavar="[HOST]:PORT", help="Address of the Prometheus metrics. Default: no metrics."
 )
+@click.option(
+    "--automated-testing", "template", metavar="TEMPLATE",
+    help="Also serve InterUSS' flight planning interface for automated testing below /flight_planning/v1, with flights of this"
+    " ApplicationTemplate. It removes flight plans on request: use a namespace for tests only.",
+)  # fmt: skip
+@click.option(
+    "--geoid", type=click.FloatRange(-110, 90), default=0.0, show_default=True, metavar="METRES",
+    help="For --automated-testing: height of the geoid above the WGS 84 ellipsoid where the tests fly.",
+)  # fmt: skip
 def serve(
     *,
     listen: tuple[str, int],
@@ -99,6 +109,8 @@ def serve(
     namespace: str,
     requests_per_second: float,
     metrics: str,
+    template: str | None,
+    geoid: float,
 ) -> None:
     """Serve the API until SIGTERM or SIGINT.
 
@@ -116,7 +128,12 @@ def serve(
         raise_open_files()
     except TooFewOpenFiles as error:
         raise click.ClickException(str(error)) from None
-    settings = Settings(namespace, requests_per_s=requests_per_second)
+    if template is not None and find_spec("shapely") is None:
+        raise click.ClickException(
+            "--automated-testing requires shapely; install it with: pip install 'fractus-drones[geometry]'"
+        )
+    testing = AutomatedTesting(template, geoid) if template is not None else None
+    settings = Settings(namespace, requests_per_s=requests_per_second, automated_testing=testing)
     asyncio.run(_serve(listen, settings, _access(server, ca, context, kubeconfig), metrics))
 
 

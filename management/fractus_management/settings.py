@@ -9,6 +9,19 @@ DEFAULT_REQUESTS_PER_S = 20.0
 
 
 @dataclass(frozen=True, slots=True)
+class AutomatedTesting:
+    """Settings of the adapter for InterUSS' automated testing.
+
+    Attributes:
+        template: ApplicationTemplate of flights that name none.
+        geoid_m: Height of the geoid above the ellipsoid where the tests fly, in metres.
+    """
+
+    template: str
+    geoid_m: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
 class Settings:
     """Settings of the management API.
 
@@ -21,6 +34,7 @@ class Settings:
         max_streams: Maximum number of open event streams of this process.
         max_streams_of_token: Maximum number of open event streams of a token.
         keepalive_s: Seconds without an event after which a stream sends a comment.
+        automated_testing: Settings of the adapter for InterUSS' automated testing. None: the adapter is not served.
     """
 
     namespace: str = DEFAULT_NAMESPACE
@@ -31,6 +45,7 @@ class Settings:
     max_streams: int = 256
     max_streams_of_token: int = 16
     keepalive_s: float = 15.0
+    automated_testing: AutomatedTesting | None = None
 
     @property
     def burst(self) -> float:

@@ -49,6 +49,15 @@ SWERVE_M = 5.0
 SWERVE_MPS = 20.0
 """Documented distance by which a drone may leave its course after a jump: without delay, and in addition per second of round trip."""
 
+FAST_SWERVE_S = 0.8
+FAST_SWERVE_SHARE = 2.0
+"""The same for a fast drone, as multiples of its speed: these replace the two above if they are larger.
+
+A drone that brakes before the end of its leg may accelerate instead for the time T until its stop begins. It is then faster by
+up to 2 * acceleration * T, which makes its way to stop longer by 2 * speed * T. Without delay, T is the reaction and the time
+until the next position: 0.35 s. The rest covers the turn itself.
+"""
+
 SLOW_TURN_S = 0.5
 SLOW_TURN_MPS = 25.0
 """Documented increase of this distance for a drone that needs longer than `SLOW_TURN_S` to undo its acceleration.
@@ -58,15 +67,18 @@ WPNAV_ACCEL / PSC_JERK_XY: 0.5 s with its default parameters.
 """
 
 
-def swerve_m(round_trip_s: Floats, turn_s: Floats) -> Floats:
+def swerve_m(round_trip_s: Floats, turn_s: Floats, speed_mps: Floats) -> Floats:
     """Return how far a drone may leave its course between a jump of its estimate and the end of its stop, in metres.
 
     Args:
         round_trip_s: Delay of the link.
         turn_s: Time in which the drone undoes its acceleration.
+        speed_mps: Horizontal speed at the jump.
     """
+    base_m = np.maximum(SWERVE_M, FAST_SWERVE_S * speed_mps)
+    late_mps = np.maximum(SWERVE_MPS, FAST_SWERVE_SHARE * speed_mps)
     slow_m = SLOW_TURN_MPS * np.maximum(turn_s - SLOW_TURN_S, 0.0)
-    return SWERVE_M + SWERVE_MPS * np.maximum(round_trip_s, 0.0) + slow_m
+    return base_m + late_mps * np.maximum(round_trip_s, 0.0) + slow_m
 
 
 @dataclass(frozen=True)
@@ -110,7 +122,8 @@ class PositionFaultFlights:
         jumped.goal[:, :2] -= jump
         paths = [_fly(each, jump_s, allowed, rows, tally, "") for each in (course, jumped)]
         away = np.linalg.norm(paths[0] - paths[1], axis=2).max(axis=0)
-        bound = swerve_m(straight.latency - REACTION_S, straight.accels / straight.jerks)
+        speed = np.linalg.norm(fleet.speed[rows, :2], axis=1)
+        bound = swerve_m(straight.latency - REACTION_S, straight.accels / straight.jerks, speed)
         for i in np.flatnonzero(away > bound):
             tally.wrong.append(
                 f"seed {self.seed}, drone {rows[i]} left its course by {away[i]:.1f} m after a jump, more than {bound[i]:.1f} m"

@@ -38,6 +38,11 @@ scenario-field: env ## Fly the field experiment and leave its report in out/fiel
 	$(RUN) python -m fractus_sim.scenarios.field --out $(OUT)/field --speedup $(SPEEDUP) \
 		$(if $(AUTOPILOT),--autopilot $(AUTOPILOT)) $(if $(RESTORE),--restore)
 
+.PHONY: scenario-monitor
+scenario-monitor: env ## Fly a DroneKit program that leaves its course, with and without policies, and leave the report in out/monitor (AUTOPILOT=, RESTORE= as above)
+	$(RUN) python -m fractus_sim.scenarios.monitor --out $(OUT)/monitor --speedup $(SPEEDUP) \
+		$(if $(AUTOPILOT),--autopilot $(AUTOPILOT)) $(if $(RESTORE),--restore)
+
 .PHONY: scenario-links
 scenario-links: packages uv ## Fly past edge nodes with WiFi on an embedded cluster and leave the report in out/links (FACTOR=1: ratio of real to declared radio range)
 	$(SIM) python -m fractus_sim.scenarios.links --out $(OUT)/links --factor $(or $(FACTOR),1)

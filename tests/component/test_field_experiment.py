@@ -6,10 +6,11 @@ import shapely
 from fractus_core.geo import LocalFrame
 from fractus_sim.report.flight_record import JudgedCall
 from fractus_sim.report.track import Place, Sample, Track
-from fractus_sim.scenarios.field.field_evidence import Evidence
-from fractus_sim.scenarios.field.field_flight import HOVER_S, PICTURE_INTERVAL_S, RUNS, Run, navigator_environment
+from fractus_sim.scenarios.field.field_flight import HOVER_S, PICTURE_INTERVAL_S, RUNS, navigator_environment
 from fractus_sim.scenarios.field.field_report import draw_map
 from fractus_sim.scenarios.field.field_site import ABOVE_STRIPE, EXAMPLE, VIEWER, FieldSite
+from fractus_sim.scenarios.scenario_evidence import Evidence
+from fractus_sim.scenarios.scenario_flight import ScenarioRun
 
 SITE = FieldSite.read(EXAMPLE)
 HOVER_ERROR_M = 3.0
@@ -38,7 +39,7 @@ def test_map_legend_shows_the_run_of_each_picture() -> None:
     assert len(arrows) >= len(runs), "each path has an arrow in flight direction"
 
 
-def _flown(run: Run, east: float) -> Evidence:
+def _flown(run: ScenarioRun, east: float) -> Evidence:
     def place(north: float) -> Place:
         return Place(*SITE.frame.latlon(east, north), 10.0)
 

@@ -16,10 +16,11 @@ from fractus_sim.errors import ExperimentError
 from fractus_sim.report.flight_record import JudgedCall
 from fractus_sim.report.report_files import Expectation
 from fractus_sim.report.track import Place, Sample, Track
-from fractus_sim.scenarios.field.field_evidence import Evidence, read_evidence
 from fractus_sim.scenarios.field.field_expectations import RunEvaluation
 from fractus_sim.scenarios.field.field_report import field_results, write_field_report
-from fractus_sim.scenarios.field.field_site import FieldSite, format_position
+from fractus_sim.scenarios.field.field_site import FieldSite
+from fractus_sim.scenarios.scenario_evidence import Evidence, read_evidence
+from fractus_sim.scenarios.scenario_site import format_position
 from fractus_sim.testbeds.vehicle_settings import parse_link
 from vehicle_world import alone
 

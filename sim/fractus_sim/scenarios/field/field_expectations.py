@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import shapely
 from fractus_core.api.geometry import Point
@@ -13,8 +12,9 @@ from fractus_core.geo import geodesic_m
 from fractus_sim.report.flight_record import JudgedCall
 from fractus_sim.report.report_files import Expectation
 from fractus_sim.report.track import Sample
-from fractus_sim.scenarios.field.field_evidence import SYSTEM, Evidence
-from fractus_sim.scenarios.field.field_site import NAVIGATOR, FieldSite, Position
+from fractus_sim.scenarios.field.field_site import NAVIGATOR, FieldSite
+from fractus_sim.scenarios.scenario_evidence import SYSTEM, Evidence
+from fractus_sim.scenarios.scenario_site import Position
 
 REACHED_M = 2.0
 SAME_POSITION_M = 0.5
@@ -43,21 +43,6 @@ def evaluate_run(site: FieldSite, run: Evidence) -> list[Expectation]:
         "unguarded": evaluation.unguarded,
     }
     return evaluations[run.name]()
-
-
-def evaluate_owner(run: str, differences: Sequence[str]) -> Expectation:
-    """Evaluate if a running autopilot has the settings of its owner again after a run.
-
-    Args:
-        run: Name of the run.
-        differences: Differences as sentences.
-    """
-    return Expectation(
-        "the vehicle has the parameters, the fence and the rally points of its owner again",
-        not differences,
-        "; ".join(differences) or "no difference",
-        run,
-    )
 
 
 class RunEvaluation:

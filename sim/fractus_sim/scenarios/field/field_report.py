@@ -22,9 +22,9 @@ from fractus_sim.report.report_files import (
     table,
     write_report,
 )
-from fractus_sim.scenarios.field.field_evidence import Evidence
 from fractus_sim.scenarios.field.field_expectations import MAX_ALTITUDE_M, MIN_ALTITUDE_M
 from fractus_sim.scenarios.field.field_site import NAVIGATOR, FieldSite
+from fractus_sim.scenarios.scenario_evidence import Evidence
 
 
 def write_field_report(

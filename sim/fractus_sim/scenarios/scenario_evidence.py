@@ -33,6 +33,7 @@ class Evidence:
         track: Flight, on the clock of the autopilot.
         calls: Calls of the components and actions of the system, in order.
         texts: STATUSTEXT messages of the autopilot.
+        position_errors: Horizontal accuracies that the GPS receiver reported: time in seconds, and error in metres.
     """
 
     name: str
@@ -41,6 +42,7 @@ class Evidence:
     track: Track
     calls: tuple[JudgedCall, ...]
     texts: tuple[str, ...]
+    position_errors: tuple[tuple[float, float], ...] = ()
 
     def gotos(self) -> list[JudgedCall]:
         """Return all Goto calls, including the calls of the system during transit flights."""
@@ -55,7 +57,9 @@ class Evidence:
 
     def takeover(self) -> JudgedCall | None:
         """Return the action by which the system took control permanently. Return None if it never took control."""
-        return next((c for c in self.calls if c.caller == SYSTEM and c.method in ("revoke", "returnToLaunch")), None)
+        return next(
+            (c for c in self.calls if c.caller == SYSTEM and c.method in ("landAt", "revoke", "returnToLaunch")), None
+        )
 
 
 def read_evidence(name: str, title: str, *, policies: bool, tlog: Path, audits: tuple[Path, ...]) -> Evidence:
@@ -65,15 +69,21 @@ def read_evidence(name: str, title: str, *, policies: bool, tlog: Path, audits: 
         OSError: A log is missing.
         ValueError: The tlog contains no flight.
     """
-    samples, clock, texts = _read_flight(tlog)
+    flight = _read_flight(tlog)
     calls = [
         call
         for path in audits
         for entry in entries(path.read_bytes().splitlines())
-        if (call := _call(entry, clock)) is not None
+        if (call := _call(entry, flight.clock)) is not None
     ]
     return Evidence(
-        name, title, policies, Track(title, samples), tuple(sorted(calls, key=lambda c: c.time_s)), tuple(texts)
+        name,
+        title,
+        policies,
+        Track(title, tuple(flight.samples)),
+        tuple(sorted(calls, key=lambda c: c.time_s)),
+        tuple(flight.texts),
+        tuple(flight.position_errors),
     )
 
 
@@ -109,11 +119,20 @@ def _messages(path: Path) -> Iterator[tuple[float, Message]]:
             yield time_s, message
 
 
-def _read_flight(path: Path) -> tuple[tuple[Sample, ...], _AutopilotClock, list[str]]:
-    """Return the samples, the clock and the STATUSTEXT messages of a tlog."""
-    clock = _AutopilotClock()
-    samples = list[Sample]()
-    texts = list[str]()
+class _Flight:
+    """Contents of a tlog."""
+
+    def __init__(self) -> None:
+        self.samples: list[Sample] = []
+        self.clock = _AutopilotClock()
+        self.texts: list[str] = []
+        self.position_errors: list[tuple[float, float]] = []
+
+
+def _read_flight(path: Path) -> _Flight:
+    """Read the messages of the autopilot in a tlog."""
+    flight = _Flight()
+    samples = flight.samples
     mode = ""
     armed = False
     landed_state = 0
@@ -130,10 +149,12 @@ def _read_flight(path: Path) -> tuple[tuple[Sample, ...], _AutopilotClock, list[
         elif message.name == "SYS_STATUS":
             battery = max(message.integer("battery_remaining"), 0) / 100.0
         elif message.name == "STATUSTEXT":
-            texts.append(message.text("text"))
+            flight.texts.append(message.text("text"))
+        elif message.name == "GPS_RAW_INT" and samples:
+            flight.position_errors.append((samples[-1].time_s, message.integer("h_acc") / 1000.0))
         elif message.name == "GLOBAL_POSITION_INT":
             boot_s = message.integer("time_boot_ms") / 1000.0
-            clock.add(unix_s, boot_s)
+            flight.clock.add(unix_s, boot_s)
             if samples and boot_s - samples[-1].time_s < _SAMPLE_S:
                 continue
             altitude_m = message.integer("relative_alt") / 1000.0
@@ -144,7 +165,7 @@ def _read_flight(path: Path) -> tuple[tuple[Sample, ...], _AutopilotClock, list[
     if samples and not armed:
         # The vehicle has disarmed after the last recorded position.
         samples[-1] = replace(samples[-1], in_air=False)
-    return tuple(samples), clock, texts
+    return flight
 
 
 def _is_flying(landed_state: int, altitude_m: float) -> bool:

@@ -54,6 +54,25 @@ def test_program_takes_off_flies_a_target_and_a_velocity_and_returns(tmp_path: P
     fly(flight, tmp_path)
 
 
+def test_answers_are_sent_as_soon_as_they_are_known(tmp_path: Path) -> None:
+    """An upload of 650 mission items waits for an answer to each item."""
+
+    async def flight(world):
+        grant = world.drone.grants.put(mavlink_spec())
+        program = await world.program(grant.identity)
+        await program.until(lambda: program.mode == GUIDED)
+        loop = asyncio.get_running_loop()
+        begun_s = loop.time()
+        for number in range(50):
+            program.send("PING", seq=number, target_system=0, target_component=0)
+            while "PING" not in program.latest or program.latest["PING"].integer("seq") != number:  # noqa: ASYNC110
+                await asyncio.sleep(0.001)
+        assert loop.time() - begun_s < 0.3
+        await program.close()
+
+    fly(flight, tmp_path)
+
+
 @pytest.mark.parametrize(("altitude_cm", "expected_m"), [(2500.0, 25.0), (9000.0, 60.0)])
 def test_program_returns_at_the_altitude_that_it_has_written_within_the_limits(
     altitude_cm: float, expected_m: float, tmp_path: Path

@@ -156,7 +156,7 @@ class Gateway:
         log.info("gateway: program connected (instance=%s)", identity)
         sending = asyncio.get_running_loop().create_task(self._send(session, writer, recorder))
         try:
-            await self._receive(instance, session, reader)
+            await self._receive(instance, session, reader, writer, recorder)
         except (ConnectionError, ssl.SSLError, TimeoutError):
             pass
         finally:
@@ -203,7 +203,14 @@ class Gateway:
         task.cancel()
         await asyncio.gather(task, return_exceptions=True)
 
-    async def _receive(self, instance: Instance, session: Session, reader: asyncio.StreamReader) -> None:
+    async def _receive(
+        self,
+        instance: Instance,
+        session: Session,
+        reader: asyncio.StreamReader,
+        writer: asyncio.StreamWriter,
+        recorder: Recorder,
+    ) -> None:
         loop = asyncio.get_running_loop()
         while data := await reader.read(READ_BYTES):
             for call in session.receive(data, loop.time()):
@@ -215,18 +222,27 @@ class Gateway:
                     continue
                 entry = {"identity": instance.identity, "message": refusal.name, "reason": refusal.reason}
                 self._audit.append("mavlink_refused", entry)
+            self._write(session, writer, recorder)
             delay_s = session.delay_s(loop.time())
-            await asyncio.sleep(delay_s if delay_s > TICK_S else 0.0)  # other connections run in between
+            if delay_s > TICK_S:
+                await asyncio.sleep(delay_s)
+            elif len(data) == READ_BYTES:
+                await asyncio.sleep(0.0)  # the next bytes have arrived already, and other connections run in between
 
     async def _send(self, session: Session, writer: asyncio.StreamWriter, recorder: Recorder) -> None:
         loop = asyncio.get_running_loop()
         while not writer.is_closing():
             session.step(loop.time())
-            data = session.take()
-            if data and writer.transport.get_write_buffer_size() < MAX_UNSENT_BYTES:
-                writer.write(data)
-                recorder.take_received(data)
+            self._write(session, writer, recorder)
             await asyncio.sleep(TICK_S)
+
+    @staticmethod
+    def _write(session: Session, writer: asyncio.StreamWriter, recorder: Recorder) -> None:
+        """Send what the session has for the program. Drop it while the program does not read."""
+        data = session.take()
+        if data and writer.transport.get_write_buffer_size() < MAX_UNSENT_BYTES:
+            writer.write(data)
+            recorder.take_received(data)
 
     async def close(self) -> None:
         """Close all connections, and wait until their instances have ended."""

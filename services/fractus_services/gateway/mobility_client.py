@@ -16,6 +16,8 @@ from google.rpc import code_pb2, status_pb2
 MAX_MESSAGE_BYTES = 4 * 1024 * 1024
 """Maximum size of a message from the mobility service. A list of parameters has about 40 kB."""
 
+READ_BYTES = 64 * 1024
+
 _LENGTH = struct.Struct(">I")
 
 _Reply = TypeVar("_Reply", bound=ProtobufMessage)
@@ -125,21 +127,36 @@ class MobilityClient:
                 self._send(gateway_pb2.GatewayRequest(id=number, cancel=True))
 
     async def _read(self) -> None:
+        received = bytearray()
         try:
-            while True:
-                (length,) = _LENGTH.unpack(await self._reader.readexactly(_LENGTH.size))
-                if length > MAX_MESSAGE_BYTES:
+            while data := await self._reader.read(READ_BYTES):
+                received += data
+                if not self._take_responses(received):
                     return
-                response = gateway_pb2.GatewayResponse.FromString(await self._reader.readexactly(length))
-                queue = self._waiting.get(response.id)
-                if queue is not None:
-                    queue.put_nowait(response)
-        except (asyncio.IncompleteReadError, ConnectionError):
+        except ConnectionError:
             return
         finally:
             self.closed.set()
             for queue in self._waiting.values():
                 queue.put_nowait(None)
+
+    def _take_responses(self, received: bytearray) -> bool:
+        """Remove complete responses from the received bytes. Return False if a response is too long."""
+        start = 0
+        while len(received) - start >= _LENGTH.size:
+            (length,) = _LENGTH.unpack_from(received, start)
+            if length > MAX_MESSAGE_BYTES:
+                return False
+            body = start + _LENGTH.size
+            if len(received) - body < length:
+                break
+            start = body + length
+            response = gateway_pb2.GatewayResponse.FromString(bytes(received[body:start]))
+            queue = self._waiting.get(response.id)
+            if queue is not None:
+                queue.put_nowait(response)
+        del received[:start]
+        return True
 
     def _send(self, request: gateway_pb2.GatewayRequest) -> None:
         if not self._writer.is_closing():

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import asyncio
+import os
+import time
 from pathlib import Path
 
 import sky_drone
 from closed_loop import Sky
+from fractus_core.api.names import ComponentIdentity
 from fractus_core.control import OutcomeKind
 from gateway_world import ACCEPTED, DENIED, GUIDED, Flight, flying, item, mavlink_spec, waypoint
 from mobility_world import zone
@@ -262,5 +265,28 @@ def test_rally_points_are_stored(tmp_path: Path) -> None:
         assert await program.upload(waypoint(0, -15, 10, command=5100), kind=2) == mavlink.MAV_MISSION_ACCEPTED
         assert len(await program.download(2)) == 1
         await program.close()
+
+    fly(flight, tmp_path)
+
+
+def test_lists_of_an_instance_that_has_not_connected_for_a_week_are_removed(tmp_path: Path) -> None:
+    async def flight(world):
+        grant = world.drone.grants.put(mavlink_spec())
+        program = await world.program(grant.identity)
+        await program.until(lambda: program.mode == GUIDED)
+        directory = tmp_path / "missions"
+        directory.mkdir(exist_ok=True)
+        parsed = ComponentIdentity.parse(grant.identity)
+        connected = directory / f"{parsed.namespace}.{parsed.instance}.json"
+        old = directory / "default.ended.json"
+        recent = directory / "default.recent.json"
+        for file, days in ((connected, 8), (old, 8), (recent, 6)):
+            file.write_text("{}")
+            os.utime(file, (time.time() - days * 86_400,) * 2)
+        world.gateway.remove_unused_missions(time.time())
+        assert sorted(directory.glob("*.json")) == sorted([connected, recent])
+        os.utime(connected, (0.0, 0.0))
+        await program.close()
+        await program.until(lambda: connected.stat().st_mtime > 0.0)  # its time begins when the last connection ends
 
     fly(flight, tmp_path)

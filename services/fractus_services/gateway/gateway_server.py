@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import os
 import ssl
 import time
 from collections.abc import Callable
@@ -46,6 +47,12 @@ AUDITED_BURST = 50.0
 
 PROBLEM_INTERVAL_S = 5.0
 """Interval at which the certificate and the socket of the mobility service are checked."""
+
+MISSIONS_KEPT_S = 7 * 86_400.0
+"""Time for which the stored lists of an instance are kept after its last connection."""
+
+REMOVAL_INTERVAL_S = 3600.0
+"""Interval at which unused lists are removed. After a start, programs have this time to connect again."""
 
 MAX_CONNECTIONS = 64
 MAX_CONNECTIONS_PER_INSTANCE = 4
@@ -177,8 +184,7 @@ class Gateway:
         if len(self._writers) >= MAX_CONNECTIONS:
             return None
         if entry is None:
-            missions = self._missions / f"{_file_name(identity)}.json"
-            instance = Instance(identity, self._socket, missions, self.metrics.observe)
+            instance = Instance(identity, self._socket, self._missions_of(identity), self.metrics.observe)
             instance.certificate = certificate
             task = asyncio.get_running_loop().create_task(instance.run())
             task.add_done_callback(partial(self._close_failed, identity))
@@ -198,7 +204,26 @@ class Gateway:
             if owner == identity:
                 writer.close()
 
+    def _missions_of(self, identity: str) -> Path:
+        """Return the file with the stored lists of an instance."""
+        return self._missions / f"{_file_name(identity)}.json"
+
+    def remove_unused_missions(self, now_s: float) -> None:
+        """Remove the stored lists of instances that have not been connected for `MISSIONS_KEPT_S`.
+
+        Args:
+            now_s: Unix time.
+        """
+        for identity in self._instances:
+            _note_use(self._missions_of(identity))
+        for file in self._missions.glob("*.json"):
+            with suppress(OSError):  # tried again after the next interval
+                if now_s - file.stat().st_mtime > MISSIONS_KEPT_S:
+                    file.unlink()
+                    log.info("gateway: unused missions removed (file=%s)", file.name)
+
     async def _detach(self, identity: str) -> None:
+        _note_use(self._missions_of(identity))
         _, task = self._instances.pop(identity)
         task.cancel()
         await asyncio.gather(task, return_exceptions=True)
@@ -300,15 +325,23 @@ async def _serve(options: GatewayOptions, tls: TlsFiles, stop: asyncio.Event) ->
         ) from None
     audit.append("started", {"listen": options.listen})
     log.info("gateway: serving (address=%s)", options.listen)
-    reload = asyncio.get_running_loop().create_task(_reload(context, options.tls))
+    loop = asyncio.get_running_loop()
+    helpers = (loop.create_task(_reload(context, options.tls)), loop.create_task(_remove_unused_missions(gateway)))
     try:
         async with serve_metrics(options.metrics, gateway.metrics.collect):
             await stop.wait()
     finally:
-        reload.cancel()
+        for helper in helpers:
+            helper.cancel()
         server.close()
         await gateway.close()
         await audit.close()
+
+
+async def _remove_unused_missions(gateway: Gateway) -> None:
+    while True:
+        await asyncio.sleep(REMOVAL_INTERVAL_S)
+        gateway.remove_unused_missions(time.time())
 
 
 async def _report_problems(options: GatewayOptions, tls: TlsFiles) -> None:
@@ -353,6 +386,12 @@ def open_recorder(options: GatewayOptions, identity: str) -> Recorder:
     name = _file_name(identity)
     directory = options.recordings / name if options.recordings is not None else None
     return Recorder(segments_in(directory, options.recordings_mb), name, MavlinkDecoder(name))
+
+
+def _note_use(file: Path) -> None:
+    """Set the time of the latest use of a file, if there is one."""
+    with suppress(OSError):
+        os.utime(file)
 
 
 def _file_name(identity: str) -> str:

@@ -180,6 +180,7 @@ def test_repeated_request_gets_the_first_response(send: Send, plan_id: str) -> N
     assert close(send, plan_id) == ("Completed", "Closed")
     assert put(send, plan_id, flight(), request_id="one") == ("Completed", "Planned")
     assert send("DELETE", f"/flight_plans/{plan_id}").status == 404
+    assert put(send, str(uuid.uuid4()), flight(upper=90), request_id="one") == ("Rejected", "NotPlanned")
 
 
 def test_clear_area_removes_the_plans_in_the_extent(send: Send, plan_id: str, world: World, tests: str) -> None:
@@ -198,7 +199,7 @@ def test_clear_area_removes_the_plans_in_the_extent(send: Send, plan_id: str, wo
 
 
 def test_conflict_that_arose_is_notified(send: Send, plan_id: str, world: World, tests: str) -> None:
-    begin = datetime.now(UTC) - timedelta(seconds=2)
+    begin = datetime.now(UTC)
     assert put(send, plan_id, flight()) == ("Completed", "Planned")
     urgent = fractus_object(
         "FlightPlan",

@@ -6,7 +6,7 @@ import asyncio
 import time
 from collections import OrderedDict
 from collections.abc import Callable
-from datetime import datetime
+from datetime import datetime, timedelta
 from http import HTTPStatus
 from typing import Annotated, Any, cast
 from uuid import UUID
@@ -55,18 +55,18 @@ router = APIRouter(prefix=PREFIX, include_in_schema=False)
 
 
 class KeptResponses:
-    """Latest responses by caller and request_id, so that a repeated request gets the response of the first one."""
+    """Latest responses by caller and request, so that a repeated request gets the response of the first one."""
 
     def __init__(self) -> None:
         self._kept: OrderedDict[tuple[bytes, str], Body] = OrderedDict()
 
-    def get(self, caller: Caller, request_id: str) -> Body | None:
+    def get(self, caller: Caller, key: str) -> Body | None:
         """Return the response to an earlier request, or None."""
-        return self._kept.get((caller.token_hash, request_id))
+        return self._kept.get((caller.token_hash, key))
 
-    def put(self, caller: Caller, request_id: str, response: Body) -> Body:
+    def put(self, caller: Caller, key: str, response: Body) -> Body:
         """Keep a response and return it."""
-        self._kept[caller.token_hash, request_id] = response
+        self._kept[caller.token_hash, key] = response
         if len(self._kept) > _KEPT_RESPONSES:
             self._kept.popitem(last=False)
         return response
@@ -89,10 +89,11 @@ async def status(caller: CallerOf) -> Response:
 @router.put("/flight_plans/{flight_plan_id}")
 async def upsert(caller: CallerOf, kept: Kept, flight_plan_id: UUID, request: UpsertRequest) -> Response:
     """Create, change, activate or close a flight plan."""
-    response = kept.get(caller, request.request_id)
+    name = _name(flight_plan_id)
+    key = f"{name}/{request.request_id}"
+    response = kept.get(caller, key)
     if response is None:
-        planned = await _upsert(caller, _name(flight_plan_id), request)
-        response = kept.put(caller, request.request_id, _content(planned))
+        response = kept.put(caller, key, _content(await _upsert(caller, name, request)))
     return JSONResponse(response)
 
 
@@ -130,7 +131,8 @@ async def user_notifications(
             if condition["type"] != "ConflictArose" or condition["status"] != "True":
                 continue
             at = datetime.fromisoformat(condition["lastTransitionTime"])
-            if after <= at and (before is None or at <= before):
+            # Kubernetes omits the fraction of a second.
+            if after - timedelta(seconds=1) < at and (before is None or at <= before):
                 found.append(
                     {
                         "observed_at": {"value": condition["lastTransitionTime"], "format": "RFC3339"},

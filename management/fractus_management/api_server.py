@@ -13,6 +13,7 @@ from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 from fractus_core.api import API_VERSION, Resource
 from fractus_core.api.names import DNS_SUBDOMAIN, Name
 from fractus_runtime.kubernetes import Body, Client, Kind
+from starlette.convertors import StringConvertor, register_url_convertor
 
 from fractus_management.problem_details import refused
 from fractus_management.request_limits import RequestLimits
@@ -23,6 +24,15 @@ _REVIEW = "/apis/authentication.k8s.io/v1/selfsubjectreviews"
 _BEARER = HTTPBearer(
     auto_error=False, description="Token of a user or ServiceAccount of the Kubernetes cluster (kubectl create token)."
 )
+
+
+class _ObjectConvertor(StringConvertor):
+    """Path parameter without a colon, so that /plans/NAME does not match /plans/NAME:end."""
+
+    regex = "[^/:]+"
+
+
+register_url_convertor("object", _ObjectConvertor())
 
 Namespace = Annotated[
     Name | None, Query(description="Namespace of the plans; unset: the namespace that the server is configured with.")

@@ -59,7 +59,7 @@ async def list_drones(caller: CallerOf, limit: Limit = 100, continue_: Continue 
     return JSONResponse(await caller.page(DRONE, "", limit, continue_))
 
 
-@router.get("/drones/{name}", response_model=DroneDetails)
+@router.get("/drones/{name:object}", response_model=DroneDetails)
 async def read_drone(caller: CallerOf, name: ObjectName) -> Response:
     """Read a drone with the times in which it is free."""
     details: Body = {"drone": public(await caller.client.get(DRONE, name), DRONE)}

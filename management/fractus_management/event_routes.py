@@ -72,7 +72,7 @@ class EventStream(StreamingResponse):
 
 
 @router.get(
-    "/plans/{name}/events",
+    "/plans/{name:object}/events",
     response_class=EventStream,
     status_code=HTTPStatus.OK,
     responses={

@@ -150,14 +150,14 @@ async def list_plans(
     return JSONResponse(page)
 
 
-@router.get("/plans/{name}", response_model=FlightPlan, responses={200: etag_header()})
+@router.get("/plans/{name:object}", response_model=FlightPlan, responses={200: etag_header()})
 async def read(caller: CallerOf, name: ObjectName, namespace: Namespace = None) -> Response:
     """Read a plan."""
     return _response(await _get(caller, name, namespace))
 
 
 @router.put(
-    "/plans/{name}",
+    "/plans/{name:object}",
     response_model=FlightPlan,
     responses={
         200: etag_header("Decided."),
@@ -173,7 +173,7 @@ async def replace(
 
 
 @router.patch(
-    "/plans/{name}",
+    "/plans/{name:object}",
     response_model=FlightPlan,
     responses={
         200: etag_header("Decided."),
@@ -191,7 +191,7 @@ async def change(
 
 
 @router.delete(
-    "/plans/{name}",
+    "/plans/{name:object}",
     status_code=HTTPStatus.NO_CONTENT,
     responses={202: etag_header("The flight ends, then the plan is deleted.", FlightPlan), **problems(409, 412, 428)},
 )
@@ -213,7 +213,7 @@ async def delete(caller: CallerOf, name: ObjectName, namespace: Namespace = None
 
 
 @router.post(
-    "/plans/{name}:activate",
+    "/plans/{name:object}:activate",
     response_model=FlightPlan,
     responses={
         200: etag_header("Decided."),
@@ -229,7 +229,7 @@ async def activate(
 
 
 @router.post(
-    "/plans/{name}:end",
+    "/plans/{name:object}:end",
     response_model=FlightPlan,
     responses={
         200: etag_header("Decided."),
@@ -242,7 +242,7 @@ async def end(caller: CallerOf, name: ObjectName, namespace: Namespace = None, i
     return await _use(caller, name, namespace, if_match, "Closed")
 
 
-@router.get("/plans/{name}/status", response_model=PlanProgress)
+@router.get("/plans/{name:object}/status", response_model=PlanProgress)
 async def progress(caller: CallerOf, name: ObjectName, namespace: Namespace = None) -> Response:
     """Read the status of a plan, of its Application and of its drone."""
     plan = await _get(caller, name, namespace)

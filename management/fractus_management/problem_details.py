@@ -138,7 +138,8 @@ def install_handlers(app: FastAPI) -> None:
 def _methods(app: FastAPI, path: str) -> set[str]:
     """Return the documented methods of a path. Starlette would return the methods of a single route."""
     documented = app.openapi()["paths"].items()
-    return {method.upper() for each, item in documented if compile_path(each)[0].match(path) for method in item}
+    patterns = ((compile_path(each.replace("}", ":object}"))[0], item) for each, item in documented)
+    return {method.upper() for pattern, item in patterns if pattern.match(path) for method in item}
 
 
 def _from_validation(findings: Sequence[Any]) -> Refused:

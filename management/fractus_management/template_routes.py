@@ -79,13 +79,13 @@ async def publish_app(caller: CallerOf, template: NewTemplate) -> Response:
     return JSONResponse(public(created, TEMPLATE), HTTPStatus.CREATED, headers)
 
 
-@router.get("/apps/{name}", response_model=ApplicationTemplate)
+@router.get("/apps/{name:object}", response_model=ApplicationTemplate)
 async def read_app(caller: CallerOf, name: ObjectName) -> Response:
     """Read an application."""
     return JSONResponse(public(await caller.client.get(TEMPLATE, name), TEMPLATE))
 
 
-@router.get("/apps/{name}/drones", response_model=DroneMatch, responses=problems(409))
+@router.get("/apps/{name:object}/drones", response_model=DroneMatch, responses=problems(409))
 async def match_drones(
     *,
     caller: CallerOf,

@@ -22,7 +22,7 @@ _PATHS = {
 router = APIRouter(tags=["thesis"])
 for _alias, _path in _PATHS.items():
     for _route in (*drone_routes.router.routes, *template_routes.router.routes, *plan_routes.router.routes):
-        if isinstance(_route, APIRoute) and _route.path == _path:
+        if isinstance(_route, APIRoute) and _route.path_format == _path:
             router.add_api_route(
                 _alias,
                 _route.endpoint,

@@ -165,3 +165,5 @@ async def test_every_error_is_a_problem(app: FastAPI, method: str, path: str, bo
 async def test_wrong_method_lists_the_right_ones(app: FastAPI) -> None:
     assert (await answer(app, "PUT", "/v1/plans"))[1]["allow"] == "GET, POST"
     assert (await answer(app, "PUT", "/healthz"))[1]["allow"] == "GET"
+    status, headers, _ = await answer(app, "PUT", "/v1/plans/morning:end")
+    assert (status, headers["allow"]) == (405, "POST")

@@ -86,8 +86,9 @@ class ManagementServer:
         all_headers = {"Content-Type": "application/json", **(headers or {})}
         if token:
             all_headers["Authorization"] = f"Bearer {token}"
-        data = body if isinstance(body, bytes) else None if body is None else json.dumps(body).encode()
-        request = urllib.request.Request(self.url + path, data, all_headers, method=method)
+        if body is not None and not isinstance(body, bytes):
+            body = json.dumps(body).encode()
+        request = urllib.request.Request(self.url + path, body, all_headers, method=method)
         try:
             with urllib.request.urlopen(request, timeout=30) as response:
                 return Reply(response.status, response.headers, response.read())

@@ -73,8 +73,8 @@ def test_generated_requests_get_documented_responses(fuzz: Fuzz) -> None:
 
 GENERATED = {
     "plans": (8000, ("--phases=coverage,fuzzing", "--max-examples=300", "--exclude-operation-id-regex=publish_app")),
-    "templates": (1300, ("--phases=coverage,fuzzing", "--max-examples=20", "--include-operation-id-regex=publish_app")),
-    "sequences": (700, ("--phases=stateful", "--max-examples=60")),
+    "templates": (1200, ("--phases=coverage,fuzzing", "--max-examples=20", "--include-operation-id-regex=publish_app")),
+    "sequences": (400, ("--phases=stateful", "--max-examples=60")),
 }
 """Runs with 10,000 requests together: the least number of requests, and options. Templates take a second each to generate."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 from pathlib import Path
 from typing import Any
@@ -120,12 +121,14 @@ def app() -> FastAPI:
     return app
 
 
-async def answer(app: FastAPI, method: str, path: str, body: str = "") -> tuple[int, dict[str, str], bytes]:
-    """Return status, headers and body of the response to a request."""
+async def answer(app: FastAPI, method: str, path: str, body: str | None = "") -> tuple[int, dict[str, str], bytes]:
+    """Return status, headers and body of the response to a request. A body that is None never arrives."""
     sent: list[Any] = []
 
     async def receive() -> dict[str, Any]:
-        return {"type": "http.request", "body": body.encode()}
+        if body is None:
+            await asyncio.Event().wait()
+        return {"type": "http.request", "body": (body or "").encode()}
 
     async def send(message: Any) -> None:
         sent.append(message)
@@ -167,3 +170,9 @@ async def test_wrong_method_lists_the_right_ones(app: FastAPI) -> None:
     assert (await answer(app, "PUT", "/healthz"))[1]["allow"] == "GET"
     status, headers, _ = await answer(app, "PUT", "/v1/plans/morning:end")
     assert (status, headers["allow"]) == (405, "POST")
+
+
+async def test_slow_body_is_refused() -> None:
+    app = create_app(Settings(body_timeout_s=0.05))
+    status, headers, _ = await answer(app, "POST", "/v1/plans", None)
+    assert (status, headers["content-type"]) == (408, "application/problem+json")

@@ -53,6 +53,7 @@ POLICIES = (
     "fractus-flight-node-status",
     "fractus-flight-kinds",
     "fractus-flight-priority",
+    "fractus-flight-reservation",
     "fractus-flight-applications",
     "fractus-template-approval",
 )

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
+import chart as fractus_chart
 import pytest
 from control_plane import ControlPlane, wait_for
 from fractus_runtime.kubernetes import BlockingClient, KubeError
@@ -163,11 +164,19 @@ def test_higher_priority_class_needs_permission(users: dict[str, BlockingClient]
     assert refused(users["rescuer"], plan(priorityClass=priority)) == ""
 
 
-def test_plan_of_higher_class_can_be_ended_but_not_raised_by_others(users: dict[str, BlockingClient]) -> None:
+def test_plan_of_higher_class_can_be_ended_but_not_changed_by_others(users: dict[str, BlockingClient]) -> None:
     users["rescuer"].call("POST", PLANS, plan(priorityClass="elevated"))
+    for change in (
+        {"priorityClass": "emergency"},
+        {"priorityClass": "emergency", "use": "Closed"},
+        {"use": "InUse"},
+        {"waypoints": [{"lat": 50.1, "lon": 4.0}]},
+    ):
+        with pytest.raises(KubeError, match="ask for the verb prioritize"):
+            users["pilot"].merge(f"{PLANS}/flight", {"spec": change})
+    users["pilot"].merge(f"{PLANS}/flight", {"metadata": {"labels": {"team": "a"}}})
+    users["rescuer"].merge(f"{PLANS}/flight", {"spec": {"use": "InUse"}})
     users["pilot"].merge(f"{PLANS}/flight", {"spec": {"use": "Closed"}})
-    with pytest.raises(KubeError, match="ask for the verb prioritize"):
-        users["pilot"].merge(f"{PLANS}/flight", {"spec": {"priorityClass": "emergency"}})
     users["pilot"].merge(f"{PLANS}/flight", {"spec": {"priorityClass": "normal"}})
 
 
@@ -176,3 +185,44 @@ def test_editor_of_plans_cannot_write_their_status(users: dict[str, BlockingClie
     with pytest.raises(KubeError) as denied:
         users["pilot"].merge(f"{PLANS}/flight/status", {"status": {"state": "Accepted"}})
     assert denied.value.status == 403
+
+
+@pytest.mark.parametrize("before", [False, True])
+def test_dry_run_cannot_become_a_plan_or_the_reverse(users: dict[str, BlockingClient], before: bool) -> None:
+    users["pilot"].call("POST", PLANS, plan(dryRun=before))
+    with pytest.raises(KubeError, match=r"spec\.dryRun cannot change; create another FlightPlan"):
+        users["pilot"].merge(f"{PLANS}/flight", {"spec": {"dryRun": not before}})
+    users["pilot"].merge(f"{PLANS}/flight", {"spec": {"use": "Closed", "dryRun": before}})
+
+
+def test_only_the_operator_removes_the_landing_finalizer(
+    users: dict[str, BlockingClient], control_plane: ControlPlane, world: World
+) -> None:
+    users["pilot"].call("POST", PLANS, plan())
+    operator = control_plane.with_token(fractus_chart.operator_token(world))
+    try:
+        operator.merge(f"{PLANS}/flight", {"metadata": {"finalizers": ["fractus.dev/landing"]}})
+        users["pilot"].delete(f"{PLANS}/flight")
+        with pytest.raises(KubeError, match="keeps the airspace until the drone has landed"):
+            users["pilot"].merge(f"{PLANS}/flight", {"metadata": {"finalizers": []}})
+        operator.merge(f"{PLANS}/flight", {"metadata": {"finalizers": []}})
+    finally:
+        operator.close()
+    assert world.api.get(f"{PLANS}/flight") is None
+
+
+def test_operator_reports_on_templates_and_cannot_approve_them(
+    users: dict[str, BlockingClient], control_plane: ControlPlane, world: World
+) -> None:
+    users["developer"].call("POST", TEMPLATES, template())
+    approve(users["authority"], account("authority"), 1)
+    ready = {"type": "Ready", "status": "True", "reason": "Approved", "message": "", "lastTransitionTime": "2026-12-01T09:00:00Z"}
+    header = {"apiVersion": "fractus.dev/v1alpha1", "kind": "ApplicationTemplate", "metadata": {"name": "survey"}}
+    operator = control_plane.with_token(fractus_chart.operator_token(world))
+    try:
+        applied = operator.apply(f"{TEMPLATES}/survey/status", header | {"status": {"conditions": [ready]}})
+        assert applied["status"]["approval"]["generation"] == 1
+        with pytest.raises(KubeError, match="ask for the verb approve on applicationtemplates"):
+            operator.merge(f"{TEMPLATES}/survey/status", {"status": {"approval": None}})
+    finally:
+        operator.close()

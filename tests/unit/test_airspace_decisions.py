@@ -15,7 +15,7 @@ from fractus_core.airspace import (
     standing_overlaps,
     transition_problem,
 )
-from fractus_core.airspace.decide import MAX_EXPLAINED, MAX_HORIZON_S
+from fractus_core.airspace.decide import MAX_EXPLAINED, MAX_HORIZON_S, MAX_LISTED
 from fractus_core.geo import LocalFrame
 
 NOW_S = 1_800_000_000.0
@@ -249,3 +249,10 @@ def test_only_the_first_of_many_conflicts_are_explained():
     decision = decide(intent("a", at(0)), None, Airspace(others), NOW_S)
     assert len(decision.refusals) == 50
     assert [" near " in finding.message for finding in decision.refusals] == [i < MAX_EXPLAINED for i in range(50)]
+
+
+def test_listed_conflicts_are_limited():
+    others = [intent(f"p{i:03}", at(0), state="Activated") for i in range(MAX_LISTED + 1)]
+    assert len(decide(intent("a", at(0)), None, Airspace(others), NOW_S).refusals) == MAX_LISTED
+    advisories = decide(intent("a", at(0), priority=1), None, Airspace(others), NOW_S).advisories
+    assert len(advisories) == MAX_LISTED

@@ -29,6 +29,9 @@ MAX_VERTICES = 10_000
 MAX_EXPLAINED = 20
 """Maximum number of overlaps that a decision explains with place and time."""
 
+MAX_LISTED = 100
+"""Maximum number of overlaps with the same reason that a decision lists, so that it fits into a Kubernetes object."""
+
 Reason = Literal[
     "TransitionNotPermitted",
     "VolumesMissing",
@@ -167,7 +170,7 @@ def _limits_problem(intent: OperationalIntent, now_s: float) -> Finding | None:
 def _findings(intent: OperationalIntent, others: Sequence[OperationalIntent], reason: Reason) -> tuple[Finding, ...]:
     return tuple(
         Finding(reason, _sentence(intent, other, reason, explained=i < MAX_EXPLAINED), other.name)
-        for i, other in enumerate(others)
+        for i, other in enumerate(others[:MAX_LISTED])
     )
 
 

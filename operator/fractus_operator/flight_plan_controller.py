@@ -20,7 +20,7 @@ from fractus_operator.flight_matching import SOON_S
 from fractus_operator.flight_plan_index import reserved_flight
 from fractus_operator.flight_plan_steps import STARTED, PlanSituation, PlanStep, plan_step
 from fractus_operator.flight_progress import FlownMission
-from fractus_operator.kinds import Body, Key, key_of
+from fractus_operator.kinds import Body, Key
 from fractus_operator.labels import FINALIZER, LANDING_FINALIZER
 from fractus_operator.parsing import Submitted, Unreadable, parse_application, parse_object
 from fractus_operator.status_reporter import create_events, transition_events
@@ -176,6 +176,8 @@ class FlightPlanController:
         created = plan.metadata.creation_timestamp
         if created is None or plan.status is None or (now - created).total_seconds() < DRY_RUN_S:
             return False
+        if plan.status.state in _FLYING:
+            return False
         await self._store.delete(kinds.FLIGHT_PLAN, (plan.metadata.namespace or "", plan.name), plan.metadata.uid)
         return True
 
@@ -196,10 +198,12 @@ class FlightPlanController:
         header = kinds.FLIGHT_PLAN.header(plan.name, key[0], uid=plan.metadata.uid)
         body: Body = {**header, "status": status.to_dict()}
         applied = await self._store.apply(kinds.FLIGHT_PLAN, body, subresource="status")
+        # The status is stored, so its reservation must remain even if the next write fails.
+        self._cache.flight_plans.record_write(key, applied)
         if parse_object(FlightPlan, applied).status != status:
             # An apply does not remove fields of other writers, such as volumes that a user added.
             applied = await self._store.replace_status(kinds.FLIGHT_PLAN, applied, status.to_dict())
-        self._cache.flight_plans.record_write(key_of(applied), applied)
+            self._cache.flight_plans.record_write(key, applied)
         log.info("flight plans: status written (plan=%s/%s state=%s)", *key, status.state)
         await create_events(self._store, header, transition_events(transitions), now)
 

@@ -64,7 +64,9 @@ def reserved_flight(plan: FlightPlan) -> ReservedFlight | None:
         InvalidObject: A volume of the status is invalid.
     """
     status = plan.status
-    if plan.spec.dry_run or status is None or status.state not in RESERVING or status.drone is None:
+    if status is None or status.state not in RESERVING or status.drone is None:
+        return None
+    if plan.spec.dry_run and status.state == "Accepted":
         return None
     intent = intent_of(plan)
     return ReservedFlight(plan.metadata.uid or "", intent, status.drone) if intent.all_volumes else None

@@ -7,8 +7,10 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from fractus_core.airspace import Airspace, OperationalIntent, Volume4D, decide, standing_overlaps
+from fractus_core.airspace.decide import MAX_LISTED
 from fractus_core.airspace.lifecycle import OFF_NOMINAL
 from fractus_core.airspace.plan_status import PRIORITIES, intent_of, plan_finding, reserved_volume
+from fractus_core.airspace.volumes import utc
 from fractus_core.api import Application, ApplicationTemplate, FlightPlan, InvalidObject
 from fractus_core.api.conditions import ConditionUpdate
 from fractus_core.api.flight_plans import FlightPlanStatus, PlanFinding, PlanState, ReservedVolume
@@ -111,7 +113,7 @@ class PlanStep:
 
 def plan_step(now: PlanSituation) -> PlanStep:
     """Return the next step of a plan."""
-    if now.plan.spec.dry_run and now.state != "Draft":
+    if now.plan.spec.dry_run and now.state in {"Accepted", "Rejected", "Ended"}:
         # A dry run reserves nothing and is never flown.
         return _decide_new(now) if now.changed else _keep(now)
     match now.state:
@@ -328,8 +330,9 @@ def _change_in_flight(now: PlanSituation) -> PlanStep | None:
         return _refuse_change(now, (PlanFinding(reason="ChangeNotPermitted", message=message),))
     intent = replace(before, volumes=tuple(replace(volume, end_s=end_s) for volume in before.volumes))
     decision = decide(intent, before, now.airspace, now.now_s)
-    if not decision.accepted:
-        return _refuse_change(now, tuple(map(plan_finding, decision.refusals)))
+    refusals = tuple(map(plan_finding, decision.refusals)) or _drone_conflicts(now, end_s)
+    if refusals:
+        return _refuse_change(now, refusals)
     status = now.status.model_copy(
         update={
             "observed_generation": now.plan.metadata.generation,
@@ -339,6 +342,22 @@ def _change_in_flight(now: PlanSituation) -> PlanStep | None:
         }
     )
     return PlanStep(status, _conditions(status, now), next_s=RETRY_S)
+
+
+def _drone_conflicts(now: PlanSituation, end_s: float) -> tuple[PlanFinding, ...]:
+    """Return the reservations of the drone by other plans until the later end of a window."""
+    if end_s <= now.end_s:
+        return ()
+    drone = now.status.drone or ""
+    return tuple(
+        PlanFinding(
+            reason="DroneBusy",
+            message=f"flight plan {each.holder} has reserved {drone} from {utc(each.begin_s)}; choose an earlier end",
+            plan=each.holder,
+        )
+        for each in now.inventory().reservations.get(drone, ())
+        if each.begin_s <= end_s and each.end_s >= now.now_s
+    )[:MAX_LISTED]
 
 
 def _ended(now: PlanSituation, message: str) -> PlanStep:

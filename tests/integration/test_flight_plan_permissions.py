@@ -216,7 +216,13 @@ def test_operator_reports_on_templates_and_cannot_approve_them(
 ) -> None:
     users["developer"].call("POST", TEMPLATES, template())
     approve(users["authority"], account("authority"), 1)
-    ready = {"type": "Ready", "status": "True", "reason": "Approved", "message": "", "lastTransitionTime": "2026-12-01T09:00:00Z"}
+    ready = {
+        "type": "Ready",
+        "status": "True",
+        "reason": "Approved",
+        "message": "",
+        "lastTransitionTime": "2026-12-01T09:00:00Z",
+    }
     header = {"apiVersion": "fractus.dev/v1alpha1", "kind": "ApplicationTemplate", "metadata": {"name": "survey"}}
     operator = control_plane.with_token(fractus_chart.operator_token(world))
     try:

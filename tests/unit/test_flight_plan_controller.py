@@ -40,6 +40,7 @@ class Api(Store):
         kill_at: Number of the write at which the operator is killed.
         effective: True if this write takes effect.
         lose_status: True if statuses are stored, but no response arrives.
+        foreign: Status fields of another writer, which an apply does not remove. A JSON patch of the status is refused.
     """
 
     def __init__(self) -> None:
@@ -49,6 +50,7 @@ class Api(Store):
         self.kill_at: int | None = None
         self.effective = False
         self.lose_status = False
+        self.foreign: Body = {}
         self.attempts = 0
         self._versions = itertools.count(1)
 
@@ -95,8 +97,10 @@ class Api(Store):
             if not self.objects[target]["metadata"].get("finalizers"):
                 del self.objects[target]
             return {"kind": "Status"}
+        elif isinstance(body, list):
+            raise Conflict(409, "Conflict", "the object was changed")
         elif path != target:
-            self.objects[target]["status"] = body["status"]
+            self.objects[target]["status"] = {**self.foreign, **body["status"]}
         else:
             self.objects[target]["metadata"]["finalizers"] = body["metadata"]["finalizers"]
         self.objects[target]["metadata"]["resourceVersion"] = str(next(self._versions))
@@ -220,6 +224,16 @@ async def test_second_plan_is_rejected_also_if_the_response_to_the_first_write_w
         await world.step()
     await world.controller.reconcile(("team", "noon"))
     assert world.status()["state"] == "Accepted"
+    assert world.status(("team", "noon"))["state"] == "Rejected"
+
+
+async def test_second_plan_is_rejected_although_fields_of_another_writer_cannot_be_removed() -> None:
+    world = World(flight(), plan_named("noon", "u2"))
+    world.api.foreign = {"application": "other"}
+    with pytest.raises(Conflict):
+        await world.controller.reconcile(PLAN)
+    world.api.foreign = {}
+    await world.controller.reconcile(("team", "noon"))
     assert world.status(("team", "noon"))["state"] == "Rejected"
 
 
@@ -392,6 +406,21 @@ async def test_dry_run_is_never_flown() -> None:
     world.now_s = BEGIN_S
     await world.step(times=2)
     assert world.created() == 0
+
+
+async def test_flying_plan_that_becomes_a_dry_run_keeps_its_airspace() -> None:
+    world = await started()
+    body = world.api.find(kinds.FLIGHT_PLAN, PLAN)
+    assert body is not None
+    body["metadata"]["creationTimestamp"] = "2027-01-14T08:00:00Z"
+    world.flies("flying")
+    world.change(kinds.FLIGHT_PLAN, PLAN, dryRun=True)
+    assert world.cache.flights.get(PLAN) is not None
+    assert (await world.step())["state"] == "Activated"
+    assert world.cache.flights.get(PLAN) is not None
+    plan = world.api.find(kinds.FLIGHT_PLAN, PLAN)
+    assert plan is not None
+    assert plan["metadata"]["finalizers"] == [LANDING_FINALIZER]
 
 
 async def test_deleted_drone_is_replaced_long_before_the_flight() -> None:

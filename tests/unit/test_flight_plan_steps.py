@@ -383,6 +383,15 @@ def test_undone_change_in_flight_is_no_longer_reported_as_refused():
     assert step.status.decided_for == 3
 
 
+def test_window_cannot_be_extended_into_another_reservation_of_the_drone():
+    stock = replace(STOCK, reservations={"d": [Reservation("team/noon", END_S + 300, END_S + 900)]})
+    for minutes, refused in ((14, False), (16, True)):
+        longer = changed(activated(), window={"start": "2027-01-15T08:00:00Z", "duration": minutes})
+        step = flown(longer, stock=stock, in_air=True, position=position(0, 0))
+        assert (conditions(step).get("ChangeRefused") == ("True", "DroneBusy")) == refused
+        assert (step.status.volumes[0].end.timestamp() == END_S) == refused
+
+
 def test_end_of_window_can_change_in_flight():
     longer = changed(activated(), window={"start": "2027-01-15T08:00:00Z", "duration": 20})
     step = flown(longer, in_air=True, position=position(0, 0))

@@ -8,9 +8,10 @@ from collections.abc import Callable
 from dataclasses import replace
 from datetime import datetime
 
-from fractus_core.api import Application, FlightPlan
+from fractus_core.api import Application, Drone, FlightPlan
 from fractus_core.api.conditions import ConditionUpdate, merge_conditions
 from fractus_core.api.flight_plans import FlightPlanStatus
+from fractus_core.api.plans import MissionRecord
 from fractus_core.planning.inventory import Settings
 from fractus_core.planning.ordered_application import application_name
 
@@ -167,9 +168,17 @@ class FlightPlanController:
             mission,
             drone_exists=drone is not None,
             in_air=status.drone is not None and self._cache.fleet.is_in_flight(status.drone) and not landed,
+            unreported=drone is not None and self._unreported(drone, key, record),
             position=reported.position if reported is not None else None,
             home_m=home.alt if home is not None else None,
         )
+
+    def _unreported(self, drone: Drone, application: Key, record: MissionRecord | None) -> bool:
+        """Return True if a drone may have taken off for an Application since its last report."""
+        if record is not None and record.outcome == "Complete" and record.landed:
+            return False
+        claim = self._cache.fleet.claims().get(drone.name)
+        return drone.may_take_off and (claim is None or claim.key == application)
 
     async def _expire(self, plan: FlightPlan, now: datetime) -> bool:
         """Delete a dry run that is old enough. Return True if it was deleted."""

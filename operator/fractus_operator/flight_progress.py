@@ -35,6 +35,7 @@ class FlownMission:
         record: Record of its mission, or None before the takeoff.
         drone_exists: True if the Drone of the plan exists.
         in_air: True if the drone of the plan is in the air.
+        unreported: True if the drone may have taken off for the plan since its last report.
         position: Last reported position of the drone.
         home_m: Ground elevation of the home of the drone above mean sea level, if known.
     """
@@ -46,6 +47,7 @@ class FlownMission:
     record: MissionRecord | None = None
     drone_exists: bool = True
     in_air: bool = False
+    unreported: bool = False
     position: Position | None = None
     home_m: float | None = None
 
@@ -98,6 +100,9 @@ def flight_progress(
     if mission.in_air:
         aborted = outcome != "Complete" and (over or closing or mission.leaving)
         return _airborne(mission, state, status, late=late, aborted=aborted, end=end)
+    if over and mission.unreported:
+        message = f"{status.drone} may be in the air, because it has not reported since the end of its mission"
+        return Progress("Contingent", message)
     if over:
         return Progress("Ended", _result(mission))
     if end or mission.leaving:

@@ -10,6 +10,7 @@ import ssl
 import threading
 from collections.abc import Container, Iterator
 from contextlib import contextmanager
+from datetime import UTC, datetime
 from pathlib import Path
 
 import aiohttp
@@ -201,6 +202,13 @@ def test_operator_killed_after_any_write_reaches_same_state(
 
 
 @pytest.mark.timeout(600)
+def ended_after_reports(world: World, namespace: str) -> bool:
+    """Report from the drone on the ground. Return True if the plan has ended."""
+    report = {"status": {"lastSeen": datetime.now(UTC).isoformat()}}
+    world.api.merge("/apis/fractus.dev/v1alpha1/drones/drone-1/status", report)
+    return bool(status(world, namespace).get("state") == "Ended")
+
+
 @pytest.mark.parametrize(
     "write",
     [
@@ -224,5 +232,5 @@ def test_operator_killed_after_write_for_flight_plan_starts_the_flight_once(
         assert application["metadata"]["name"] == f"flight-{plan['metadata']['uid']}"
         world.api.delete(f"{applications}/{application['metadata']['name']}")
         wait_for(lambda: not world.api.list(applications), operator.log, 120)
-        wait_for(lambda: status(world, namespace).get("state") == "Ended", operator.log, 120)
+        wait_for(lambda: ended_after_reports(world, namespace), operator.log, 120)
         assert not world.api.list(applications)

@@ -184,6 +184,15 @@ class World:
         self.api.put(kinds.DRONE, body)
         self.watch()
 
+    def mission(self, status: str) -> None:
+        """Set the condition OnMission of the drone."""
+        body = self.api.find(kinds.DRONE, ("", "d"))
+        assert body is not None
+        condition = {"type": "OnMission", "status": status, "reason": "Test", "message": ""}
+        body["status"]["conditions"] = [condition | {"lastTransitionTime": "2027-01-15T08:00:00Z"}]
+        self.api.put(kinds.DRONE, body)
+        self.watch()
+
     def application(self) -> Body | None:
         return self.api.find(kinds.APPLICATION, FLIGHT)
 
@@ -335,6 +344,32 @@ async def test_closed_plan_keeps_its_airspace_until_the_landing() -> None:
     plan = world.api.find(kinds.FLIGHT_PLAN, PLAN)
     assert plan is not None
     assert plan["metadata"]["finalizers"] == []
+
+
+@pytest.mark.parametrize("status", ["True", "Unknown"])
+async def test_ended_flight_keeps_its_airspace_until_the_drone_has_reported(status: str) -> None:
+    world = await started()
+    world.mission(status)
+    del world.api.objects[kinds.APPLICATION.path(*FLIGHT)]
+    world.watch()
+    world.now_s = END_S + 60
+    assert (await world.step())["state"] == "Contingent"
+    reserved = world.cache.flights.get(PLAN)
+    assert reserved is not None
+    assert reserved.end_s > world.now_s
+    world.mission("False")
+    assert (await world.step())["state"] == "Ended"
+
+
+async def test_completed_flight_ends_without_another_report() -> None:
+    world = await started()
+    world.mission("Unknown")
+    body = world.application()
+    assert body is not None
+    record = MissionRecord(outcome="Complete", message="all waypoints reached", landed=True)
+    planned = DeploymentPlanSpec(application="flight-3e0a", flown=record)
+    world.cache.plans.decide(FLIGHT, body["metadata"]["uid"], planned)
+    assert (await world.step())["state"] == "Ended"
 
 
 async def test_deleted_plan_ends_its_flight() -> None:

@@ -14,6 +14,7 @@ from prometheus_client import Metric
 
 from fractus_management import drone_routes, event_routes, plan_routes, template_routes, thesis_routes
 from fractus_management.openapi import install_document
+from fractus_management.page_routes import page_router
 from fractus_management.problem_details import install_handlers, refused
 from fractus_management.request_guard import RequestGuard, RequestMetrics
 from fractus_management.request_limits import RequestLimits
@@ -69,6 +70,7 @@ def create_app(settings: Settings, client: Client | None = None) -> FastAPI:
         app.include_router(router, prefix="/v1")
     app.include_router(thesis_routes.router)
     app.include_router(health)
+    app.include_router(page_router())
     if settings.automated_testing is not None:
         _include_automated_testing(app)
     return app

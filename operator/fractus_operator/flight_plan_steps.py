@@ -278,9 +278,7 @@ def _follow_flight(now: PlanSituation) -> PlanStep:
     if now.changed and not now.closing:
         step = _change_in_flight(now)
         if step is not None:
-            # Repeated changes must not delay the end of the window.
-            after = flight_progress(now.mission, now.state, step.status, closing=False, now_s=now.now_s)
-            return replace(step, end=after.end)
+            return step
     progress = flight_progress(now.mission, now.state, now.status, closing=now.closing, now_s=now.now_s)
     if progress.state == "Ended":
         return _ended(now, progress.message)

@@ -383,8 +383,11 @@ async def test_requests_without_token_are_refused(served: tuple[str, ViewServer]
                 async with session.get(address + path, headers=headers) as response:
                     assert response.status == 401
                     assert "fractus view" in await response.text()
-        async with session.get(address, headers={hdrs.AUTHORIZATION: f"Bearer {live_view.token}"}) as response:
+        authorized = {hdrs.AUTHORIZATION: f"Bearer {live_view.token}"}
+        async with session.get(address, headers=authorized) as response:
             assert response.status == 200
+        async with session.get(f"{address}/plans.html", headers=authorized) as response:
+            assert response.status == 404
 
 
 async def test_health_endpoint_requires_no_token(served: tuple[str, ViewServer]) -> None:
@@ -563,7 +566,7 @@ def test_invalid_arguments_are_refused_with_message(
 def test_built_page_matches_its_sources() -> None:
     """If this test fails, run `make view`."""
     web_part = ROOT / "view" / "web"
-    root_files = ("index.html", "package-lock.json", "package.json", "tsconfig.json", "vite.config.ts")
+    root_files = ("index.html", "package-lock.json", "package.json", "plans.html", "tsconfig.json", "vite.config.ts")
     files = [path for folder in ("public", "src") for path in (web_part / folder).rglob("*") if path.is_file()]
     digests = {
         path.relative_to(web_part).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
@@ -577,8 +580,9 @@ def test_typescript_types_of_events_are_current() -> None:
     assert (ROOT / "view/web/src/events.ts").read_text() == typescript_types(), "run `make generate`"
 
 
-def test_page_loads_no_external_resources() -> None:
-    html = (PAGE / "index.html").read_text()
+@pytest.mark.parametrize("name", ["index.html", "plans.html"])
+def test_page_loads_no_external_resources(name: str) -> None:
+    html = (PAGE / name).read_text()
     assert re.findall(r'(?:src|href)="([^"]+)"', html)
     assert all(re.match(r"[/#]", url) for url in re.findall(r'(?:src|href)="([^"]+)"', html))
     assert not re.search(r"<script>|<style|style=|\son\w+=", html)

@@ -119,16 +119,16 @@ class User:
 
     def __init__(self, server: ManagementServer, token: str, namespace: str) -> None:
         self._server = server
-        self._token = token
-        self._namespace = namespace
+        self.token = token
+        self.namespace = namespace
 
     def at(self, server: ManagementServer) -> User:
         """Return the same user at another server."""
-        return User(server, self._token, self._namespace)
+        return User(server, self.token, self.namespace)
 
     def __call__(self, method: str, path: str, body: Any = None, **headers: str) -> Reply:
         named = {name.replace("_", "-"): value for name, value in headers.items()}
-        return self._server.send(method, self._in_namespace(path), body, token=self._token, headers=named)
+        return self._server.send(method, self._in_namespace(path), body, token=self.token, headers=named)
 
     def open(
         self, path: str, headers: Mapping[str, str]
@@ -136,7 +136,7 @@ class User:
         """Send a GET request, and return the response before its body."""
         connection = http.client.HTTPConnection(self._server.url.removeprefix("http://"), timeout=30)
         connection.request(
-            "GET", self._in_namespace(path), headers={"Authorization": f"Bearer {self._token}", **headers}
+            "GET", self._in_namespace(path), headers={"Authorization": f"Bearer {self.token}", **headers}
         )
         return connection, connection.getresponse()
 
@@ -147,7 +147,7 @@ class User:
         return response.status
 
     def _in_namespace(self, path: str) -> str:
-        return f"{path}{'&' if '?' in path else '?'}namespace={self._namespace}"
+        return f"{path}{'&' if '?' in path else '?'}namespace={self.namespace}"
 
 
 def plan(*, in_s: float = 3600, **more: Any) -> Body:

@@ -305,6 +305,18 @@ def approved_template(world: World, name: str = "survey") -> None:
     world.api.merge(f"{FRACTUS}/applicationtemplates/{name}/status", {"status": {"approval": approval}})
 
 
+def approved_region_template(world: World) -> None:
+    """Publish and approve the template `patrol` of a flight in a region."""
+    area = {"circle": {"center": at(0, 0), "radius": 50}}
+    points = [{"point": {"depot": "base"}, "navigation": "regionBased", "region": area, "duration": 1}]
+    driver = navigator(controlPoints=points)
+    driver["container"]["image"] = "registry.test/component@sha256:" + "0" * 64
+    spec = {"navigation": "region", "altitudes": {"upper": 60}, "template": {"components": [driver]}}
+    body = world.put(fractus_object("ApplicationTemplate", "patrol", spec))
+    approval = {"generation": body["metadata"]["generation"], "by": "admin", "at": "2026-01-01T00:00:00Z"}
+    world.api.merge(f"{FRACTUS}/applicationtemplates/patrol/status", {"status": {"approval": approval}})
+
+
 def _namespace(name: str) -> Body:
     return {"apiVersion": "v1", "kind": "Namespace", "metadata": {"name": name}}
 

@@ -11,24 +11,22 @@ import pytest
 from control_plane import ControlPlane, wait_for
 from implicitdict import ImplicitDict
 from management_server import ManagementServer, Reply, user_token
-from operator_world import FRACTUS, LAT, LON, OperatorProcess, World, at, fractus_object, fresh_namespace, navigator
+from operator_world import (
+    FRACTUS,
+    LAT,
+    LON,
+    OperatorProcess,
+    World,
+    approved_region_template,
+    fractus_object,
+    fresh_namespace,
+)
 from uas_standards.interuss.automated_testing.flight_planning.v1 import api
 
 Body = dict[str, Any]
 Send = Callable[..., Reply]
 HOME_M = 12
 """Ground elevation of the home of the drones above mean sea level."""
-
-
-def approved_region_template(world: World) -> None:
-    area = {"circle": {"center": at(0, 0), "radius": 50}}
-    points = [{"point": {"depot": "base"}, "navigation": "regionBased", "region": area, "duration": 1}]
-    driver = navigator(controlPoints=points)
-    driver["container"]["image"] = "registry.test/component@sha256:" + "0" * 64
-    spec = {"navigation": "region", "altitudes": {"upper": 60}, "template": {"components": [driver]}}
-    body = world.put(fractus_object("ApplicationTemplate", "patrol", spec))
-    approval = {"generation": body["metadata"]["generation"], "by": "admin", "at": "2026-01-01T00:00:00Z"}
-    world.api.merge(f"{FRACTUS}/applicationtemplates/patrol/status", {"status": {"approval": approval}})
 
 
 @pytest.fixture(scope="module")

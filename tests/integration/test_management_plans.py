@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import pytest
 from control_plane import wait_for
 from management_server import ManagementServer, User, path_of, plan, problem, submitted, user_token
@@ -135,3 +137,15 @@ def test_invalid_plan_gets_a_reason_with_its_field(pilot: User) -> None:
     reply = pilot("PATCH", "/v1/plans")
     problem(reply, 405)
     assert reply.headers["Allow"] == "GET, POST"
+
+
+def test_page_is_served_without_token_and_may_only_contact_the_api(management: ManagementServer) -> None:
+    page = management.send("GET", "/")
+    assert page.headers["Content-Type"] == "text/html; charset=utf-8"
+    assert "connect-src 'self'" in page.headers["Content-Security-Policy"]
+    loaded = re.findall(rb'(?:src|href)="(/[^"]+)"', page.content)
+    assert len(loaded) > 4
+    assert {management.send("GET", path.decode()).status for path in loaded} == {200}
+    problem(management.send("GET", "/index.html"), 404)
+    problem(management.send("GET", "/assets/../plans.html"), 404)
+    problem(management.send("POST", "/", {}), 405)

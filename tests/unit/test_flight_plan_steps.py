@@ -383,14 +383,6 @@ def test_undone_change_in_flight_is_no_longer_reported_as_refused():
     assert step.status.decided_for == 3
 
 
-def test_flight_ends_with_its_window_although_changed_parameters_are_too_large():
-    plan = changed(activated(), parameters={"note": "x" * 40_000})
-    step = flown(plan, END_S + 1, in_air=True, position=position(0, 0))
-    assert conditions(step)["ChangeRefused"] == ("True", "Invalid")
-    assert step.end
-    assert not flown(plan, END_S - 1, in_air=True, position=position(0, 0)).end
-
-
 def test_window_cannot_be_extended_into_another_reservation_of_the_drone():
     stock = replace(STOCK, reservations={"d": [Reservation("team/noon", END_S + 300, END_S + 900)]})
     for minutes, refused in ((14, False), (16, True)):

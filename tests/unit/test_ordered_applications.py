@@ -53,20 +53,6 @@ def test_waypoints_of_plan_replace_those_of_the_template():
     assert [c.name for c in app.spec.components] == ["Navigator", "DataStore"]
 
 
-def test_parameters_larger_than_a_variable_are_refused():
-    ordered_application(flight(parameters={"note": "x" * 32_756}), template())
-    with pytest.raises(InvalidObject, match="32769 bytes as JSON, more than 32768; give fewer or shorter values"):
-        ordered_application(flight(parameters={"note": "x" * 32_757}), template())
-
-
-def test_parameters_are_refused_if_the_template_has_the_maximum_number_of_variables():
-    full = navigator(PATH)
-    full["container"] = full["container"] | {"env": [{"name": f"V{i}", "value": ""} for i in range(256)]}
-    ordered_application(flight(), template(full))
-    with pytest.raises(InvalidObject, match="env: must have at most 256 entries"):
-        ordered_application(flight(parameters={"speed": 2}), template(full))
-
-
 def test_waypoints_of_plan_replace_points_of_interest():
     guide = VIEWER | {"egress": [], "pointsOfInterest": {"points": [at(1, 1)], "ordered": False}}
     app = ordered_application(flight(), template(guide))

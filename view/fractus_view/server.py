@@ -278,7 +278,8 @@ async def _add_security_headers(_request: web.Request, response: web.StreamRespo
 
 def _files(page: Path) -> list[Path]:
     (page / "index.html").stat()
-    return sorted(path for path in page.rglob("*") if path.is_file())
+    # The management API serves plans.html, because that page sends requests to the API on its own host.
+    return sorted(path for path in page.rglob("*") if path.is_file() and path.name != "plans.html")
 
 
 def _static(name: str, data: bytes) -> _Handler:

@@ -1,9 +1,9 @@
 import { createHash } from "node:crypto";
 import { readFileSync, readdirSync, statSync } from "node:fs";
 
-import { type Plugin, defineConfig } from "vite";
+import { type Plugin, type Rollup, defineConfig } from "vite";
 
-const SOURCES = ["index.html", "package-lock.json", "package.json", "public", "src", "tsconfig.json", "vite.config.ts"];
+const SOURCES = ["index.html", "package-lock.json", "package.json", "plans.html", "public", "src", "tsconfig.json", "vite.config.ts"];
 
 function files(path: string): string[] {
   return statSync(path).isDirectory() ? readdirSync(path).sort().flatMap((name) => files(`${path}/${name}`)) : [path];
@@ -20,23 +20,30 @@ function storeDigests(): Plugin {
   };
 }
 
-/** Preloads the map, which is a separate chunk because the page works without it if the browser has no WebGL. */
+/** Preloads the map of each page, which is a separate chunk because the page works without it if the browser has no WebGL. */
 function preloadMap(): Plugin {
   return {
     name: "preload-map",
     transformIndexHtml: {
       order: "post",
       handler: (html, context) => {
-        const files = Object.values(context.bundle ?? {}).filter((file) => !html.includes(file.fileName));
-        const chunks = files.filter((file) => file.type === "chunk").map((file) => ({ rel: "modulepreload", href: `/${file.fileName}` }));
+        const names = new Set(context.chunk?.dynamicImports);
+        // The loop also visits the names that it adds.
+        for (const name of names) for (const imported of chunk(context.bundle, name)?.imports ?? []) names.add(imported);
+        const missing = [...names].filter((name) => !html.includes(name));
+        const chunks = missing.map((name) => ({ rel: "modulepreload", href: `/${name}` }));
         // Preload style sheets too, because a module waits for its style sheet.
-        const styles = files
-          .filter((file) => file.fileName.endsWith(".css"))
-          .map((file) => ({ rel: "stylesheet", href: `/${file.fileName}` }));
+        const css = new Set(missing.flatMap((name) => [...(chunk(context.bundle, name)?.viteMetadata?.importedCss ?? [])]));
+        const styles = [...css].map((name) => ({ rel: "stylesheet", href: `/${name}` }));
         return [...styles, ...chunks].map((attrs) => ({ tag: "link", attrs, injectTo: "head" }));
       },
     },
   };
+}
+
+function chunk(bundle: Rollup.OutputBundle | undefined, name: string): Rollup.OutputChunk | undefined {
+  const file = bundle?.[name];
+  return file?.type === "chunk" ? file : undefined;
 }
 
 export default defineConfig({
@@ -48,7 +55,11 @@ export default defineConfig({
     assetsInlineLimit: 0,
     modulePreload: { polyfill: false },
     // Keep MapLibre in its own file, so that browsers can cache it when other files change.
-    rollupOptions: { output: { manualChunks: (id: string) => (id.includes("maplibre-gl") ? "maplibre" : null) } },
+    rollupOptions: {
+      // plans.html is the page of the management API.
+      input: ["index.html", "plans.html"],
+      output: { manualChunks: (id: string) => (id.includes("maplibre-gl") ? "maplibre" : null) },
+    },
     chunkSizeWarningLimit: 2000,
   },
 });

@@ -5,18 +5,13 @@ from __future__ import annotations
 import json
 from typing import Any
 
-from pydantic import ValidationError
-
 from fractus_core.api.applications import Application, ApplicationSpec
-from fractus_core.api.components import Component, Container
+from fractus_core.api.components import Component
 from fractus_core.api.flight_plans import ApplicationTemplate, FlightPlan, FlightPlanSpec
 from fractus_core.api.model import API_VERSION, InvalidObject
 
 PARAMETERS = "FLIGHT_PARAMETERS"
 """Environment variable of every container with the parameters of the plan as JSON."""
-
-MAX_PARAMETERS_BYTES = 32_768
-"""Maximum size of the parameters as JSON: that of an environment variable of an Application."""
 
 
 def application_name(uid: str) -> str:
@@ -92,17 +87,6 @@ def _with_parameters(component: Component, plan: FlightPlanSpec) -> Component:
     if not plan.parameters:
         return component
     container = component.container.to_dict()
-    value = json.dumps(plan.parameters, sort_keys=True)
-    # The JSON contains only ASCII characters, so its length is its size.
-    if len(value) > MAX_PARAMETERS_BYTES:
-        raise InvalidObject(
-            "spec.parameters",
-            f"{len(value)} bytes as JSON, more than {MAX_PARAMETERS_BYTES}; give fewer or shorter values",
-        )
-    entry = {"name": PARAMETERS, "value": value}
+    entry = {"name": PARAMETERS, "value": json.dumps(plan.parameters, sort_keys=True)}
     container["env"] = [*(each for each in container.get("env", ()) if each["name"] != PARAMETERS), entry]
-    try:
-        return component.model_copy(update={"container": Container.model_validate(container)})
-    except ValidationError as error:
-        # The template has the maximum number of variables.
-        raise InvalidObject.from_pydantic(error, Container) from None
+    return component.model_copy(update={"container": type(component.container).model_validate(container)})

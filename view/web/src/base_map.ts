@@ -1,6 +1,6 @@
 // Base map, which the server reads from a file or directory.
 
-import { byId } from "./lists";
+import { byId } from "./elements";
 
 export interface BaseMap {
   min_zoom: number;

@@ -1,5 +1,6 @@
 // Lists of drones, verdicts, areas and other objects. They contain everything that the map shows.
 
+import { byId, element, setText } from "./elements";
 import type { Application, Feature, Link, Note, Policy, Verdict } from "./events";
 import { type Drone, MAX_GAP_MS, type Model } from "./model";
 import { policiesAt } from "./places";
@@ -15,21 +16,6 @@ const UNLISTED_POLICIES = "Recordings do not list policies. The zones on the map
 export interface Actions {
   select(drone: string): void;
   seek(time: number): void;
-}
-
-function element<K extends keyof HTMLElementTagNameMap>(tag: K, className = "", text = ""): HTMLElementTagNameMap[K] {
-  const created = document.createElement(tag);
-  if (className) created.className = className;
-  if (text) created.textContent = text;
-  return created;
-}
-
-export function byId<T extends HTMLElement>(id: string): T {
-  return document.getElementById(id) as T;
-}
-
-function setText(target: HTMLElement, text: string): void {
-  if (target.textContent !== text) target.textContent = text;
 }
 
 function phaseBadge(phase: string): HTMLSpanElement {

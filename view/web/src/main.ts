@@ -3,8 +3,9 @@
 import "./style.css";
 
 import { loadBaseMap } from "./base_map";
+import { byId } from "./elements";
 import type { Event, Marker } from "./events";
-import { Lists, byId } from "./lists";
+import { Lists } from "./lists";
 import type { Colours, FlightMap } from "./map";
 import { Model } from "./model";
 import { Playback } from "./playback";

@@ -1,0 +1,267 @@
+"""Web page of flight plans in Chromium, on the real management API, API server and operator."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from axe_playwright_python.sync_playwright import Axe
+from browser import CHROMIUM, SOFTWARE_GL, TIMEOUT_MS, launched
+from control_plane import wait_for
+from management_server import ManagementServer, User, submitted
+from operator_world import FRACTUS, LAT, LON, World, approved_region_template, approved_template, at, fractus_object
+from playwright.sync_api import Browser, Page, Playwright, expect, sync_playwright
+
+IMPORTED = Path(__file__).parents[1] / "imported"
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(
+        CHROMIUM is None, reason="Chromium is not installed; `make packages` installs it on machines with apt-get"
+    ),
+    pytest.mark.xdist_group("browser"),
+]
+
+
+@pytest.fixture(scope="module")
+def playwright() -> Iterator[Playwright]:
+    with sync_playwright() as playwright:
+        yield playwright
+
+
+@pytest.fixture(scope="module")
+def browser(playwright: Playwright) -> Iterator[Browser]:
+    with launched(playwright, *SOFTWARE_GL) as browser:
+        yield browser
+
+
+@pytest.fixture
+def page(browser: Browser, management: ManagementServer) -> Iterator[Page]:
+    """The page before the sign-in. The test fails if the page violates its Content-Security-Policy or throws an error."""
+    context = browser.new_context(viewport={"width": 1400, "height": 1000})
+    context.set_default_timeout(TIMEOUT_MS)
+    page = context.new_page()
+    problems = list[str]()
+    page.on("pageerror", lambda error: problems.append(str(error)))
+    page.on("console", lambda message: problems.append(message.text) if "Content Security" in message.text else None)
+    page.on("dialog", lambda dialog: dialog.accept())
+    page.goto(management.url)
+    yield page
+    assert problems == []
+    context.close()
+
+
+def sign_in(page: Page, pilot: User, *, by_keyboard: bool = False) -> None:
+    page.get_by_label("Token").fill(pilot.token)
+    page.get_by_label("Namespace").fill(pilot.namespace)
+    if by_keyboard:
+        page.get_by_label("Namespace").press("Enter")
+    else:
+        page.locator("#sign-in button").click()
+    expect(page.get_by_role("heading", name="Plan a flight")).to_be_visible(timeout=TIMEOUT_MS)
+
+
+def enter_point(page: Page, number: int, north_m: float, east_m: float, alt: float) -> None:
+    """Add a point by the table."""
+    position = at(north_m, east_m)
+    page.get_by_role("button", name="Add a point").press("Enter")
+    for label, value in (("Latitude", position["lat"]), ("Longitude", position["lon"]), ("Altitude", alt)):
+        page.get_by_label(f"{label} of point {number}").fill(f"{value:.7f}")
+
+
+def import_file(page: Page, content: str) -> None:
+    file = {"name": "route", "mimeType": "application/json", "buffer": content.encode()}
+    page.get_by_label("Import").set_input_files(file)  # type: ignore[arg-type]
+
+
+def is_ready(pilot: User, template: str) -> bool:
+    status = pilot("GET", f"/v1/apps/{template}").body.get("status") or {}
+    return any(each["type"] == "Ready" and each["status"] == "True" for each in status.get("conditions") or ())
+
+
+def expect_decision(page: Page, text: str) -> None:
+    expect(page.locator("#decision")).to_contain_text(text, timeout=TIMEOUT_MS)
+
+
+def test_plans_page_leads_from_a_token_to_an_accepted_plan(page: Page, pilot: User) -> None:
+    sign_in(page, pilot)
+    submit = page.get_by_role("button", name="Submit the plan")
+    expect_decision(page, "Add a waypoint.")
+    expect(submit).to_be_disabled()
+    page.wait_for_selector("#map[data-map=ready]")
+    # The map shows nothing yet, so the first point is imported, and the map then shows its surroundings.
+    takeoff = {"type": "SimpleItem", "command": 22, "frame": 3, "params": [0, 0, 0, None, 0, 0, 10]}
+    waypoint = {
+        "type": "SimpleItem",
+        "command": 16,
+        "frame": 3,
+        "params": [0, 0, 0, None, LAT + 0.0002, LON + 0.0002, 30],
+    }
+    import_file(page, json.dumps({"fileType": "Plan", "mission": {"items": [takeoff, waypoint]}}))
+    expect_decision(page, "Accepted")
+    expect(page.get_by_label("Altitude of point 1")).to_have_value("30")
+    page.locator("#map canvas").click(position={"x": 420, "y": 320})
+    expect(page.locator("#route tr")).to_have_count(2)
+    expect_decision(page, "Accepted")
+    expect(page.locator("#findings")).to_contain_text("Suitable drones")
+    expect(page.locator("#findings")).to_contain_text("Reserved airspace")
+    submit.click()
+    item = page.locator("#plans > li")
+    expect(item).to_contain_text("Accepted", timeout=TIMEOUT_MS)
+    (stored,) = pilot("GET", "/v1/plans").body["items"]
+    assert stored["status"]["state"] == "Accepted"
+    assert len(stored["spec"]["waypoints"]) == 2
+    expect(item).to_contain_text(stored["metadata"]["name"])
+    expect(submit).to_be_disabled()
+    # The stream of the followed plan reports the change.
+    item.get_by_role("button", name="End").click()
+    expect(item).to_contain_text("Ended", timeout=TIMEOUT_MS)
+    expect(page.locator("#announcer")).to_contain_text("Ended", timeout=TIMEOUT_MS)
+
+
+def test_plans_page_submits_a_plan_of_a_region(page: Page, pilot: User, world: World) -> None:
+    approved_region_template(world)
+    wait_for(lambda: is_ready(pilot, "patrol"), "the template to be ready")
+    sign_in(page, pilot)
+    page.get_by_label("Application", exact=True).select_option("patrol")
+    expect_decision(page, "Add the corners of the region.")
+    corners = [at(10, 10), at(40, 10), at(40, 40)]
+    ring = [[corner["lon"], corner["lat"]] for corner in [*corners, corners[0]]]
+    import_file(page, json.dumps({"type": "Feature", "geometry": {"type": "Polygon", "coordinates": [ring]}}))
+    expect(page.locator("#route tr")).to_have_count(3)
+    page.get_by_label("Minutes in the region").fill("1")
+    expect_decision(page, "Accepted")
+    page.get_by_role("button", name="Submit the plan").click()
+    expect(page.locator("#plans > li")).to_contain_text("Accepted", timeout=TIMEOUT_MS)
+    (stored,) = pilot("GET", "/v1/plans").body["items"]
+    assert stored["spec"]["region"]["polygon"]["exterior"] == corners
+    assert stored["spec"]["stay"] == 1
+
+
+def test_plans_page_can_be_used_by_keyboard_and_passes_axe(page: Page, pilot: User) -> None:
+    assert Axe().run(page).violations_count == 0
+    sign_in(page, pilot, by_keyboard=True)
+    expect(page.locator("#plan-title")).to_be_focused()
+    enter_point(page, 1, 50, 50, 20)
+    expect_decision(page, "Accepted")
+    result = Axe().run(page)
+    assert result.violations_count == 0, result.generate_report()
+    page.get_by_role("button", name="Submit the plan").press("Enter")
+    expect(page.locator("#plans-title")).to_be_focused()
+    expect(page.locator("#plans > li")).to_contain_text("Accepted", timeout=TIMEOUT_MS)
+    result = Axe().run(page)
+    assert result.violations_count == 0, result.generate_report()
+
+
+def test_plans_page_shows_reasons_and_the_conflicting_plan(page: Page, pilot: User) -> None:
+    first = submitted(pilot, in_s=600).body["metadata"]["name"]
+    sign_in(page, pilot)
+    enter_point(page, 1, 50, 50, 20)
+    expect_decision(page, "Rejected")
+    expect(page.locator("#findings")).to_contain_text("Unsuitable drones")
+    expect(page.locator("#findings")).to_contain_text("drone-1")
+    expect(page.get_by_role("button", name="Submit the plan")).to_be_disabled()
+    expect(page.locator("#plans")).to_contain_text(first)
+
+
+def test_plans_page_requires_an_action_for_each_policy_with_choices(page: Page, pilot: User, world: World) -> None:
+    square = [{"lat": 39.4 + north, "lon": 22.97 + east} for north, east in ((0, 0), (0, 0.001), (0.001, 0.001))]
+    world.put(fractus_object("Zone", "yard", {"area": {"polygon": {"exterior": square}}}))
+    spec = {"type": "GeofenceControl", "kind": "exclusion", "selector": {"zones": ["yard"]}}
+    world.put(fractus_object("Policy", "school", spec | {"action": "hover", "choices": ["land"]}))
+    sign_in(page, pilot)
+    enter_point(page, 1, 50, 50, 20)
+    expect_decision(page, "Select an action for school.")
+    submit = page.get_by_role("button", name="Submit the plan")
+    expect(submit).to_be_disabled()
+    page.get_by_label("land", exact=True).check()
+    expect_decision(page, "Accepted")
+    submit.click()
+    expect(page.locator("#plans > li")).to_contain_text("Accepted", timeout=TIMEOUT_MS)
+    (stored,) = pilot("GET", "/v1/plans").body["items"]
+    assert stored["spec"]["policyActions"] == [{"policy": "school", "action": "land"}]
+
+
+def test_plans_page_shows_parameters_of_the_template(page: Page, pilot: User, world: World) -> None:
+    approved_template(world)
+    path = f"{FRACTUS}/applicationtemplates/survey"
+    schema = {
+        "type": "object",
+        "required": ["pictures"],
+        "properties": {
+            "pictures": {"type": "integer", "title": "Number of pictures", "minimum": 1},
+            "mode": {"enum": ["fast", "careful"], "default": "careful"},
+        },
+    }
+    body = world.api.merge(path, {"spec": {"parameters": schema}})
+    approval = {"generation": body["metadata"]["generation"], "by": "admin", "at": "2026-01-01T00:00:00Z"}
+    world.api.merge(f"{path}/status", {"status": {"approval": approval}})
+    wait_for(lambda: is_ready(pilot, "survey"), "the template to be ready")
+    sign_in(page, pilot)
+    enter_point(page, 1, 50, 50, 20)
+    expect_decision(page, "Number of pictures")
+    page.get_by_label("Number of pictures").fill("3")
+    expect_decision(page, "Accepted")
+    page.get_by_role("button", name="Submit the plan").click()
+    expect(page.locator("#plans > li")).to_contain_text("Accepted", timeout=TIMEOUT_MS)
+    (stored,) = pilot("GET", "/v1/plans").body["items"]
+    assert stored["spec"]["parameters"] == {"pictures": 3, "mode": "careful"}
+
+
+def test_plans_page_shows_differences_if_another_user_changed_the_plan(page: Page, pilot: User) -> None:
+    name = submitted(pilot).body["metadata"]["name"]
+    sign_in(page, pilot)
+    page.get_by_role("button", name=f"Change {name}").click()
+    page.get_by_label("Duration in minutes").fill("20")
+    pilot("PATCH", f"/v1/plans/{name}", {"window": {"duration": 25}}, If_Match="*")
+    change = page.get_by_role("button", name="Change the plan", exact=True)
+    change.click()
+    problem = page.locator("#submit-problem")
+    expect(problem).to_contain_text("window.duration is now 25, and 20 in your version", timeout=TIMEOUT_MS)
+    assert pilot("GET", f"/v1/plans/{name}").body["spec"]["window"]["duration"] == 25
+    change.click()
+    expect(page.locator("#plans > li")).to_contain_text("20 minutes", timeout=TIMEOUT_MS)
+    assert pilot("GET", f"/v1/plans/{name}").body["spec"]["window"]["duration"] == 20
+
+
+def test_plans_page_shows_since_when_it_is_stale(page: Page, pilot: User) -> None:
+    sign_in(page, pilot)
+    page.context.set_offline(True)
+    enter_point(page, 1, 50, 50, 20)
+    expect(page.locator("#connection")).to_contain_text("Stale since", timeout=TIMEOUT_MS)
+    expect(page.get_by_role("button", name="Submit the plan")).to_be_disabled()
+    page.context.set_offline(False)
+    expect(page.locator("#connection")).to_be_empty(timeout=TIMEOUT_MS)
+    expect_decision(page, "Accepted")
+
+
+def test_plans_page_refuses_an_invalid_token_and_forgets_it(page: Page, pilot: User) -> None:
+    page.get_by_label("Token").fill("not-a-token")
+    page.locator("#sign-in button").click()
+    expect(page.locator("#sign-in-problem")).to_contain_text("the bearer token is invalid", timeout=TIMEOUT_MS)
+    sign_in(page, pilot)
+    page.reload()
+    expect(page.get_by_role("heading", name="Plan a flight")).to_be_visible(timeout=TIMEOUT_MS)
+    page.get_by_role("button", name="Sign out").click()
+    expect(page.get_by_label("Token")).to_be_focused()
+    assert page.evaluate("sessionStorage.getItem('token')") is None
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("{", "The file is not JSON"),
+        ("null", "no point, line or polygon"),
+        ('{"type": "LineString", "coordinates": [[0, 91]]}', "position 91, 0, without altitude"),
+        ('{"type": "LineString"}', "coordinates of the file are incomplete"),
+        ((IMPORTED / "plan-jump.plan").read_text(), "of the mission is not a waypoint"),
+        ((IMPORTED / "plan-terrain-frames.plan").read_text(), "is not relative to home"),
+    ],
+)
+def test_plans_page_names_the_problem_of_an_imported_file(page: Page, pilot: User, content: str, message: str) -> None:
+    sign_in(page, pilot)
+    import_file(page, content)
+    expect(page.locator("#import-problem")).to_contain_text(message)
+    expect(page.locator("#route tr")).to_have_count(0)

@@ -1,0 +1,407 @@
+// Connects the parts of the page: sign-in, form with check, map, and list of plans.
+
+import "../style.css";
+import "./plans.css";
+
+import { byId, setText } from "../elements";
+import { clock } from "../text";
+import { Api, Problem, TEMPORARY } from "./api";
+import { showFindings } from "./decision";
+import { differences } from "./differences";
+import { PlanForm } from "./plan_form";
+import { PlanList, stateOf } from "./plan_list";
+import type { PlanMap } from "./plan_map";
+import type { ApplicationTemplate, Drone, FlightPlan, FlightPlanSpec, FlightPlanStatus } from "./types";
+
+const CHECK_DELAY_MS = 500;
+const CHECK_RETRY_MS = 5_000;
+const REFRESH_MS = 10_000;
+const CHANGE_ATTEMPTS = 5;
+const RESERVING = new Set(["Accepted", "Activated", "Nonconforming", "Contingent"]);
+
+type Maps = typeof import("./plan_map");
+
+let api: Api | undefined;
+let plans: FlightPlan[] = [];
+let drones: Drone[] = [];
+let maps: Maps | undefined;
+let map: PlanMap | undefined;
+/** Time since which the server does not respond, in Unix milliseconds. */
+let lost: number | undefined;
+/** Plan that the form changes, in the version that the user has seen. Undefined: the form submits a new plan. */
+let changed: FlightPlan | undefined;
+/** Status of the last check or submission of the entered plan. */
+let decision: FlightPlanStatus | undefined;
+/** Reason why the entered plan could not be checked, or an empty text. */
+let unchecked = "";
+/** True if the entered plan is submitted. */
+let submitted = false;
+/** Key of the entered plan, so that a repeated submission creates no second plan. */
+let key = "";
+let checkTimer = 0;
+let checking = new AbortController();
+let following = new AbortController();
+let followed = "";
+
+const submit = byId<HTMLButtonElement>("submit");
+const form = new PlanForm(edited);
+const list = new PlanList({
+  follow,
+  start: (plan) => void act(plan, "POST", ":activate"),
+  end: (plan) => {
+    if (confirm(`End ${plan.metadata.name}? A drone in the air returns home.`)) void act(plan, "POST", ":end");
+  },
+  change: beginChange,
+  remove: (plan) => {
+    if (confirm(`Delete ${plan.metadata.name}?`)) void act(plan, "DELETE", "", { "If-Match": "*" });
+  },
+});
+
+// -- sign-in --
+
+async function signIn(token: string, namespace: string): Promise<void> {
+  showProblem("sign-in-problem", "");
+  api = new Api(token, namespace, {
+    connected: () => (lost = undefined),
+    lost: () => (lost ??= Date.now()),
+  });
+  try {
+    plans = await api.list<FlightPlan>("/plans");
+    const templates = await api.list<ApplicationTemplate>("/apps");
+    drones = await optionalDrones(api);
+    form.offer(templates, drones.map(({ metadata }) => metadata.name));
+  } catch (error) {
+    signOut(sentence(error));
+    return;
+  }
+  sessionStorage.setItem("token", token);
+  sessionStorage.setItem("namespace", namespace);
+  showSignedIn(true);
+  byId("plan-title").focus();
+  edited();
+  showPlans();
+}
+
+/** Returns the drones, or none if the user may not read them. */
+async function optionalDrones(client: Api): Promise<Drone[]> {
+  try {
+    return await client.list<Drone>("/drones");
+  } catch (error) {
+    if (error instanceof Problem && error.status === 403) return [];
+    throw error;
+  }
+}
+
+function signOut(reason = ""): void {
+  api = undefined;
+  checking.abort();
+  following.abort();
+  clearTimeout(checkTimer);
+  plans = [];
+  sessionStorage.removeItem("token");
+  byId<HTMLInputElement>("token").value = "";
+  showSignedIn(false);
+  showProblem("sign-in-problem", reason);
+  byId("token").focus();
+}
+
+function showSignedIn(signedIn: boolean): void {
+  byId("sign-in-section").hidden = signedIn;
+  for (const id of ["plan-section", "plans-section", "sign-out"]) byId(id).hidden = !signedIn;
+}
+
+// -- check and submission --
+
+/** Called after each change of the form: checks the plan when the user pauses. */
+function edited(): void {
+  clearTimeout(checkTimer);
+  checking.abort();
+  submitted = false;
+  unchecked = "";
+  key = randomKey();
+  showRoute();
+  // A check of a change would conflict with the reservation of the plan itself.
+  if (changed === undefined) decision = undefined;
+  if (changed === undefined && form.problem === "") checkTimer = window.setTimeout(() => void check(), CHECK_DELAY_MS);
+  showDecision();
+}
+
+async function check(): Promise<void> {
+  if (api === undefined) return;
+  checking = new AbortController();
+  const { signal } = checking;
+  const spec = form.spec;
+  try {
+    const { body } = await api.send<FlightPlan>("POST", "/plans:check", spec, {}, signal);
+    if (signal.aborted) return;
+    decide(body.status ?? {});
+    // The policies have changed, and with them the selected actions.
+    if (JSON.stringify(form.choices.actions) !== JSON.stringify(spec.policyActions)) edited();
+  } catch (error) {
+    if (signal.aborted || isExpired(error)) return;
+    unchecked = sentence(error);
+    if (!(error instanceof Problem) || TEMPORARY.has(error.status)) checkTimer = window.setTimeout(() => void check(), CHECK_RETRY_MS);
+    showDecision();
+  }
+}
+
+function decide(status: FlightPlanStatus): void {
+  decision = status;
+  form.choices.show(status.restrictions ?? []);
+  showFindings(status, showPlan);
+  showDecision();
+  map?.set("operationArea", maps!.volumeFeatures(status.volumes ?? []));
+  const others = [...(status.refusals ?? []), ...(status.advisories ?? [])].map(({ plan }) => plan);
+  const conflicting = plans.filter((plan) => others.includes(nameOf(plan)));
+  map?.set("exclusion", conflicting.flatMap((plan) => maps!.volumeFeatures(plan.status?.volumes ?? [])));
+}
+
+/** Returns why the plan cannot be submitted, or an empty text. */
+function obstacle(): string {
+  if (submitted) return "The plan is submitted.";
+  if (form.problem) return form.problem;
+  const missing = form.choices.missing;
+  if (missing.length > 0) return `Select an action for ${missing.join(", ")}.`;
+  if (changed !== undefined) return "";
+  if (decision === undefined) return unchecked || "The plan is being checked.";
+  return decision.state === "Accepted" ? "" : "Change the plan to submit it.";
+}
+
+function showDecision(): void {
+  const result = decision === undefined ? "" : `${decision.state ?? "Draft"}: ${decision.message ?? "not decided"}.`;
+  const reason = obstacle();
+  const present = changed === undefined ? result : `You change ${changed.metadata.name}. ${result}`;
+  setText(byId("decision"), [present, reason].filter(Boolean).join(" "));
+  if (decision === undefined) {
+    showFindings(undefined, showPlan);
+    map?.set("operationArea", []);
+  }
+  submit.disabled = reason !== "";
+  submit.textContent = changed === undefined ? "Submit the plan" : "Change the plan";
+  byId("keep").hidden = changed === undefined;
+}
+
+async function submitPlan(): Promise<void> {
+  if (api === undefined || obstacle() !== "") return;
+  submit.disabled = true;
+  showProblem("submit-problem", "");
+  const spec = form.spec;
+  const before = key;
+  try {
+    const plan = changed === undefined ? await create(api, spec) : await replace(api, changed, spec);
+    if (plan === undefined) return;
+    changed = undefined;
+    form.release();
+    put(plan);
+    follow(plan);
+    // Without a further edit meanwhile, the form shows what is submitted.
+    submitted = key === before;
+    if (submitted) decide(plan.status ?? {});
+    byId("plans-title").focus();
+  } catch (error) {
+    if (!isExpired(error)) showProblem("submit-problem", sentence(error));
+  } finally {
+    showDecision();
+  }
+}
+
+async function create(client: Api, spec: FlightPlanSpec): Promise<FlightPlan> {
+  return (await client.send<FlightPlan>("POST", "/plans", spec, { "Idempotency-Key": key })).body;
+}
+
+/** Replaces a plan. Returns undefined if another user has changed it, and shows the differences. */
+async function replace(client: Api, plan: FlightPlan, spec: FlightPlanSpec): Promise<FlightPlan | undefined> {
+  let seen = plan;
+  for (let attempt = 1; ; attempt++) {
+    try {
+      return (await client.send<FlightPlan>("PUT", pathOf(plan), spec, { "If-Match": `"${seen.metadata.resourceVersion}"` })).body;
+    } catch (error) {
+      if (!(error instanceof Problem) || error.status !== 412 || attempt === CHANGE_ATTEMPTS) throw error;
+    }
+    seen = (await client.send<FlightPlan>("GET", pathOf(plan))).body;
+    // The status of a plan is part of its version. Only changes of the specification matter to the user.
+    if (differences(seen.spec, plan.spec) === "") continue;
+    changed = seen;
+    const text = differences(seen.spec, spec) || "both versions are equal";
+    showProblem("submit-problem", `Another user changed the plan meanwhile: ${text}. To replace that version by yours, press “Change the plan” again.`);
+    return undefined;
+  }
+}
+
+function beginChange(plan: FlightPlan): void {
+  try {
+    changed = plan;
+    form.show(plan.spec);
+    showProblem("plans-problem", "");
+  } catch (error) {
+    changed = undefined;
+    showProblem("plans-problem", sentence(error));
+    return;
+  }
+  decide(plan.status ?? {});
+  byId("plan-title").focus();
+}
+
+function endChange(): void {
+  changed = undefined;
+  form.release();
+  showProblem("submit-problem", "");
+  edited();
+}
+
+// -- plans --
+
+async function refresh(): Promise<void> {
+  const client = api;
+  if (client === undefined) return;
+  try {
+    const present = await client.list<FlightPlan>("/plans");
+    if (client !== api) return;
+    plans = present;
+  } catch (error) {
+    if (!isExpired(error)) lost ??= Date.now();
+  }
+  showPlans();
+}
+
+async function act(plan: FlightPlan, method: string, action: string, headers: Record<string, string> = {}): Promise<void> {
+  if (api === undefined) return;
+  showProblem("plans-problem", "");
+  try {
+    const { status, body } = await api.send<FlightPlan>(method, pathOf(plan, action), undefined, headers);
+    if (status === 204) plans = plans.filter(({ metadata }) => metadata.name !== plan.metadata.name);
+    else put(body);
+  } catch (error) {
+    if (!isExpired(error)) showProblem("plans-problem", sentence(error));
+  }
+  showPlans();
+}
+
+/** Follows the changes of one plan. Browsers limit the connections to a server, so the other plans are read regularly. */
+function follow(plan: FlightPlan): void {
+  following.abort();
+  following = new AbortController();
+  followed = plan.metadata.name;
+  showPlans();
+  showPlan(nameOf(plan));
+  let state = stateOf(plan);
+  const handle = (event: string, data: unknown): void => {
+    if (event === "plan") {
+      put(data as FlightPlan);
+      if (stateOf(data as FlightPlan) !== state) setText(byId("announcer"), `${plan.metadata.name}: ${stateOf(data as FlightPlan)}`);
+      state = stateOf(data as FlightPlan);
+    }
+    if (event === "error") showProblem("plans-problem", (data as { detail: string }).detail);
+    if (event === "deleted") plans = plans.filter(({ metadata }) => metadata.name !== plan.metadata.name);
+    showPlans();
+  };
+  api?.follow(pathOf(plan, "/events"), following.signal, handle).catch((error: unknown) => {
+    if (!isExpired(error)) showProblem("plans-problem", sentence(error));
+  });
+}
+
+function put(plan: FlightPlan): void {
+  plans = [...plans.filter(({ metadata }) => metadata.name !== plan.metadata.name), plan];
+}
+
+function showPlans(): void {
+  list.show(plans, followed);
+  const others = plans.filter((plan) => RESERVING.has(stateOf(plan)) && plan.metadata.name !== changed?.metadata.name);
+  map?.set("corridor", others.flatMap(({ status }) => maps!.volumeFeatures([...(status?.volumes ?? []), ...(status?.offNominalVolumes ?? [])])));
+}
+
+/** Shows a plan with the name namespace/name on the map. */
+function showPlan(name: string): void {
+  const plan = plans.find((each) => nameOf(each) === name);
+  if (plan === undefined) {
+    showProblem("submit-problem", `You cannot see the plan ${name}, because it is in another namespace or was deleted.`);
+    return;
+  }
+  if (maps === undefined || map === undefined) return;
+  const features = [...maps.specFeatures(plan.spec), ...maps.volumeFeatures(plan.status?.volumes ?? [])];
+  map.set("exclusion", features);
+  map.fit(features);
+}
+
+// -- map and connection --
+
+function showRoute(): void {
+  map?.set("path", maps!.routeFeatures(form.route.points, form.route.isRegion));
+}
+
+function showDrones(): void {
+  const positions = drones.flatMap(({ status }) => (status?.position ? [status.position] : []));
+  map?.set("depot", positions.map(maps!.pointFeature));
+}
+
+async function openMap(): Promise<void> {
+  const style = getComputedStyle(document.documentElement);
+  const colours = (name: string): string => style.getPropertyValue(`--${name}`).trim();
+  try {
+    maps = await import("./plan_map");
+    map = new maps.PlanMap(byId("map"), colours, (point) => form.route.add(point));
+    const opened = map;
+    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => opened.paint(colours));
+  } catch (error) {
+    byId("map").hidden = true;
+    byId("legend").hidden = true;
+    byId("no-map").hidden = false;
+    byId("no-map").textContent = "This browser has no WebGL, which the map requires. Use the table of coordinates.";
+    console.info("cannot show the map:", error);
+    return;
+  }
+  showRoute();
+  showDrones();
+  showPlans();
+}
+
+function showConnection(): void {
+  setText(byId("connection"), lost === undefined ? "" : `Stale since ${clock(lost)} UTC: the server does not respond, reconnecting`);
+  document.body.classList.toggle("stale", lost !== undefined);
+}
+
+/** Signs out and returns true if the server refuses the token. */
+function isExpired(error: unknown): boolean {
+  const expired = error instanceof Problem && error.status === 401;
+  if (expired) signOut(error.message);
+  return expired;
+}
+
+function sentence(error: unknown): string {
+  return error instanceof TypeError ? "The server does not respond. Try again." : (error as Error).message;
+}
+
+function showProblem(id: string, text: string): void {
+  setText(byId(id), text);
+}
+
+function nameOf({ metadata }: FlightPlan): string {
+  return `${metadata.namespace ?? ""}/${metadata.name}`;
+}
+
+function pathOf({ metadata }: FlightPlan, action = ""): string {
+  return `/plans/${metadata.name}${action}`;
+}
+
+function randomKey(): string {
+  return [...crypto.getRandomValues(new Uint8Array(16))].map((byte) => byte.toString(16).padStart(2, "0")).join("");
+}
+
+byId("sign-in").addEventListener("submit", (event) => {
+  event.preventDefault();
+  void signIn(byId<HTMLInputElement>("token").value.trim(), byId<HTMLInputElement>("namespace").value.trim());
+});
+byId("sign-out").addEventListener("click", () => signOut());
+byId("plan").addEventListener("submit", (event) => {
+  event.preventDefault();
+  void submitPlan();
+});
+byId("keep").addEventListener("click", endChange);
+setInterval(() => void refresh(), REFRESH_MS);
+setInterval(showConnection, 250);
+void openMap().then(() => {
+  const token = sessionStorage.getItem("token");
+  const namespace = sessionStorage.getItem("namespace") ?? "";
+  byId<HTMLInputElement>("namespace").value = namespace;
+  if (token !== null) void signIn(token, namespace);
+});

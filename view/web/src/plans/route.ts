@@ -1,0 +1,94 @@
+// Table of the points of a path or region. It is equivalent to drawing on the map.
+
+import { byId, element } from "../elements";
+import type { Position } from "./types";
+
+const DEFAULT_ALTITUDE_M = 20;
+
+interface Column {
+  name: "lat" | "lon" | "alt";
+  label: string;
+  min: number;
+  max: number;
+}
+
+const COLUMNS: Column[] = [
+  { name: "lat", label: "Latitude", min: -90, max: 90 },
+  { name: "lon", label: "Longitude", min: -180, max: 180 },
+  { name: "alt", label: "Altitude", min: -1_000, max: 20_000 },
+];
+
+export class Route {
+  points: Position[] = [];
+  /** True for a region, whose corners have no altitude. */
+  isRegion = false;
+
+  constructor(private readonly changed: () => void) {
+    byId("add-point").addEventListener("click", () => {
+      this.add({ lat: NaN, lon: NaN });
+      this.focus(this.points.length - 1);
+    });
+    byId("clear-route").addEventListener("click", () => this.set([], this.isRegion));
+  }
+
+  /** Replaces all points. */
+  set(points: Position[], isRegion: boolean): void {
+    this.isRegion = isRegion;
+    this.points = points.map((point) => (isRegion ? { lat: point.lat, lon: point.lon } : { ...point, alt: point.alt ?? DEFAULT_ALTITUDE_M }));
+    this.show();
+    this.changed();
+  }
+
+  /** Adds a point with the altitude of the last one. */
+  add(point: Position): void {
+    this.set([...this.points, { ...point, alt: this.points.at(-1)?.alt ?? DEFAULT_ALTITUDE_M }], this.isRegion);
+  }
+
+  private get columns(): Column[] {
+    return this.isRegion ? COLUMNS.slice(0, 2) : COLUMNS;
+  }
+
+  private show(): void {
+    byId("route-title").textContent = this.isRegion ? "Corners of the region" : "Waypoints";
+    const head = element("tr");
+    const names = ["Point", ...this.columns.map(({ label, name }) => (name === "alt" ? "Altitude (m)" : `${label} (°)`)), "Remove"];
+    head.append(...names.map((name) => element("th", "", name)));
+    byId("route-head").replaceChildren(head);
+    byId("route").replaceChildren(...this.points.map((point, index) => this.createRow(point, index)));
+  }
+
+  private createRow(point: Position, index: number): HTMLTableRowElement {
+    const row = element("tr");
+    const number = element("th", "", String(index + 1));
+    number.scope = "row";
+    row.append(number);
+    for (const { name, label, min, max } of this.columns) {
+      const input = element("input");
+      Object.assign(input, { type: "number", step: "any", required: true, min: String(min), max: String(max) });
+      input.value = Number.isFinite(point[name]) ? String(point[name]) : "";
+      input.setAttribute("aria-label", `${label} of point ${index + 1}`);
+      input.addEventListener("input", () => {
+        // The form receives the same event, and calls its listener for changes.
+        point[name] = input.valueAsNumber;
+      });
+      const cell = element("td");
+      cell.append(input);
+      row.append(cell);
+    }
+    const remove = element("button", "", "×");
+    remove.type = "button";
+    remove.setAttribute("aria-label", `Remove point ${index + 1}`);
+    remove.addEventListener("click", () => {
+      this.set(this.points.toSpliced(index, 1), this.isRegion);
+      this.focus(Math.min(index, this.points.length - 1));
+    });
+    const cell = element("td");
+    cell.append(remove);
+    row.append(cell);
+    return row;
+  }
+
+  private focus(index: number): void {
+    (byId("route").querySelectorAll("tr")[index]?.querySelector("input") ?? byId("add-point")).focus();
+  }
+}

@@ -1,0 +1,144 @@
+// Objects of the management API, as far as the page uses them. A test compares them with management/openapi.json.
+
+export interface Point {
+  lat: number;
+  lon: number;
+}
+
+export interface Position {
+  lat: number;
+  lon: number;
+  alt?: number | null;
+}
+
+export interface Circle {
+  center: Point;
+  radius: number;
+}
+
+export interface Polygon {
+  exterior: Point[];
+  holes?: Point[][];
+}
+
+export interface Area {
+  circle?: Circle | null;
+  polygon?: Polygon | null;
+}
+
+export interface Metadata {
+  name: string;
+  namespace?: string | null;
+  resourceVersion?: string | null;
+  generation?: number | null;
+}
+
+export interface Condition {
+  type: string;
+  status: string;
+  reason: string;
+  message?: string;
+}
+
+export interface FlightWindow {
+  start: string;
+  duration: number;
+}
+
+export interface PolicyAction {
+  policy: string;
+  action: string;
+}
+
+export interface ContactLoss {
+  action?: string;
+}
+
+export interface FlightPlanSpec {
+  template: string;
+  parameters?: object;
+  waypoints?: Position[] | null;
+  region?: Area | null;
+  stay?: number | null;
+  window: FlightWindow;
+  drone?: string | null;
+  policyActions?: PolicyAction[];
+  contactLost?: ContactLoss | null;
+  use?: string;
+  autoActivate?: boolean;
+}
+
+export interface PlanFinding {
+  reason: string;
+  message: string;
+  plan?: string | null;
+}
+
+export interface PlanRestriction {
+  policy: string;
+  choices?: string[];
+  chosen?: string | null;
+}
+
+export interface ReservedVolume {
+  areas: Area[];
+  lower?: number | null;
+  upper?: number | null;
+  begin: string;
+  end: string;
+}
+
+export interface Alternative {
+  node: string;
+  score: number;
+}
+
+export interface Rejection {
+  node: string;
+  message: string;
+}
+
+export interface FlightPlanStatus {
+  state?: string | null;
+  message?: string | null;
+  drone?: string | null;
+  candidates?: Alternative[];
+  rejected?: Rejection[];
+  volumes?: ReservedVolume[];
+  offNominalVolumes?: ReservedVolume[];
+  restrictions?: PlanRestriction[];
+  refusals?: PlanFinding[];
+  advisories?: PlanFinding[];
+  conditions?: Condition[];
+}
+
+export interface FlightPlan {
+  metadata: Metadata;
+  spec: FlightPlanSpec;
+  status?: FlightPlanStatus | null;
+}
+
+export interface ApplicationTemplateSpec {
+  description?: string;
+  navigation: string;
+  parameters?: object;
+}
+
+export interface ApplicationTemplateStatus {
+  conditions?: Condition[];
+}
+
+export interface ApplicationTemplate {
+  metadata: Metadata;
+  spec: ApplicationTemplateSpec;
+  status?: ApplicationTemplateStatus | null;
+}
+
+export interface DroneStatus {
+  position?: Position | null;
+}
+
+export interface Drone {
+  metadata: Metadata;
+  status?: DroneStatus | null;
+}

@@ -12,7 +12,14 @@ from fractus_runtime.kubernetes import Client
 from fractus_runtime.metrics import gauge
 from prometheus_client import Metric
 
-from fractus_management import drone_routes, event_routes, plan_routes, template_routes, thesis_routes
+from fractus_management import (
+    drone_routes,
+    event_routes,
+    plan_routes,
+    restriction_routes,
+    template_routes,
+    thesis_routes,
+)
 from fractus_management.openapi import install_document
 from fractus_management.page_routes import page_router
 from fractus_management.problem_details import install_handlers, refused
@@ -23,7 +30,13 @@ from fractus_management.settings import Settings
 RESPONSE_TIMEOUT_S = 2.0
 """Time in which the API server must respond for this process to be ready."""
 
-ROUTERS = (drone_routes.router, template_routes.router, plan_routes.router, event_routes.router)
+ROUTERS = (
+    drone_routes.router,
+    template_routes.router,
+    plan_routes.router,
+    event_routes.router,
+    restriction_routes.router,
+)
 """Routers below /v1. Each resource has a module with its router."""
 
 health = APIRouter(include_in_schema=False)

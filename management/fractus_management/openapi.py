@@ -12,8 +12,8 @@ from fractus_management.problem_details import MEDIA_TYPE, Problem
 Responses = dict[int | str, dict[str, Any]]
 
 _EVERYWHERE = (400, 401, 403, 404, 422, 429, 500, 503)
-_ETAG = {"description": "Version of the plan, for If-Match.", "schema": {"type": "string"}}
-_LOCATION = {"description": "Path of the plan.", "schema": {"type": "string"}}
+_ETAG = {"description": "Version of the object, for If-Match.", "schema": {"type": "string"}}
+_LOCATION = {"description": "Path of the object.", "schema": {"type": "string"}}
 
 
 def problems(*statuses: int) -> Responses:
@@ -26,17 +26,20 @@ def etag_header(description: str = "The plan.", model: Any = None) -> dict[str, 
     return {"description": description, "headers": {"ETag": _ETAG}} | ({"model": model} if model else {})
 
 
-def located(description: str, model: Any = None, follow: tuple[str, ...] = ()) -> dict[str, Any]:
+def located(
+    description: str, model: Any = None, follow: tuple[str, ...] = (), name: str = "/metadata/name"
+) -> dict[str, Any]:
     """Return the description of a response to a submission.
 
     Args:
         description: Meaning of the response.
         model: Model of the body, unless it is that of the route.
         follow: Names of the routes to which the name of the created object can be passed.
+        name: JSON pointer to this name in the body.
     """
     response = etag_header(description, model)
-    name = {"name": "$response.body#/metadata/name"}
-    links = {operation: {"operationId": operation, "parameters": name} for operation in follow}
+    parameters = {"name": f"$response.body#{name}"}
+    links = {operation: {"operationId": operation, "parameters": parameters} for operation in follow}
     return response | {"headers": {"ETag": _ETAG, "Location": _LOCATION}, "links": links}
 
 

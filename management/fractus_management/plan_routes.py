@@ -6,7 +6,6 @@ import asyncio
 import hashlib
 import json
 import logging
-import re
 import secrets
 from collections.abc import Callable
 from contextlib import aclosing
@@ -26,6 +25,7 @@ from pydantic import BeforeValidator, Field, WrapValidator
 
 from fractus_management.api_server import Caller, CallerOf, Continue, Limit, Namespace, ObjectName, kind_of, public
 from fractus_management.openapi import etag_header, located, problems
+from fractus_management.preconditions import IfMatch, check_version, mismatch, required
 from fractus_management.problem_details import invalid, refused
 from fractus_management.request_bodies import merged, parsed_spec, spec_of
 
@@ -40,9 +40,6 @@ _WRITE_ATTEMPTS = 5
 router = APIRouter(tags=["plans"], responses=problems())
 
 PlanSpec = Annotated[FlightPlanSpec, WrapValidator(spec_of(FlightPlan))]
-IfMatch = Annotated[
-    str | None, Header(max_length=1024, description='ETag of the version that the request is based on, or "*" for any.')
-]
 IdempotencyKey = Annotated[
     str | None,
     Header(
@@ -169,7 +166,7 @@ async def replace(
     caller: CallerOf, name: ObjectName, spec: PlanSpec, namespace: Namespace = None, if_match: IfMatch = None
 ) -> Response:
     """Replace the specification of a plan. If the change is refused, the earlier version stays in force (`status.refusals`)."""
-    return await _write(caller, name, namespace, _required(if_match), lambda _: spec)
+    return await _write(caller, name, namespace, required(if_match), lambda _: spec)
 
 
 @router.patch(
@@ -186,7 +183,7 @@ async def change(
 ) -> Response:
     """Change the specification of a plan by a JSON merge patch (RFC 7396)."""
     return await _write(
-        caller, name, namespace, _required(if_match), lambda spec: parsed_spec(FlightPlan, merged(spec, patch))
+        caller, name, namespace, required(if_match), lambda spec: parsed_spec(FlightPlan, merged(spec, patch))
     )
 
 
@@ -199,14 +196,14 @@ async def delete(caller: CallerOf, name: ObjectName, namespace: Namespace = None
     """Delete a plan. A flight is aborted: the drone returns home."""
     present = await _get(caller, name, namespace)
     options: Body = {"propagationPolicy": "Background"}
-    version = _version(_required(if_match), present)
+    version = _version(required(if_match), present)
     if version is not None:
         options["preconditions"] = {"resourceVersion": version}
     path = PLAN.path(present["metadata"]["namespace"], name)
     try:
         left = await caller.client.request("DELETE", path, options)
     except Conflict as conflict:
-        raise _mismatch() from conflict
+        raise mismatch() from conflict
     if left.get("kind") == "Status":
         return Response(status_code=HTTPStatus.NO_CONTENT)
     return _response(left, HTTPStatus.ACCEPTED)
@@ -308,7 +305,7 @@ async def _write(
             written = await caller.client.replace(PLAN, {**present, "spec": spec.to_dict()})
         except Conflict as conflict:
             if expected is not None:
-                raise _mismatch() from conflict
+                raise mismatch() from conflict
             # The operator has written the status meanwhile.
             continue
         return await _decided_response(caller, written, HTTPStatus.OK)
@@ -367,35 +364,14 @@ def _refuse_dry_run(spec: FlightPlanSpec) -> None:
         raise refused(422, "Invalid", "dryRun: remove it, and use /v1/plans:check", "dryRun")
 
 
-def _required(if_match: str | None) -> str:
-    """Return the header If-Match.
-
-    Raises:
-        Refused: The header is missing.
-    """
-    if if_match is None:
-        message = "send the header If-Match with the ETag of the plan, or If-Match: * to change any version"
-        raise refused(428, "PreconditionRequired", message, "If-Match")
-    return if_match
-
-
 def _version(if_match: str, present: Body) -> str | None:
     """Return the version that a write must replace, or None for any version.
 
     Raises:
         Refused: The header does not contain the present version.
     """
-    if if_match.strip() == "*":
-        return None
     version: str = present["metadata"]["resourceVersion"]
-    if f'"{version}"' not in re.findall(r'(?:W/)?"[^"]*"', if_match):
-        raise _mismatch()
-    return version
-
-
-def _mismatch() -> Exception:
-    message = "the plan was changed meanwhile; read it again, and repeat the change with its new ETag"
-    return refused(412, "PreconditionFailed", message, "If-Match")
+    return version if check_version(if_match, f'"{version}"') else None
 
 
 def _response(plan: Body, status: int = HTTPStatus.OK) -> JSONResponse:

@@ -36,7 +36,7 @@ LACKING = {
     "component": {"cv2", "kubernetes", "fractus_vehicle"},
     "operator": {"cv2", "fractus_vehicle"},
     "agent": {"numpy", "shapely", "cv2", "fractus_vehicle"},
-    "management": {"numpy", "shapely", "cv2", "fractus_vehicle"},
+    "management": {"cv2", "fractus_vehicle"},
     "mobility": {"cv2", "kubernetes", "fractus_vehicle"},
     "camera": {"kubernetes", "fractus_vehicle"},
 }

@@ -25,7 +25,7 @@ from fractus_core.policy.decision_types import Home, Situation
 _MARGIN_M = Situation(0.0).margin_m
 """Horizontal distance that the engine keeps from fences: position error plus tracking error."""
 
-_HEIGHT_MARGIN_M = Situation(0.0).height_margin_m
+HEIGHT_MARGIN_M = Situation(0.0).height_margin_m
 """Vertical distance that the engine keeps from floors and ceilings: altitude error plus tracking error."""
 
 _QUARTER = 8
@@ -77,18 +77,18 @@ def flight_volumes(
     corridor = shapely.union_all(
         [area_polygon(area.frame, part) for part in (*granted.operation_area, *granted.corridor)]
     )
-    upper_m = limits.home.amsl_m + limits.ceiling_m + _HEIGHT_MARGIN_M
+    upper_m = limits.home.amsl_m + limits.ceiling_m + HEIGHT_MARGIN_M
     lower_m = -math.inf
     columns: list[Area] = []
     if limits.floor_m is not None:
-        lower_m = limits.home.amsl_m + limits.floor_m - _HEIGHT_MARGIN_M
+        lower_m = limits.home.amsl_m + limits.floor_m - HEIGHT_MARGIN_M
         columns = [stand_of(drone, inventory.depots, area)]
         columns += [
             Area(circle=Circle(center=at, radius=settings.safety_radius_m)) for _, at in landing_places(granted)
         ]
     shapes = [(corridor, lower_m), *((area_polygon(area.frame, column), -math.inf) for column in columns)]
     return tuple(
-        Volume4D.of_shape(area.frame, _enlarged(shape), lower_m=bottom_m, upper_m=upper_m, begin_s=begin_s, end_s=end_s)
+        Volume4D.of_shape(area.frame, enlarged(shape), lower_m=bottom_m, upper_m=upper_m, begin_s=begin_s, end_s=end_s)
         for shape, bottom_m in shapes
     )
 
@@ -155,7 +155,7 @@ def _check_duration(needed_s: float, window_s: float) -> None:
         )
 
 
-def _enlarged(shape: BaseGeometry) -> BaseGeometry:
+def enlarged(shape: BaseGeometry) -> BaseGeometry:
     """Return a shape enlarged by the engine's margin. Arcs are circumscribed."""
     distance_m = _MARGIN_M / math.cos(math.pi / (4 * _QUARTER))
     enlarged: BaseGeometry = shapely.buffer(shape, distance_m, quad_segs=_QUARTER)

@@ -191,7 +191,7 @@ charts: ## Package the charts into dist/, for the images of this version in REGI
 
 # With PLATFORMS, Docker builds for several architectures, with bills of materials and provenance. Otherwise buildah builds for the
 # architecture of this machine.
-RELEASED := operator agent mobility camera view component sim example-traffic-monitoring
+RELEASED := operator agent mobility camera view management component sim example-traffic-monitoring
 .PHONY: archives
 archives: env ## Save the images of this version as archives in dist/ (PLATFORMS=linux/amd64,linux/arm64: with Docker)
 	mkdir -p $(DIST)

@@ -301,7 +301,11 @@ def _pods(pods: Sequence[Body]) -> Iterator[Finding]:
 
 def _scheduling_remedy(pod: Body) -> str:
     """Return the remedy for a pod that cannot be scheduled."""
-    if (pod["metadata"].get("labels") or {}).get("app.kubernetes.io/component") not in {"operator", "view"}:
+    if (pod["metadata"].get("labels") or {}).get("app.kubernetes.io/component") not in {
+        "operator",
+        "view",
+        "management",
+    }:
         return f"kubectl -n {SYSTEM} describe pod {pod['metadata']['name']}"
     return (
         f"add a node that is neither a drone nor an edge node, or label a node {CLOUD_LABEL}=true; if that node has taints, set"

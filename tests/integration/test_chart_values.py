@@ -15,7 +15,8 @@ VALUES = tuple(values_of("fractus"))
 SCHEMA = json.loads((CHARTS / "fractus" / "values.schema.json").read_text())
 WIPE = ("--set=uninstall.wipeNodes=true", "--is-upgrade")
 EVERYTHING = [
-    f"--set={part}.enabled=true" for part in ("view", "metrics.podMonitor", "metrics.rules", "metrics.dashboard")
+    f"--set={part}.enabled=true"
+    for part in ("view", "management", "metrics.podMonitor", "metrics.rules", "metrics.dashboard")
 ]
 
 
@@ -122,7 +123,7 @@ def test_every_fraction_of_values_schema_is_tested() -> None:
 
 
 IMAGES = {
-    "fractus": ("operator", "agent", "mobility", "camera", "view"),
+    "fractus": ("operator", "agent", "mobility", "camera", "view", "management"),
     "fractus-demo": ("sim", "example-traffic-monitoring", "operator"),
 }
 
@@ -130,7 +131,11 @@ IMAGES = {
 @pytest.mark.parametrize(("chart", "name"), [(chart, name) for chart, names in IMAGES.items() for name in names])
 def test_image_is_selected_by_digest(chart: str, name: str) -> None:
     digest = "sha256:" + "0123456789abcdef" * 4
-    options = ("--set=view.enabled=true", *WIPE) if chart == "fractus" else ("--set=drone=drone-1",)
+    options = (
+        ("--set=view.enabled=true", "--set=management.enabled=true", *WIPE)
+        if chart == "fractus"
+        else ("--set=drone=drone-1",)
+    )
     rendered = str(render(*options, f"--set=image.digests.{name}={digest}", chart=chart))
     assert f"localhost/fractus/{name}@{digest}" in rendered
     assert f"localhost/fractus/{name}:" not in rendered, "a workload ignores the digest"

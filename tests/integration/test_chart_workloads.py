@@ -13,7 +13,8 @@ from chart import render
 Body = dict[str, Any]
 
 ON_NODES = ("agent", "mobility", "camera")
-IN_THE_CLOUD = ("operator", "view")
+IN_THE_CLOUD = ("operator", "view", "management")
+ENABLED = ("--set=view.enabled=true", "--set=management.enabled=true")
 WORKLOADS = (*ON_NODES, *IN_THE_CLOUD)
 DRONE = "--set=drone=d"
 WHERE = "requiredDuringSchedulingIgnoredDuringExecution"
@@ -57,11 +58,11 @@ def templates(*arguments: str, chart: str = "fractus") -> dict[str, Body]:
 def everything() -> dict[str, Body]:
     settings = [f"--set-json={name}={json.dumps(FOR_THE_CLOUD)}" for name in IN_THE_CLOUD]
     settings += [f"--set-json={name}={json.dumps(FOR_PLACED)}" for name in ON_NODES]
-    return templates(*settings, "--set=view.enabled=true", "--set=uninstall.wipeNodes=true", "--is-upgrade")
+    return templates(*settings, *ENABLED, "--set=uninstall.wipeNodes=true", "--is-upgrade")
 
 
 def plain() -> dict[str, Body]:
-    return templates("--set=view.enabled=true", "--set=uninstall.wipeNodes=true", "--is-upgrade")
+    return templates(*ENABLED, "--set=uninstall.wipeNodes=true", "--is-upgrade")
 
 
 def refusal(*arguments: str, chart: str = "fractus") -> str:
@@ -113,7 +114,7 @@ def test_cloud_workload_has_configured_spread_and_tolerations(part: str) -> None
     (spread,) = pod["topologySpreadConstraints"]
     counted = spread.pop("labelSelector")["matchLabels"]
     assert spread == FOR_THE_CLOUD["topologySpreadConstraints"][0]
-    labels = everything()["view" if part == "view" else "operator"]["metadata"]["labels"]
+    labels = everything()[part if part in IN_THE_CLOUD else "operator"]["metadata"]["labels"]
     assert counted.items() <= labels.items()
     assert "app.kubernetes.io/component" in counted
 
@@ -184,7 +185,7 @@ def test_invalid_image_tag_is_refused(chart: str, more: tuple[str, ...]) -> None
 
 @pytest.mark.parametrize("part", WORKLOADS)
 def test_reserved_environment_variable_is_refused(part: str) -> None:
-    message = refusal(f"--set={part}.extraEnv[0].name=FRACTUS_NODE", "--set=view.enabled=true")
+    message = refusal(f"--set={part}.extraEnv[0].name=FRACTUS_NODE", *ENABLED)
     assert f"{part}.extraEnv: FRACTUS_NODE is reserved" in message
 
 

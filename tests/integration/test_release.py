@@ -23,8 +23,8 @@ pytestmark = pytest.mark.slow
 ROOT = CHARTS.parent
 WORKFLOW = yaml.safe_load((ROOT / ".github" / "workflows" / "release.yaml").read_text())
 VERSION = yaml.safe_load((CHARTS / "fractus" / "Chart.yaml").read_text())["version"]
-EVERYTHING = ("--set=view.enabled=true", "--set=uninstall.wipeNodes=true")
-PARTS = ("operator", "agent", "mobility", "camera", "view")
+EVERYTHING = ("--set=view.enabled=true", "--set=management.enabled=true", "--set=uninstall.wipeNodes=true")
+PARTS = ("operator", "agent", "mobility", "camera", "view", "management")
 BUILT_ON = "component"
 """Base image for components of users. No chart uses it."""
 

@@ -105,7 +105,7 @@ podAntiAffinity:
     {{- end }}
 {{- end }}
 
-{{/* Scheduling of the pods of the operator and the view. Argument: (dict "root" $ "workload" "view"). */}}
+{{/* Scheduling of the pods of the operator, the view and the management API. Argument: (dict "root" $ "workload" "view"). */}}
 {{- define "fractus.cloudPod" -}}
 {{- $values := index .root.Values .workload }}
 {{- $operator := .root.Values.operator -}}

@@ -27,7 +27,7 @@ from fractus_management.api_server import Caller, CallerOf, Continue, Limit, Nam
 from fractus_management.openapi import etag_header, located, problems
 from fractus_management.preconditions import IfMatch, check_version, mismatch, required
 from fractus_management.problem_details import invalid, refused
-from fractus_management.request_bodies import merged, parsed_spec, spec_of
+from fractus_management.request_bodies import check_values, merged, parsed_spec, spec_of
 
 log = logging.getLogger(__name__)
 
@@ -54,6 +54,7 @@ IdempotencyKey = Annotated[
 def _object(value: Any) -> Any:
     if not isinstance(value, dict):
         raise InvalidObject("", "the body must be a JSON object with Content-Type: application/merge-patch+json")
+    check_values(value)
     return value
 
 

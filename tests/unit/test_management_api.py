@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 from fastapi import FastAPI
+from fractus_management.api_server import CallerOf
 from fractus_management.app import create_app
 from fractus_management.openapi import text
 from fractus_management.problem_details import Refused, from_kubernetes
@@ -62,6 +63,34 @@ def test_failure_of_api_server_is_unavailable_and_may_be_retried(error: Exceptio
 )
 def test_merge_patch_follows_its_standard(target: object, patch: object, result: object) -> None:
     assert merged(target, patch) == result
+
+
+@pytest.mark.parametrize("opening", ['{"a":', "["])
+@pytest.mark.parametrize("depth", [101, 500, 900])
+async def test_deeply_nested_body_is_refused(opening: str, depth: int) -> None:
+    closing = "}" if opening.startswith("{") else "]"
+    nested = f"{opening * depth}1{closing * depth}"
+    spec = f'{{"parameters": {{"a": {nested}}}}}'
+    requests = [
+        ("POST", "/v1/plans", spec),
+        ("PATCH", "/v1/plans/x", spec),
+        ("POST", "/v1/apps", f'{{"name": "x", "spec": {spec}}}'),
+    ]
+    for method, path, body in requests:
+        status, _, content = await answer(authenticated(), method, path, body)
+        assert status == 422, (method, path)
+        assert "nested more than 100 levels deep" in json.loads(content)["detail"]
+
+
+@pytest.mark.parametrize("number", ["NaN", "Infinity", "-1e400"])
+@pytest.mark.parametrize("method", ["POST", "PATCH"])
+async def test_number_that_is_not_finite_is_refused_with_its_field(method: str, number: str) -> None:
+    path = "/v1/plans" if method == "POST" else "/v1/plans/x"
+    body = f'{{"parameters": {{"a": [1, {number}]}}}}'
+    status, _, content = await answer(authenticated(), method, path, body)
+    (reason,) = json.loads(content)["reasons"]
+    assert (status, reason["field"]) == (422, "parameters.a[1]")
+    assert "must be a finite number" in reason["message"]
 
 
 @pytest.fixture
@@ -118,6 +147,13 @@ def app() -> FastAPI:
     async def fails() -> None:
         raise RuntimeError
 
+    return app
+
+
+def authenticated() -> FastAPI:
+    """Return the API for requests that are refused before they reach the API server."""
+    app = create_app(Settings())
+    app.dependency_overrides[CallerOf.__metadata__[0].dependency] = lambda: None
     return app
 
 

@@ -7,6 +7,7 @@ import logging
 import time
 from collections.abc import Iterator
 from http import HTTPStatus
+from urllib.parse import quote
 
 from prometheus_client import Counter, Histogram, Metric
 from starlette.exceptions import HTTPException
@@ -114,7 +115,8 @@ class RequestGuard:
             level,
             "management: response sent (method=%s path=%s status=%d seconds=%.3f)",
             scope["method"],
-            scope["path"],
+            # The path is decoded, so it may contain line breaks.
+            quote(scope["path"]),
             status,
             seconds,
         )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import logging
 from pathlib import Path
 from typing import Any
 
@@ -212,3 +213,10 @@ async def test_slow_body_is_refused() -> None:
     app = create_app(Settings(body_timeout_s=0.05))
     status, headers, _ = await answer(app, "POST", "/v1/plans", None)
     assert (status, headers["content-type"]) == (408, "application/problem+json")
+
+
+async def test_path_in_the_log_contains_no_line_break(app: FastAPI, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO)
+    await answer(app, "GET", "/v1/x\nmanagement: response sent")
+    (line,) = [each for each in caplog.messages if "response sent (" in each]
+    assert "path=/v1/x%0Amanagement%3A%20response%20sent" in line

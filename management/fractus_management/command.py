@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import os
 import signal
-from collections.abc import Awaitable
+from collections.abc import Awaitable, Iterator
 from contextlib import aclosing
 from importlib.util import find_spec
 from pathlib import Path
 from types import FrameType
 from typing import Any
+from urllib.parse import urlsplit
 
 import click
 import uvicorn
@@ -24,12 +26,15 @@ from fractus_runtime.kubernetes import (
     without_credentials,
 )
 from fractus_runtime.kubernetes import kubeconfig as from_kubeconfig
+from fractus_runtime.loopback import is_loopback
 from fractus_runtime.metrics import serve_metrics
 from fractus_runtime.open_files import TooFewOpenFiles, raise_open_files
 
 from fractus_management.app import collect, create_app
 from fractus_management.openapi import text
 from fractus_management.settings import DEFAULT_NAMESPACE, DEFAULT_REQUESTS_PER_S, AutomatedTesting, Settings
+
+log = logging.getLogger(__name__)
 
 DEFAULT_LISTEN = "127.0.0.1:8660"
 GRACE_S = 20
@@ -155,13 +160,43 @@ async def _access(server: str, ca: Path | None, context: str | None, kubeconfig:
     return without_credentials(access.configuration)
 
 
+def token_risks(host: str, server: str, *, verified: bool) -> Iterator[str]:
+    """Yield a sentence for each way in which others could read the tokens of users.
+
+    Args:
+        host: Host on which the API listens.
+        server: URL of the Kubernetes API server.
+        verified: True if the certificate of the API server is verified.
+    """
+    if not is_loopback(host):
+        yield (
+            f"connections to {host} are not encrypted, so others on this network can read the tokens of users; put a TLS proxy in"
+            " front of this server"
+        )
+    address = urlsplit(server)
+    if address.scheme != "https" and not is_loopback(address.hostname or ""):
+        yield (
+            f"connections to the Kubernetes API server {server} are not encrypted, so others on this network can read the tokens"
+            " of users; use its https address"
+        )
+    elif address.scheme == "https" and not verified:
+        yield (
+            f"the certificate of the Kubernetes API server {server} is not verified, so another server can receive the tokens of"
+            " users; specify its CA instead of insecure-skip-tls-verify"
+        )
+
+
 async def _serve(listen: tuple[str, int], settings: Settings, access: Awaitable[Access], metrics: str) -> None:
     try:
-        client = Client(await access, "fractus-api", max_connections=_MAX_CONNECTIONS)
+        api_server = await access
+        client = Client(api_server, "fractus-api", max_connections=_MAX_CONNECTIONS)
     except Unconfigured as error:
         raise click.ClickException(str(error)) from error
     app = create_app(settings, client)
     host, port = listen
+    configuration = api_server.configuration
+    for risk in token_risks(host, str(configuration.host), verified=configuration.verify_ssl):
+        log.warning("management: tokens are at risk (reason=%s)", risk)
     config = uvicorn.Config(
         app,
         host=host,

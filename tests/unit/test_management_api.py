@@ -12,6 +12,7 @@ import pytest
 from fastapi import FastAPI
 from fractus_management.api_server import CallerOf
 from fractus_management.app import create_app
+from fractus_management.command import token_risks
 from fractus_management.openapi import text
 from fractus_management.problem_details import Refused, from_kubernetes
 from fractus_management.request_bodies import merged
@@ -220,3 +221,21 @@ async def test_path_in_the_log_contains_no_line_break(app: FastAPI, caplog: pyte
     await answer(app, "GET", "/v1/x\nmanagement: response sent")
     (line,) = [each for each in caplog.messages if "response sent (" in each]
     assert "path=/v1/x%0Amanagement%3A%20response%20sent" in line
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.0.2.1", "example.com"])
+def test_listening_on_the_network_without_tls_is_reported(host: str) -> None:
+    (warning,) = token_risks(host, "https://192.0.2.2", verified=True)
+    assert "put a TLS proxy in front" in warning
+
+
+@pytest.mark.parametrize("server", ["https://192.0.2.2", "http://127.0.0.1:8001"])
+@pytest.mark.parametrize("host", ["127.0.0.1", "::1", "localhost"])
+def test_local_connections_without_tls_are_not_reported(host: str, server: str) -> None:
+    assert list(token_risks(host, server, verified=True)) == []
+
+
+@pytest.mark.parametrize(("server", "verified"), [("http://192.0.2.2", True), ("https://192.0.2.2", False)])
+def test_sending_tokens_to_an_unverified_api_server_is_reported(server: str, verified: bool) -> None:
+    (warning,) = token_risks("127.0.0.1", server, verified=verified)
+    assert "API server" in warning

@@ -9,13 +9,13 @@ import signal
 from collections.abc import Callable, Iterable
 from contextlib import aclosing, suppress
 from dataclasses import dataclass
-from ipaddress import ip_address
 from pathlib import Path
 
 import click
 from aiohttp import web
 from fractus_runtime.files import open_file, path_text, read_file
 from fractus_runtime.kubernetes import Client, KubeError, Unconfigured, from_environment, kubeconfig
+from fractus_runtime.loopback import is_loopback
 from fractus_runtime.mcap_tail import MAGIC
 from fractus_runtime.metrics import serve_metrics
 from fractus_runtime.open_files import TooFewOpenFiles, raise_open_files
@@ -314,7 +314,7 @@ async def _serve(source: Source, options: ServerOptions, metrics: Callable[[], I
         # Do not print the token of a file: the user knows it, and other people may read the log.
         token = server.token if token_file is None else "..."
         click.echo(f"view: open http://{url_host}:{actual_port}/?token={token}")
-        if not _is_loopback(host):
+        if not is_loopback(host):
             click.echo(
                 "view: connections are not encrypted, so others on this network can read them and the token; put a TLS proxy in"
                 " front of this server",
@@ -329,10 +329,3 @@ async def _serve(source: Source, options: ServerOptions, metrics: Callable[[], I
         if listener is not None:
             listener.close()
         await runner.cleanup()
-
-
-def _is_loopback(host: str) -> bool:
-    try:
-        return ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import fcntl
-import ipaddress
 import logging
 import os
 import termios
@@ -13,6 +12,7 @@ import tty
 from collections.abc import Callable
 from typing import Any, Protocol
 
+from fractus_runtime.loopback import is_loopback
 from fractus_runtime.mavlink_codec import Parser
 
 from fractus_services.mobility.mavlink.vehicle_identification import is_vehicle_heartbeat
@@ -114,15 +114,6 @@ def _from_autopilot(data: bytes) -> bool:
     return any(map(is_vehicle_heartbeat, Parser().feed(data)))
 
 
-def _is_loopback(host: str) -> bool:
-    if host == "localhost":
-        return True
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
-
-
 class _Serial:
     """Serial device in raw mode, read by the event loop."""
 
@@ -203,7 +194,7 @@ async def open_link(url: str, receive: Receive, closed: Closed) -> Transport:
         raise BadUrl(
             f"{url!r} is not an autopilot URL; use tcp:HOST:PORT, udpin:HOST:PORT, udpout:HOST:PORT or serial:DEVICE:BAUD"
         )
-    if scheme == "udpin" and not _is_loopback(address):
+    if scheme == "udpin" and not is_loopback(address):
         raise BadUrl(f"{url!r} would accept an autopilot on any host; use udpin:127.0.0.1:{number}")
     if scheme == "serial":
         return _Serial(address, int(number), receive, closed)

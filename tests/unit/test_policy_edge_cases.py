@@ -149,6 +149,17 @@ def test_return_flight_changes_altitude_only_where_limit_of_zone_permits_it(
     assert may_change_altitude(at(alt=present_m), compiled(limited), target_m) == permitted
 
 
+@pytest.mark.parametrize(("beyond_margin_m", "permitted"), [(0.3, False), (0.7, True)])
+def test_return_flight_does_not_climb_where_wind_moves_drone_into_margin_of_limited_zone(
+    beyond_margin_m: float, permitted: bool
+) -> None:
+    limited = altitude(
+        zones=[zone("limited", box(-50, -50, 50, 50), lower=10, upper=45)], lowerLimit=5.0, upperLimit=22.0
+    )
+    east_m = 50 + at().margin_m + beyond_margin_m
+    assert may_change_altitude(at(east_m, alt=15.0), compiled(limited), 40.0) == permitted
+
+
 def _court() -> dict[str, Any]:
     area = box(-60, -60, 60, 60)
     area["polygon"]["holes"] = [box(-40, -40, 40, 40)["polygon"]["exterior"]]

@@ -32,6 +32,12 @@ MIN_RETURN_ALTITUDE_M = 10.0
 ZONE_FLOOR_CLEARANCE_M = 0.5
 """Distance kept below a zone's floor in addition to the margin, because a drone does not hold its altitude exactly."""
 
+HOVER_DRIFT_M = 0.5
+"""Distance by which wind moves a drone that climbs or sinks at one position.
+
+A drone that drifts into the margin of a zone during a climb would have to sink to the altitudes of the zone, and then climb again.
+"""
+
 MAX_LOWERED_ALTITUDES = 4
 """Maximum number of altitudes just below a zone at which a return route is searched.
 
@@ -118,14 +124,15 @@ def may_change_altitude(now: Situation, grant: CompiledGrant, altitude_m: float)
 
     A drone that is too close below or above a zone may move away from it, even next to another zone: a vertical motion
     does not bring it closer to the other zone. A drone that breaks the altitude limit of a zone may move to any altitude.
-    Any other drone must not climb or sink into or inside a zone at altitudes that the zone's altitude limit forbids.
+    Any other drone must not climb or sink into, inside or just beside a zone at altitudes that the zone's altitude limit forbids.
     """
     position = grant.locate(now)
     if position is None:
         return False
     low_m = min(now.altitude_m, altitude_m)
     high_m = max(now.altitude_m, altitude_m)
-    if _limits_forbid(AirVolume(shapely.points(position), now.margin_m, low_m, high_m), now, grant):
+    around_m = now.margin_m + HOVER_DRIFT_M
+    if _limits_forbid(AirVolume(shapely.points(position), around_m, low_m, high_m), now, grant):
         return False
     column = vertical_leg(position, low_m, high_m)
     present = vertical_leg(position, now.altitude_m, now.altitude_m)

@@ -747,8 +747,10 @@ def _change(fleet: Fleet, tally: Tally, permitted: list[str], exempt: Flags, rng
         permitted[i] = ""
         fleet.arrives[i] = False
     fleet.learn()
-    if len(rows):
-        exempt[rows] |= excused(fleet.part(rows))
+    # No request in force has caused the motion of these drones: before a new request, they may already be unable to stop.
+    idle = np.array([i for i, text in enumerate(permitted) if not text], dtype=np.int64)
+    if len(idle):
+        exempt[idle] |= excused(fleet.part(idle))
     tally.changed += len(rows)
 
 

@@ -10,9 +10,9 @@ import pytest
 from axe_playwright_python.sync_playwright import Axe
 from browser import CHROMIUM, SOFTWARE_GL, TIMEOUT_MS, launched
 from control_plane import wait_for
-from management_server import ManagementServer, User, submitted
+from management_server import Body, ManagementServer, User, plan, submitted
 from operator_world import FRACTUS, LAT, LON, World, approved_region_template, approved_template, at, fractus_object
-from playwright.sync_api import Browser, Page, Playwright, expect, sync_playwright
+from playwright.sync_api import Browser, Page, Playwright, Route, expect, sync_playwright
 
 IMPORTED = Path(__file__).parents[1] / "imported"
 
@@ -79,6 +79,15 @@ def import_file(page: Page, content: str) -> None:
 def is_ready(pilot: User, template: str) -> bool:
     status = pilot("GET", f"/v1/apps/{template}").body.get("status") or {}
     return any(each["type"] == "Ready" and each["status"] == "True" for each in status.get("conditions") or ())
+
+
+def publish_parameters(world: World, schema: Body) -> None:
+    """Publish and approve the template `survey` with a schema of its parameters."""
+    approved_template(world)
+    path = f"{FRACTUS}/applicationtemplates/survey"
+    body = world.api.merge(path, {"spec": {"parameters": schema}})
+    approval = {"generation": body["metadata"]["generation"], "by": "admin", "at": "2026-01-01T00:00:00Z"}
+    world.api.merge(f"{path}/status", {"status": {"approval": approval}})
 
 
 def expect_decision(page: Page, text: str) -> None:
@@ -185,8 +194,6 @@ def test_plans_page_requires_an_action_for_each_policy_with_choices(page: Page, 
 
 
 def test_plans_page_shows_parameters_of_the_template(page: Page, pilot: User, world: World) -> None:
-    approved_template(world)
-    path = f"{FRACTUS}/applicationtemplates/survey"
     schema = {
         "type": "object",
         "required": ["pictures"],
@@ -195,9 +202,7 @@ def test_plans_page_shows_parameters_of_the_template(page: Page, pilot: User, wo
             "mode": {"enum": ["fast", "careful"], "default": "careful"},
         },
     }
-    body = world.api.merge(path, {"spec": {"parameters": schema}})
-    approval = {"generation": body["metadata"]["generation"], "by": "admin", "at": "2026-01-01T00:00:00Z"}
-    world.api.merge(f"{path}/status", {"status": {"approval": approval}})
+    publish_parameters(world, schema)
     wait_for(lambda: is_ready(pilot, "survey"), "the template to be ready")
     sign_in(page, pilot)
     enter_point(page, 1, 50, 50, 20)
@@ -255,6 +260,7 @@ def test_plans_page_refuses_an_invalid_token_and_forgets_it(page: Page, pilot: U
         ("{", "The file is not JSON"),
         ("null", "no point, line or polygon"),
         ('{"type": "LineString", "coordinates": [[0, 91]]}', "position 91, 0, without altitude"),
+        ('{"type": "LineString", "coordinates": [[0, 1, 120]]}', "heights above the ellipsoid"),
         ('{"type": "LineString"}', "coordinates of the file are incomplete"),
         ((IMPORTED / "plan-jump.plan").read_text(), "of the mission is not a waypoint"),
         ((IMPORTED / "plan-terrain-frames.plan").read_text(), "is not relative to home"),
@@ -265,3 +271,95 @@ def test_plans_page_names_the_problem_of_an_imported_file(page: Page, pilot: Use
     import_file(page, content)
     expect(page.locator("#import-problem")).to_contain_text(message)
     expect(page.locator("#route tr")).to_have_count(0)
+
+
+def test_plans_page_keeps_changing_a_plan_that_is_edited_during_its_submission(page: Page, pilot: User) -> None:
+    name = submitted(pilot).body["metadata"]["name"]
+    sign_in(page, pilot)
+    page.get_by_role("button", name=f"Change {name}").click()
+    page.get_by_label("Duration in minutes").fill("20")
+    pending: list[Route] = []
+
+    def held(route: Route) -> None:
+        pending.append(route)
+
+    page.route(f"**/v1/plans/{name}?*", held, times=1)
+    change = page.get_by_role("button", name="Change the plan", exact=True)
+    with page.expect_request(f"**/v1/plans/{name}?*"):
+        change.click()
+    page.get_by_label("Duration in minutes").fill("25")
+    pending[0].continue_()
+    expect(page.locator("#plans > li")).to_contain_text("20 minutes", timeout=TIMEOUT_MS)
+    expect_decision(page, f"You change {name}.")
+    change.click()
+    expect(page.locator("#plans > li")).to_contain_text("25 minutes", timeout=TIMEOUT_MS)
+    expect(page.locator("#plans > li")).to_have_count(1)
+
+
+def test_plans_page_keeps_changing_a_plan_if_another_one_cannot_be_shown(page: Page, pilot: User, world: World) -> None:
+    approved_region_template(world)
+    wait_for(lambda: is_ready(pilot, "patrol"), "the template to be ready")
+    name = submitted(pilot).body["metadata"]["name"]
+    circle = {"circle": {"center": at(10, 10), "radius": 20}}
+    window = {"start": "2099-01-01T00:00:00Z", "duration": 15}
+    reply = pilot("POST", "/v1/plans", {"template": "patrol", "region": circle, "stay": 1, "window": window})
+    sign_in(page, pilot)
+    page.get_by_role("button", name=f"Change {name}").click()
+    page.get_by_role("button", name=f"Change {reply.body['metadata']['name']}").click()
+    expect(page.locator("#plans-problem")).to_contain_text("cannot change a region that is a circle")
+    page.get_by_label("Duration in minutes").fill("20")
+    expect(page.get_by_role("button", name="Change the plan", exact=True)).to_be_enabled()
+    expect_decision(page, f"You change {name}.")
+
+
+@pytest.mark.parametrize("button", ["Start", "Delete"])
+def test_plans_page_does_nothing_with_a_plan_that_another_user_has_changed(
+    page: Page, pilot: User, button: str
+) -> None:
+    name = submitted(pilot, in_s=7200).body["metadata"]["name"]
+    if button == "Delete":
+        name = submitted(pilot, in_s=7200).body["metadata"][
+            "name"
+        ]  # It conflicts with the first one, so it is rejected.
+    sign_in(page, pilot)
+    page.route("**/v1/plans?*", lambda route: route.abort())  # The list is not read again.
+    later = plan(in_s=14400)["window"]
+    pilot("PATCH", f"/v1/plans/{name}", {"window": later}, If_Match="*")
+    page.get_by_role("button", name=f"{button} {name}").click()
+    expect(page.locator("#plans-problem")).to_contain_text("window.start is now", timeout=TIMEOUT_MS)
+    stored = pilot("GET", f"/v1/plans/{name}").body
+    assert stored["spec"].get("use") != "InUse"
+    assert stored["status"]["state"] == "Accepted"
+
+
+def test_plans_page_keeps_the_altitude_reference_of_waypoints(page: Page, pilot: User) -> None:
+    waypoints = [{**at(50, 50, alt=30), "altitudeReference": "amsl"}]
+    name = submitted(pilot, waypoints=waypoints).body["metadata"]["name"]
+    sign_in(page, pilot)
+    page.get_by_role("button", name=f"Change {name}").click()
+    expect(page.locator("#route")).to_contain_text("above sea level")
+    enter_point(page, 2, 60, 60, 31)
+    page.get_by_role("button", name="Change the plan", exact=True).click()
+    expect(page.get_by_role("button", name="Submit the plan")).to_be_visible(timeout=TIMEOUT_MS)
+    stored = pilot("GET", f"/v1/plans/{name}").body["spec"]["waypoints"]
+    assert [(each["alt"], each["altitudeReference"]) for each in stored] == [(30, "amsl"), (31, "amsl")]
+
+
+def test_plans_page_keeps_parameters_that_the_schema_does_not_describe(page: Page, pilot: User, world: World) -> None:
+    publish_parameters(world, {"type": "object"})
+    wait_for(lambda: is_ready(pilot, "survey"), "the template to be ready")
+    name = submitted(pilot, parameters={"note": "north"}).body["metadata"]["name"]
+    sign_in(page, pilot)
+    page.get_by_role("button", name=f"Change {name}").click()
+    page.get_by_label("Duration in minutes").fill("20")
+    page.get_by_role("button", name="Change the plan", exact=True).click()
+    expect(page.locator("#plans > li")).to_contain_text("20 minutes", timeout=TIMEOUT_MS)
+    assert pilot("GET", f"/v1/plans/{name}").body["spec"]["parameters"] == {"note": "north"}
+
+
+def test_plans_page_forgets_the_plan_of_a_user_who_signs_out(page: Page, pilot: User) -> None:
+    sign_in(page, pilot)
+    enter_point(page, 1, 50, 50, 20)
+    page.get_by_role("button", name="Sign out").click()
+    expect(page.locator("#route tr")).to_have_count(0)
+    expect(page.get_by_label("Token")).to_be_focused()

@@ -67,7 +67,9 @@ export class Api {
         for await (const { event, data, id } of this.events(path, lastId, signal)) {
           lastId = id || lastId;
           if (signal.aborted) return;
-          handle(event, JSON.parse(data));
+          const content: unknown = JSON.parse(data);
+          if (event === "error" && TEMPORARY.has((content as { status: number }).status)) break;
+          handle(event, content);
           if (event === "deleted" || event === "error") return;
         }
       } catch (error) {

@@ -5,7 +5,7 @@ import "./plans.css";
 
 import { byId, setText } from "../elements";
 import { clock } from "../text";
-import { Api, Problem, TEMPORARY } from "./api";
+import { Api, Problem, type Reply, TEMPORARY } from "./api";
 import { showFindings } from "./decision";
 import { differences } from "./differences";
 import { PlanForm } from "./plan_form";
@@ -47,13 +47,13 @@ const submit = byId<HTMLButtonElement>("submit");
 const form = new PlanForm(edited);
 const list = new PlanList({
   follow,
-  start: (plan) => void act(plan, "POST", ":activate"),
+  start: (plan) => void act(plan, (client) => sendSeen(client, plan, "POST", ":activate")),
   end: (plan) => {
-    if (confirm(`End ${plan.metadata.name}? A drone in the air returns home.`)) void act(plan, "POST", ":end");
+    if (confirm(`End ${plan.metadata.name}? A drone in the air returns home.`)) void act(plan, (client) => client.send("POST", pathOf(plan, ":end")));
   },
   change: beginChange,
   remove: (plan) => {
-    if (confirm(`Delete ${plan.metadata.name}?`)) void act(plan, "DELETE", "", { "If-Match": "*" });
+    if (confirm(`Delete ${plan.metadata.name}?`)) void act(plan, (client) => sendSeen(client, plan, "DELETE", ""));
   },
 });
 
@@ -80,6 +80,7 @@ async function signIn(token: string, namespace: string): Promise<void> {
   byId("plan-title").focus();
   edited();
   showPlans();
+  showDrones();
 }
 
 /** Returns the drones, or none if the user may not read them. */
@@ -98,6 +99,12 @@ function signOut(reason = ""): void {
   following.abort();
   clearTimeout(checkTimer);
   plans = [];
+  drones = [];
+  changed = undefined;
+  form.release();
+  showPlans();
+  showDrones();
+  map?.set("exclusion", []);
   sessionStorage.removeItem("token");
   byId<HTMLInputElement>("token").value = "";
   showSignedIn(false);
@@ -187,17 +194,22 @@ async function submitPlan(): Promise<void> {
   showProblem("submit-problem", "");
   const spec = form.spec;
   const before = key;
+  const target = changed;
   try {
-    const plan = changed === undefined ? await create(api, spec) : await replace(api, changed, spec);
+    const plan = target === undefined ? await create(api, spec) : await replace(api, target, spec);
     if (plan === undefined) return;
-    changed = undefined;
-    form.release();
     put(plan);
     follow(plan);
-    // Without a further edit meanwhile, the form shows what is submitted.
-    submitted = key === before;
-    if (submitted) decide(plan.status ?? {});
-    byId("plans-title").focus();
+    if (key === before) {
+      changed = undefined;
+      form.release();
+      submitted = true;
+      decide(plan.status ?? {});
+      byId("plans-title").focus();
+    } else if (target !== undefined && changed === target) {
+      // The user has edited the form meanwhile, so the form still changes the plan.
+      changed = plan;
+    }
   } catch (error) {
     if (!isExpired(error)) showProblem("submit-problem", sentence(error));
   } finally {
@@ -211,30 +223,48 @@ async function create(client: Api, spec: FlightPlanSpec): Promise<FlightPlan> {
 
 /** Replaces a plan. Returns undefined if another user has changed it, and shows the differences. */
 async function replace(client: Api, plan: FlightPlan, spec: FlightPlanSpec): Promise<FlightPlan | undefined> {
-  let seen = plan;
-  for (let attempt = 1; ; attempt++) {
-    try {
-      return (await client.send<FlightPlan>("PUT", pathOf(plan), spec, { "If-Match": `"${seen.metadata.resourceVersion}"` })).body;
-    } catch (error) {
-      if (!(error instanceof Problem) || error.status !== 412 || attempt === CHANGE_ATTEMPTS) throw error;
-    }
-    seen = (await client.send<FlightPlan>("GET", pathOf(plan))).body;
-    // The status of a plan is part of its version. Only changes of the specification matter to the user.
-    if (differences(seen.spec, plan.spec) === "") continue;
-    changed = seen;
-    const text = differences(seen.spec, spec) || "both versions are equal";
+  try {
+    return (await sendSeen(client, plan, "PUT", "", spec)).body;
+  } catch (error) {
+    if (!(error instanceof Changed)) throw error;
+    if (changed === plan) changed = error.plan;
+    const text = differences(error.plan.spec, spec) || "both versions are equal";
     showProblem("submit-problem", `Another user changed the plan meanwhile: ${text}. To replace that version by yours, press “Change the plan” again.`);
     return undefined;
   }
 }
 
+/** Thrown if a plan is not the one that the user has seen. */
+class Changed extends Error {
+  constructor(readonly plan: FlightPlan) {
+    super();
+  }
+}
+
+/** Sends a request about the version of a plan that the user has seen. Throws a Changed if another user has changed the plan. */
+async function sendSeen(client: Api, plan: FlightPlan, method: string, action: string, body?: FlightPlanSpec): Promise<Reply<FlightPlan>> {
+  let present = plan;
+  for (let attempt = 1; ; attempt++) {
+    try {
+      return await client.send<FlightPlan>(method, pathOf(plan, action), body, { "If-Match": `"${present.metadata.resourceVersion}"` });
+    } catch (error) {
+      if (!(error instanceof Problem) || error.status !== 412 || attempt === CHANGE_ATTEMPTS) throw error;
+    }
+    present = (await client.send<FlightPlan>("GET", pathOf(plan))).body;
+    // The status of a plan is part of its version. It matters only if the user would delete a flight.
+    const reserved = method === "DELETE" && RESERVING.has(stateOf(present));
+    if (reserved || differences(present.spec, plan.spec) !== "") throw new Changed(present);
+  }
+}
+
 function beginChange(plan: FlightPlan): void {
+  const before = changed;
   try {
     changed = plan;
     form.show(plan.spec);
     showProblem("plans-problem", "");
   } catch (error) {
-    changed = undefined;
+    changed = before;
     showProblem("plans-problem", sentence(error));
     return;
   }
@@ -264,15 +294,19 @@ async function refresh(): Promise<void> {
   showPlans();
 }
 
-async function act(plan: FlightPlan, method: string, action: string, headers: Record<string, string> = {}): Promise<void> {
+async function act(plan: FlightPlan, send: (client: Api) => Promise<Reply<FlightPlan>>): Promise<void> {
   if (api === undefined) return;
   showProblem("plans-problem", "");
   try {
-    const { status, body } = await api.send<FlightPlan>(method, pathOf(plan, action), undefined, headers);
+    const { status, body } = await send(api);
     if (status === 204) plans = plans.filter(({ metadata }) => metadata.name !== plan.metadata.name);
     else put(body);
   } catch (error) {
-    if (!isExpired(error)) showProblem("plans-problem", sentence(error));
+    if (error instanceof Changed) {
+      put(error.plan);
+      const text = differences(error.plan.spec, plan.spec) || `its state is now ${stateOf(error.plan)}`;
+      showProblem("plans-problem", `The plan ${plan.metadata.name} was changed meanwhile: ${text}. Nothing was done.`);
+    } else if (!isExpired(error)) showProblem("plans-problem", sentence(error));
   }
   showPlans();
 }
@@ -391,7 +425,11 @@ byId("sign-in").addEventListener("submit", (event) => {
   event.preventDefault();
   void signIn(byId<HTMLInputElement>("token").value.trim(), byId<HTMLInputElement>("namespace").value.trim());
 });
-byId("sign-out").addEventListener("click", () => signOut());
+byId("sign-out").addEventListener("click", () => {
+  signOut();
+  // The next user of the tab must not see the form and the map of this one.
+  location.reload();
+});
 byId("plan").addEventListener("submit", (event) => {
   event.preventDefault();
   void submitPlan();

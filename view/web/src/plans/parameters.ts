@@ -21,12 +21,15 @@ type Control = HTMLInputElement | HTMLSelectElement | HTMLTextAreaElement;
 
 export class ParameterForm {
   private readonly readers = new Map<string, () => unknown>();
+  /** Values that the schema does not describe. They are kept. */
+  private others: [string, unknown][] = [];
 
   constructor(private readonly parent: HTMLElement) {}
 
   /** Shows the parameters of a schema with their values, or their defaults. */
   show(schema: Schema, values: Record<string, unknown>): void {
     this.readers.clear();
+    this.others = Object.entries(values).filter(([name]) => !(name in (schema.properties ?? {})));
     const rows = Object.entries(schema.properties ?? {}).flatMap(([name, property]) =>
       this.createRow(name, property, values[name] ?? property.default, schema.required?.includes(name) ?? false),
     );
@@ -36,7 +39,7 @@ export class ParameterForm {
   /** Returns the entered values. Empty parameters are omitted. */
   values(): Record<string, unknown> {
     const entries = [...this.readers].map(([name, read]) => [name, read()] as const);
-    return Object.fromEntries(entries.filter(([, value]) => value !== undefined));
+    return Object.fromEntries([...this.others, ...entries].filter(([, value]) => value !== undefined));
   }
 
   private createRow(name: string, property: Property, value: unknown, required: boolean): HTMLElement[] {

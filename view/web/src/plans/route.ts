@@ -4,6 +4,7 @@ import { byId, element } from "../elements";
 import type { Position } from "./types";
 
 const DEFAULT_ALTITUDE_M = 20;
+const REFERENCES: Record<string, string> = { home: "above home", amsl: "above sea level", terrain: "above the ground" };
 
 interface Column {
   name: "lat" | "lon" | "alt";
@@ -39,9 +40,10 @@ export class Route {
     this.changed();
   }
 
-  /** Adds a point with the altitude of the last one. */
+  /** Adds a point with the altitude of the last one, above the same reference. */
   add(point: Position): void {
-    this.set([...this.points, { ...point, alt: this.points.at(-1)?.alt ?? DEFAULT_ALTITUDE_M }], this.isRegion);
+    const { alt = DEFAULT_ALTITUDE_M, altitudeReference = "home" } = this.points.at(-1) ?? {};
+    this.set([...this.points, { ...point, alt, altitudeReference }], this.isRegion);
   }
 
   private get columns(): Column[] {
@@ -73,6 +75,7 @@ export class Route {
       });
       const cell = element("td");
       cell.append(input);
+      if (name === "alt") cell.append(element("span", "facts", REFERENCES[point.altitudeReference ?? "home"]));
       row.append(cell);
     }
     const remove = element("button", "", "×");

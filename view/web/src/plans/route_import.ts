@@ -73,8 +73,9 @@ function geometryPoints(content: unknown): Position[] {
 }
 
 function point(position: unknown): Position {
-  const [lon, lat, alt] = list(position);
-  return { lat: number(lat), lon: number(lon), ...(alt === undefined ? {} : { alt: number(alt) }) };
+  const [lon, lat, height] = list(position);
+  if (height) throw new Error("The file contains heights above the ellipsoid, which are not altitudes of a flight. Remove them.");
+  return { lat: number(lat), lon: number(lon) };
 }
 
 function list(value: unknown): unknown[] {

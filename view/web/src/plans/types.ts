@@ -9,6 +9,7 @@ export interface Position {
   lat: number;
   lon: number;
   alt?: number | null;
+  altitudeReference?: string;
 }
 
 export interface Circle {

@@ -23,6 +23,7 @@ from fractus_management.interuss.plan_mapping import (
     Unplannable,
     altitude_problem,
     flight_plan_spec,
+    notifications_of,
     priority_class,
     refusal_of,
     reserves_in,
@@ -355,3 +356,10 @@ def test_numbers_are_judged_as_by_uas_standards(
         other = valid[:i] + source.choice("019AZaz-") + valid[i + 1 :]
         # uas-standards does not check the letters of the country, and permits more letters in serial numbers.
         assert not is_valid(other) or oracle(other)
+
+
+def test_notifications_since_the_first_representable_time_are_listed() -> None:
+    at = "2026-12-01T10:00:00Z"
+    condition = {"type": "ConflictArose", "status": "True", "lastTransitionTime": at, "message": "overlap"}
+    (found,) = notifications_of({"status": {"conditions": [condition]}}, datetime.min.replace(tzinfo=UTC), None)
+    assert found["observed_at"]["value"] == at

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from datetime import datetime, timedelta
 from typing import Any, cast
 
 import shapely
@@ -249,3 +250,20 @@ def refusal_of(plan: Body) -> Unplannable | None:
             result: PlanningResult = "NotSupported" if condition["reason"] == "ChangeNotPermitted" else "Rejected"
             return Unplannable(result, str(condition.get("message") or condition["reason"]))
     return None
+
+
+def notifications_of(plan: Body, after: datetime, before: datetime | None) -> Iterator[Body]:
+    """Yield the notification of a conflict that arose with a FlightPlan, if the operator reported it in a time."""
+    status = plan.get("status") or {}
+    overlaps = [each for each in status.get("advisories") or () if each.get("plan")]
+    for condition in status.get("conditions") or ():
+        if condition["type"] != "ConflictArose" or condition["status"] != "True":
+            continue
+        at = datetime.fromisoformat(condition["lastTransitionTime"])
+        # Kubernetes omits the fraction of a second. A difference does not overflow for the first and last times of datetime.
+        if after - at < timedelta(seconds=1) and (before is None or at <= before):
+            yield {
+                "observed_at": {"value": condition["lastTransitionTime"], "format": "RFC3339"},
+                "message": condition.get("message", ""),
+                "conflicts": "Multiple" if len(overlaps) > 1 else "Single",
+            }

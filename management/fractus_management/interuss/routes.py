@@ -6,7 +6,6 @@ import asyncio
 import time
 from collections import OrderedDict
 from collections.abc import Callable
-from datetime import datetime, timedelta
 from http import HTTPStatus
 from typing import Annotated, Any, cast
 from uuid import UUID
@@ -30,6 +29,7 @@ from fractus_management.interuss.plan_mapping import (
     Unplannable,
     altitude_problem,
     flight_plan_spec,
+    notifications_of,
     refusal_of,
     reserves_in,
     response_of,
@@ -123,23 +123,8 @@ async def user_notifications(
     """List the conflicts that arose with plans that exist, by the time at which the operator reported them."""
     if before is not None and before < after:
         raise refused(HTTPStatus.BAD_REQUEST, "Invalid", "before must not be earlier than after", "before")
-    found = []
-    for plan in (await caller.client.list_whole(PLAN, namespace=caller.settings.namespace)).items:
-        status_ = plan.get("status") or {}
-        overlaps = [each for each in status_.get("advisories") or () if each.get("plan")]
-        for condition in status_.get("conditions") or ():
-            if condition["type"] != "ConflictArose" or condition["status"] != "True":
-                continue
-            at = datetime.fromisoformat(condition["lastTransitionTime"])
-            # Kubernetes omits the fraction of a second.
-            if after - timedelta(seconds=1) < at and (before is None or at <= before):
-                found.append(
-                    {
-                        "observed_at": {"value": condition["lastTransitionTime"], "format": "RFC3339"},
-                        "message": condition.get("message", ""),
-                        "conflicts": "Multiple" if len(overlaps) > 1 else "Single",
-                    }
-                )
+    plans = (await caller.client.list_whole(PLAN, namespace=caller.settings.namespace)).items
+    found = [each for plan in plans for each in notifications_of(plan, after, before)]
     return JSONResponse({"user_notifications": found})
 
 

@@ -389,9 +389,9 @@ class ApplicationController:
         state.excluded = {node: (end, reason) for node, (end, reason) in state.excluded.items() if end > now}
         state.excluded |= {node: (now + EXCLUSION, reason) for node, reason in stuck.items()}
         excluded = {node: reason for node, (_, reason) in state.excluded.items()}
-        reserved = self._cache.reserved_drone(observed.key)
+        reserved = self._cache.flights.of_application(observed.submitted)
         if reserved is not None:
-            excluded |= other_drones(inventory.drones, reserved, f"the flight plan has Drone {reserved}")
+            excluded |= other_drones(inventory.drones, reserved.drone, f"the flight plan has Drone {reserved.drone}")
         settings = replace(self._settings, excluded=excluded, time_s=now.timestamp())
         unchecked = observed.plan
         if unchecked is not None and not mission_changed(application, unchecked):

@@ -24,7 +24,6 @@ from fractus_core.api.names import NODE_SIGNER
 from fractus_core.api.plans import DeploymentPlanSpec
 from fractus_core.planning.candidates import readiness
 from fractus_core.planning.inventory import Flight, Host, Inventory
-from fractus_core.planning.ordered_application import application_name
 from fractus_core.planning.spatial_index import NodeLocations
 
 from fractus_operator import kinds
@@ -193,6 +192,8 @@ class ClusterCache:
             flights: Flights of claimed drones that the Application may share.
         """
         label = label_key(key)
+        submitted = self.applications.get(key)
+        plan_uid = submitted.flight_plan_uid if submitted is not None else None
         return Inventory(
             hosts=BookedHosts(self.hosts, self._bookings, label, self._pods.of(label)),
             drones=ByName(self.drones),
@@ -204,7 +205,7 @@ class ClusterCache:
             unreadable_policies={p.name: p.problem for p in self.policies.values() if isinstance(p, Unreadable)},
             claimed=DroneHolders(self.fleet.claims(), uid),
             flights=flights or {},
-            reservations=self.flights.reservations(self._plan_uid_of(key)),
+            reservations=self.flights.reservations(plan_uid),
             locations=self._locations,
         )
 
@@ -261,25 +262,6 @@ class ClusterCache:
             claimed=claimed,
             reservations=self.flights.reservations(plan.metadata.uid),
         )
-
-    def reserved_drone(self, key: Key) -> str | None:
-        """Return the drone that a flight plan has reserved for its Application, or None for other Applications."""
-        plan = self.flights.key_of(self._plan_uid_of(key) or "")
-        reserved = self.flights.get(plan) if plan is not None else None
-        return reserved.drone if reserved is not None else None
-
-    def _plan_uid_of(self, key: Key) -> str | None:
-        """Return the uid of the flight plan whose Application has a key, or None.
-
-        The name must match as well, because every user may name a plan as the owner of an Application.
-        """
-        submitted = self.applications.get(key)
-        if submitted is None or not submitted.metadata.owner_references:
-            return None
-        owner = submitted.metadata.owner_references[0]
-        plan = self.flights.key_of(owner.uid)
-        of_plan = plan is not None and plan[0] == key[0] and key[1] == application_name(owner.uid)
-        return owner.uid if of_plan else None
 
     def _claimed_until_s(self, claim: Claim, now_s: float) -> float:
         """Return until when an Application may need its drone: the duration of its mission from now."""

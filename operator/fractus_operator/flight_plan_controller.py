@@ -74,7 +74,7 @@ class FlightPlanController:
         uid = key[1].removeprefix(application_name(""))
         if submitted is not None and _owned_by(submitted, uid):
             self._seen.add(uid)
-        plan = self._cache.flights.key_of(uid)
+        plan = self._cache.flights.key_of(key[0], uid)
         if plan is not None:
             self.work_queue.add(plan)
 

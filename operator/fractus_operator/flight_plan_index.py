@@ -17,6 +17,7 @@ from fractus_core.api import FlightPlan, InvalidObject
 from fractus_core.planning.inventory import Reservation
 
 from fractus_operator.kinds import Key
+from fractus_operator.parsing import Submitted
 
 log = logging.getLogger(__name__)
 
@@ -89,19 +90,20 @@ class FlightPlanIndex:
         self._decided: dict[Key, ReservedFlight] = {}
         self._present: dict[Key, ReservedFlight] = {}
         self._by_drone: dict[str, set[Key]] = {}
-        self._keys: dict[str, Key] = {}
+        self._keys: dict[tuple[str, str], Key] = {}
+        """Keys of plans by namespace and uid."""
         self._uids: dict[Key, str] = {}
 
     def plan_changed(self, key: Key, plan: FlightPlan | None) -> None:
         """Handle a change of a plan. A plan is None if it was deleted."""
         before = self._observed.pop(key, None)
-        self._keys.pop(self._uids.pop(key, ""), None)
+        self._keys.pop((key[0], self._uids.pop(key, "")), None)
         uid = plan.metadata.uid or "" if plan is not None else ""
         decided = self._decided.get(key)
         if decided is not None and decided.uid != uid:
             del self._decided[key]
         if plan is not None:
-            self._keys[uid] = key
+            self._keys[key[0], uid] = key
             self._uids[key] = uid
             try:
                 reserved = reserved_flight(plan)
@@ -128,9 +130,13 @@ class FlightPlanIndex:
         """Return what a plan reserves, or None."""
         return self._present.get(key)
 
-    def key_of(self, uid: str) -> Key | None:
+    def key_of(self, namespace: str, uid: str) -> Key | None:
         """Return the key of the plan with a uid, or None."""
-        return self._keys.get(uid)
+        return self._keys.get((namespace, uid))
+
+    def of_application(self, application: Submitted) -> ReservedFlight | None:
+        """Return what the flight plan of an Application reserves, or None for other Applications."""
+        return self._present.get(self._keys.get((application.key[0], application.flight_plan_uid), ("", "")))
 
     def overlapping(self, key: Key, volumes: Sequence[Volume4D]) -> list[Key]:
         """Return the keys of other plans that overlap volumes of a plan."""

@@ -9,6 +9,7 @@ from typing import Any, Protocol, TypeVar
 
 from fractus_core.api import Application, Condition, DeploymentPlan, InvalidObject, Metadata, Resource
 from fractus_core.api.plans import DeploymentPlanSpec
+from fractus_core.planning.ordered_application import application_name
 from pydantic import ValidationError
 
 from fractus_operator.kinds import Body, Key
@@ -69,6 +70,16 @@ class Submitted(_Object):
     def key(self) -> Key:
         """(namespace, name)."""
         return self.body["metadata"].get("namespace", ""), self.body["metadata"]["name"]
+
+    @property
+    def flight_plan_uid(self) -> str:
+        """Uid of the FlightPlan whose flight the Application is; empty for other Applications.
+
+        The name must match as well, because every user may name a plan as the owner of an Application.
+        """
+        owners = self.metadata.owner_references
+        uid = owners[0].uid if owners else ""
+        return uid if uid and self.key[1] == application_name(uid) else ""
 
 
 @dataclass(frozen=True, slots=True)

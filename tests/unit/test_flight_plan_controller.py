@@ -16,6 +16,7 @@ from fractus_core.planning import Settings
 from fractus_operator import kinds
 from fractus_operator.cache import ClusterCache
 from fractus_operator.flight_plan_controller import FlightPlanController
+from fractus_operator.flight_plan_index import ReservedFlight
 from fractus_operator.kinds import Body, Key, Kind
 from fractus_operator.labels import FINALIZER, LANDING_FINALIZER
 from fractus_operator.store import Conflict, KubeError, NotFound, Store
@@ -396,9 +397,17 @@ async def test_plan_follows_the_record_of_its_mission() -> None:
     )
 
 
+def reservation(world: World, key: Key) -> ReservedFlight | None:
+    submitted = world.cache.applications.get(key)
+    assert submitted is not None
+    return world.cache.flights.of_application(submitted)
+
+
 async def test_application_of_plan_gets_the_reserved_drone() -> None:
     world = await started()
-    assert world.cache.reserved_drone(FLIGHT) == "d"
+    reserved = reservation(world, FLIGHT)
+    assert reserved is not None
+    assert reserved.drone == "d"
     assert world.cache.snapshot(FLIGHT, "u").reservations["d"] == []
 
 
@@ -409,7 +418,7 @@ async def test_application_that_names_a_plan_as_its_owner_gets_no_reserved_drone
     body["metadata"]["name"] = "thief"
     world.api.put(kinds.APPLICATION, body)
     world.watch()
-    assert world.cache.reserved_drone(("team", "thief")) is None
+    assert reservation(world, ("team", "thief")) is None
     assert world.cache.snapshot(("team", "thief"), "u").reservations["d"]
 
 

@@ -33,7 +33,7 @@ def test_accepted_plan_reserves_its_drone_and_airspace_for_its_window():
     index, _ = index_with(accepted())
     assert reserved(index) == {"d": [("team/morning", BEGIN_S, END_S)]}
     assert index.airspace["team/morning"].state == "Accepted"
-    assert index.key_of("3e0a") == KEY
+    assert index.key_of("team", "3e0a") == KEY
 
 
 def test_plan_does_not_see_its_own_reservation():
@@ -47,7 +47,7 @@ def test_plan_that_is_over_reserves_nothing(gone):
     over = stored(accepted(), plan_step(situation(changed(accepted(), use="Closed"))))
     index.plan_changed(KEY, None if gone == "deleted" else over)
     assert (reserved(index), len(index.airspace), index.get(KEY)) == ({}, 0, None)
-    assert (index.key_of("3e0a") is None) == (gone == "deleted")
+    assert (index.key_of("team", "3e0a") is None) == (gone == "deleted")
 
 
 def test_dry_run_reserves_nothing():

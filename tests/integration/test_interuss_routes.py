@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import uuid
 from collections.abc import Callable, Iterator
 from datetime import UTC, datetime, timedelta
@@ -47,9 +48,33 @@ def server(
 
 
 @pytest.fixture
-def send(world: World, operator: OperatorProcess, server: ManagementServer, tests: str) -> Iterator[Send]:
-    """Send requests to the interface with the token of an administrator."""
+def reporting(world: World) -> Iterator[None]:
+    """Let the drones report that they are on the ground, as their agents do. A flight that was in use ends with such a report."""
     world.add_drone("drone-2")
+    stopped = threading.Event()
+
+    def report(last_seen: str | None) -> None:
+        for name in ("drone-1", "drone-2"):
+            world.api.merge(f"{FRACTUS}/drones/{name}/status", {"status": {"lastSeen": last_seen}})
+
+    def run() -> None:
+        while not stopped.wait(0.5):
+            report(datetime.now(UTC).isoformat())
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    yield
+    stopped.set()
+    thread.join()
+    # The drones of the other tests have never reported.
+    report(None)
+
+
+@pytest.fixture
+def send(
+    world: World, operator: OperatorProcess, server: ManagementServer, tests: str, reporting: None
+) -> Iterator[Send]:
+    """Send requests to the interface with the token of an administrator."""
     approved_region_template(world)
     valid = user_token(world, tests, "qualifier", (), ("cluster-admin",))
 

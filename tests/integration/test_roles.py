@@ -22,7 +22,8 @@ Body = dict[str, Any]
 NAMES = [yaml.safe_load(path.read_text())["spec"]["names"] for path in (CHARTS.parent / "crds").glob("*.yaml")]
 KINDS = {names["singular"]: names["plural"] for names in NAMES}
 WRITTEN_BY_THE_OPERATOR = {"deploymentplan", "grant", "nodegrants", "directlink"}
-WRITTEN_BY_AUTHORITIES = set(KINDS) - WRITTEN_BY_THE_OPERATOR - {"application"}
+WRITTEN_BY_USERS = {"application", "flightplan"}
+WRITTEN_BY_AUTHORITIES = set(KINDS) - WRITTEN_BY_THE_OPERATOR - WRITTEN_BY_USERS
 
 READ = ("get", "list", "watch")
 WRITE = ("create", "update", "patch", "delete")
@@ -54,7 +55,7 @@ def aggregated(world: World, role: str) -> bool:
     """Return True if Kubernetes has added the rules of the chart to a built-in role that is bound to a group."""
     verbs = READ if role == "view" else (*READ, *WRITE, *ALL)
     return all(may(world, f"t-settled-{role}", "get", kind) for kind in KINDS.values()) and all(
-        may(world, f"t-settled-{role}", verb, KINDS["application"]) for verb in verbs
+        may(world, f"t-settled-{role}", verb, KINDS[kind]) for verb in verbs for kind in WRITTEN_BY_USERS
     )
 
 
@@ -110,14 +111,14 @@ def test_every_kind_has_viewer_editor_and_admin_roles() -> None:
 def test_role_permits_only_its_kind(roles: World, kind: str) -> None:
     assert allowed(roles, f"fractus-{kind}-viewer") == {(verb, kind) for verb in READ}
     if kind not in WRITTEN_BY_THE_OPERATOR:
-        more = ALL if kind == "application" else ()
+        more = ALL if kind in WRITTEN_BY_USERS else ()
         assert allowed(roles, f"fractus-{kind}-editor") == {(verb, kind) for verb in (*READ, *WRITE, *more)}
         assert allowed(roles, f"fractus-{kind}-admin") == {(verb, kind) for verb in (*READ, *WRITE, *ALL)}
 
 
-def test_builtin_roles_read_all_kinds_and_write_applications(roles: World) -> None:
+def test_builtin_roles_read_all_kinds_and_write_those_of_users(roles: World) -> None:
     read = {(verb, kind) for verb in READ for kind in KINDS}
-    write = {(verb, "application") for verb in (*WRITE, *ALL)}
+    write = {(verb, kind) for verb in (*WRITE, *ALL) for kind in WRITTEN_BY_USERS}
     assert allowed(roles, "view") == read
     assert allowed(roles, "edit") == read | write
     assert allowed(roles, "admin") == read | write

@@ -7,6 +7,7 @@ from fractus_core.airspace.flight_volumes import flight_volumes
 from fractus_core.airspace.plan_status import reserved_volume
 from fractus_core.airspace.restriction_impact import affected_flights, affected_plans
 from fractus_core.api import FlightPlan, Grant, Policy, Zone
+from fractus_core.api.policies import PolicySpec
 from fractus_core.planning import Settings, operation_area
 from fractus_core.planning.grant_compiler import flight_grant
 from test_airspace_flights import BEGIN_S, END_S, GROUND_M, located
@@ -27,7 +28,7 @@ def rfc3339(time_s):
     return datetime.fromtimestamp(time_s, UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
 
 
-def restriction(corners=CROSSING, zone=None, selector=None, **more):
+def restriction(corners=CROSSING, zone=None, selector=None, **more) -> tuple[PolicySpec, Zone]:
     area = {"polygon": {"exterior": corners}}
     policy = {"type": "GeofenceControl", "kind": "exclusion", "selector": {"zones": ["z"], **(selector or {})}, **more}
     parsed = Policy.from_body({"kind": "Policy", "metadata": {"name": "p"}, "spec": policy})

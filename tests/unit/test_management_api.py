@@ -6,7 +6,7 @@ import asyncio
 import json
 import logging
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import pytest
 from fastapi import FastAPI
@@ -155,7 +155,7 @@ def app() -> FastAPI:
 def authenticated() -> FastAPI:
     """Return the API for requests that are refused before they reach the API server."""
     app = create_app(Settings())
-    app.dependency_overrides[CallerOf.__metadata__[0].dependency] = lambda: None
+    app.dependency_overrides[get_args(CallerOf)[1].dependency] = lambda: None
     return app
 
 

@@ -53,12 +53,12 @@ def grant(phase="Active"):
     return Grant.from_body({"kind": "Grant", "metadata": {"name": "g"}, "spec": spec, "status": {"phase": phase}})
 
 
-def plans(restricted, listed=None, now_s=NOW_S):
+def plans(restricted: tuple[PolicySpec, Zone], listed=None, now_s=NOW_S):
     found = affected_plans(*restricted, listed or [plan()], {"d": DRONE}, now_s)
     return [each.name for each in found]
 
 
-def flights(restricted, granted=None, drone=FLYING):
+def flights(restricted: tuple[PolicySpec, Zone], granted=None, drone=FLYING):
     found = affected_flights(*restricted, [granted or grant()], {drone.name: drone}, NOW_S)
     return [(each.application, each.drone) for each in found]
 

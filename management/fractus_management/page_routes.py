@@ -8,18 +8,7 @@ from importlib.resources.abc import Traversable
 
 from fastapi import APIRouter
 from fastapi.responses import Response
-
-HEADERS = {
-    "Content-Security-Policy": (
-        "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; connect-src 'self'; "
-        "worker-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
-    ),
-    "Cross-Origin-Opener-Policy": "same-origin",
-    "Cross-Origin-Resource-Policy": "same-origin",
-    "Referrer-Policy": "no-referrer",
-    "X-Content-Type-Options": "nosniff",
-}
-"""Headers of the files of the page. The page loads nothing from other servers, and other pages cannot embed it."""
+from fractus_runtime.page_headers import PAGE_HEADERS
 
 
 def page_router() -> APIRouter:
@@ -47,4 +36,4 @@ def _add(router: APIRouter, path: str, file: Traversable) -> None:
 
     @router.get(path)
     async def _file() -> Response:
-        return Response(content, media_type=media_type, headers={**HEADERS, "Cache-Control": caching})
+        return Response(content, media_type=media_type, headers={**PAGE_HEADERS, "Cache-Control": caching})

@@ -15,6 +15,7 @@ from pathlib import Path
 
 from aiohttp import hdrs, web
 from fractus_runtime.metrics import gauge
+from fractus_runtime.page_headers import PAGE_HEADERS
 from fractus_runtime.thumbnails import thumbnail
 from prometheus_client import Counter, Metric
 
@@ -26,18 +27,6 @@ log = logging.getLogger(__name__)
 
 PAGE = Path(__file__).parent / "page"
 """Page built from `view/web` by `make view`."""
-
-HEADERS = {
-    "Content-Security-Policy": (
-        "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; connect-src 'self'; "
-        "worker-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
-    ),
-    "Cross-Origin-Opener-Policy": "same-origin",
-    "Cross-Origin-Resource-Policy": "same-origin",
-    "Referrer-Policy": "no-referrer",
-    "X-Content-Type-Options": "nosniff",
-}
-"""Headers of every response. The page loads nothing from other servers. Other pages can neither embed nor read it."""
 
 WRITE_TIMEOUT_S = 30.0
 """Time, in seconds, after which a client that reads nothing is disconnected."""
@@ -273,7 +262,7 @@ def _is_permitted_host(host: str, names: frozenset[str]) -> bool:
 
 
 async def _add_security_headers(_request: web.Request, response: web.StreamResponse) -> None:
-    response.headers.update(HEADERS)
+    response.headers.update(PAGE_HEADERS)
 
 
 def _files(page: Path) -> list[Path]:

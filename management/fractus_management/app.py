@@ -20,6 +20,7 @@ from fractus_management import (
     template_routes,
     thesis_routes,
 )
+from fractus_management.interuss import routes as interuss_routes
 from fractus_management.openapi import install_document
 from fractus_management.page_routes import page_router
 from fractus_management.problem_details import install_handlers, refused
@@ -85,16 +86,9 @@ def create_app(settings: Settings, client: Client | None = None) -> FastAPI:
     app.include_router(health)
     app.include_router(page_router())
     if settings.automated_testing is not None:
-        _include_automated_testing(app)
+        app.state.kept_responses = interuss_routes.KeptResponses()
+        app.include_router(interuss_routes.router)
     return app
-
-
-def _include_automated_testing(app: FastAPI) -> None:
-    # Only this adapter needs the packages of the extra `geometry`.
-    from fractus_management.interuss import routes as interuss_routes  # noqa: PLC0415
-
-    app.state.kept_responses = interuss_routes.KeptResponses()
-    app.include_router(interuss_routes.router)
 
 
 def collect(app: FastAPI) -> Iterator[Metric]:

@@ -8,7 +8,6 @@ import os
 import signal
 from collections.abc import Awaitable, Iterator
 from contextlib import aclosing
-from importlib.util import find_spec
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -133,10 +132,6 @@ def serve(
         raise_open_files()
     except TooFewOpenFiles as error:
         raise click.ClickException(str(error)) from None
-    if template is not None and find_spec("shapely") is None:
-        raise click.ClickException(
-            "--automated-testing requires shapely; install it with: pip install 'fractus-drones[geometry]'"
-        )
     testing = AutomatedTesting(template, geoid) if template is not None else None
     settings = Settings(namespace, requests_per_s=requests_per_second, automated_testing=testing)
     asyncio.run(_serve(listen, settings, _access(server, ca, context, kubeconfig), metrics))

@@ -8,8 +8,10 @@ from http import HTTPStatus
 
 from fastapi import APIRouter, Response
 from fastapi.responses import JSONResponse
+from fractus_core.airspace.decide import MAX_HORIZON_S
+from fractus_core.airspace.lifecycle import RESERVING
 from fractus_core.api import Drone, FlightPlan
-from fractus_core.api.flight_plans import FlightPlanStatus, PlanState
+from fractus_core.api.flight_plans import FlightPlanStatus
 from fractus_core.api.model import Model
 from fractus_runtime.kubernetes import Body, KubeError
 from pydantic import Field
@@ -18,10 +20,8 @@ from fractus_management.api_server import Caller, CallerOf, Continue, Limit, Obj
 from fractus_management.openapi import problems
 
 DRONE = kind_of(Drone)
-HORIZON = timedelta(days=30)
+HORIZON = timedelta(seconds=MAX_HORIZON_S)
 """Time for which flights can be ordered in advance."""
-
-_RESERVES_NOTHING: frozenset[PlanState | None] = frozenset({None, "Draft", "Rejected", "Ended"})
 
 router = APIRouter(tags=["drones"], responses=problems())
 
@@ -83,7 +83,7 @@ async def _reserved(caller: Caller, drone: str) -> list[tuple[datetime, datetime
     for body in listed:
         plan = FlightPlanStatus.model_validate(body["status"])
         volumes = plan.volumes + plan.off_nominal_volumes
-        if volumes and plan.state not in _RESERVES_NOTHING and not body["spec"].get("dryRun"):
+        if volumes and plan.state in RESERVING and not body["spec"].get("dryRun"):
             reserved.append((min(each.begin for each in volumes), max(each.end for each in volumes)))
     return reserved
 

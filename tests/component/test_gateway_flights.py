@@ -62,12 +62,15 @@ def test_answers_are_sent_as_soon_as_they_are_known(tmp_path: Path) -> None:
         program = await world.program(grant.identity)
         await program.until(lambda: program.mode == GUIDED)
         loop = asyncio.get_running_loop()
-        begun_s = loop.time()
+        waits_s = []
         for number in range(50):
+            begun_s = loop.time()
             program.send("PING", seq=number, target_system=0, target_component=0)
             while "PING" not in program.latest or program.latest["PING"].integer("seq") != number:  # noqa: ASYNC110
                 await asyncio.sleep(0.001)
-        assert loop.time() - begun_s < 0.3
+            waits_s.append(loop.time() - begun_s)
+        # The gateway's timer has an interval of 20 ms. If answers waited for it, only the first one could be faster.
+        assert sorted(waits_s)[10] < 0.01
         await program.close()
 
     fly(flight, tmp_path)

@@ -437,7 +437,7 @@ def history(monkeypatch: pytest.MonkeyPatch, *versions: Any, outcome: str = "Com
             version = left.pop(0) if path.startswith(PLANS) else None
             if isinstance(version, Exception):
                 raise version
-            return version  # type: ignore[no-any-return]
+            return version
 
         def list(self, path: str) -> list[Body]:
             if path == PLANS:

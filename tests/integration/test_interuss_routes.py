@@ -227,7 +227,7 @@ def test_conflict_that_arose_is_notified(send: Send, plan_id: str, world: World,
     urgent = fractus_object(
         "FlightPlan",
         "urgent",
-        world.api.get(f"{FRACTUS}/namespaces/{tests}/flightplans/interuss-{plan_id}")["spec"]  # type: ignore[index]
+        world.api.get(f"{FRACTUS}/namespaces/{tests}/flightplans/interuss-{plan_id}")["spec"]
         | {"priorityClass": "elevated"},
         tests,
     )

@@ -73,7 +73,7 @@ def enter_point(page: Page, number: int, north_m: float, east_m: float, alt: flo
 
 def import_file(page: Page, content: str) -> None:
     file = {"name": "route", "mimeType": "application/json", "buffer": content.encode()}
-    page.get_by_label("Import").set_input_files(file)  # type: ignore[arg-type]
+    page.get_by_label("Import").set_input_files(file)
 
 
 def is_ready(pilot: User, template: str) -> bool:

@@ -101,7 +101,7 @@ def test_several_volumes_become_one_region_that_covers_all() -> None:
     second = volume(circle(39.362), begin=4, end=9)
     third = volume(polygon(), begin=3, end=4)
     spec = spec_of(flight(first, second, third))
-    frame = LocalFrame.at(Area.model_validate(spec["region"]).polygon.exterior[0])  # type: ignore[union-attr]
+    frame = LocalFrame.at(Area.model_validate(spec["region"]).polygon.exterior[0])
     whole = area_polygon(frame, Area.model_validate(spec["region"])).buffer(0.01)
     for part in (first, second, third):
         single = Area.model_validate(spec_of(flight(part))["region"])

@@ -14,7 +14,7 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 EXAMPLES = sorted({path.parent for path in (ROOT / "examples").rglob("*.py")})
-SIMULATOR = ("cluster", "radio", "sim", "vehicle", "world")
+SIMULATOR = ("cluster", "pytest", "radio", "sim", "testing", "vehicle", "world")
 SHIPPED = ("agent", "cli", "core", "management", "operator", "proto", "runtime", "services", "view")
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
 

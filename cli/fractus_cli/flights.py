@@ -296,7 +296,7 @@ def watch(name: str, namespace: str, config: str | None) -> int:
 
 
 def _versions(cluster: ClusterReader, plan: Body) -> Iterator[Body]:
-    """Yield a plan again and again until it does not exist any more. A lost connection is reported once and tried again."""
+    """Yield the present version of a plan repeatedly until the plan is deleted. Report a lost connection once, and connect again."""
     metadata = plan["metadata"]
     path = f"{GROUP}/namespaces/{metadata['namespace']}/flightplans/{metadata['name']}"
     connected = True

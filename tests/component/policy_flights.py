@@ -469,7 +469,8 @@ class Fleet:
         The situation contains the acceleration only if `measured` is set.
         """
         x, y, z = self.estimated[i]
-        drift = self.gust[i] * self.beat[i] * math.cos(self.beat[i] * self.time_s + self.phase[i])
+        # Derivative of `sway`.
+        drift = self.gust[i] * self.beat[i] * math.cos(self.beat[i] * self.time_s + self.phase[i]) / 2
         east, north, up = (float(v) for v in self.speed[i] + drift)
         ground = math.hypot(east, north)
         tends = float(np.linalg.norm(self.velocity_setpoint[i, :2]))

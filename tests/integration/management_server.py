@@ -122,6 +122,10 @@ class User:
         self.token = token
         self.namespace = namespace
 
+    @property
+    def url(self) -> str:
+        return self._server.url
+
     def at(self, server: ManagementServer) -> User:
         """Return the same user at another server."""
         return User(server, self.token, self.namespace)

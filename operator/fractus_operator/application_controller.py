@@ -262,7 +262,7 @@ class ApplicationController:
         name = flown.drone.node if flown.drone is not None else None
         drone = self._cache.drone(name) if name is not None else None
         # A drone that has landed may later fly for another Application.
-        if name is None or (drone is not None and not drone.in_air):
+        if name is None or (drone is not None and drone.on_ground):
             landed_at = None if record.landed else self._clock().replace(microsecond=0)
             record = record.model_copy(update={"landed": True, "landed_at": record.landed_at or landed_at})
         if record != flown.flown:

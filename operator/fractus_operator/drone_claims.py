@@ -151,13 +151,16 @@ class Fleet:
         """Drones whose claims must be computed again."""
 
     def drone_changed(self, name: str, drone: Drone | None) -> None:
-        """Handle a change of a drone. A drone whose object was deleted in flight counts as in flight."""
+        """Handle a change of a drone.
+
+        A drone whose object was deleted in flight counts as in flight until an object of its name reports a landing.
+        """
         self._changed.add(name)
         if drone is None:
             return
         if drone.in_air:
             self._in_flight.add(name)
-        else:
+        elif drone.on_ground:
             self._in_flight.discard(name)
 
     def plan_changed(self, key: Key, old: OwnedPlan | None, new: OwnedPlan | None) -> None:
@@ -190,9 +193,8 @@ class Fleet:
                     self._grants.drop(("", node), key)
 
     def is_in_flight(self, node: str) -> bool:
-        """Return True if a drone is in flight, or was in flight when its object was deleted."""
-        drone = self._drones.get(("", node))
-        return drone.in_air if drone is not None else node in self._in_flight
+        """Return True if a drone is in flight, or was in flight when its object was deleted and has not landed since."""
+        return node in self._in_flight
 
     def drone_in_flight(self, plan: DeploymentPlanSpec | None) -> str | None:
         """Return the drone of a plan if it is in flight."""
@@ -217,7 +219,7 @@ class Fleet:
             node = next(iter(self._changed))
             claim = claims(self._plans.members(("", node)), self._grants.of(("", node))).get(node)
             drone = self._drones.get(("", node))
-            if claim is None and drone is not None and drone.in_air:
+            if claim is None and drone is not None and self.is_in_flight(node):
                 claim = replace(self._last_claims.get(node, _UNKNOWN_CLAIM), returning=True)
             if claim is None:
                 self._claims.pop(node, None)

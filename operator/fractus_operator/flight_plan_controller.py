@@ -168,6 +168,7 @@ class FlightPlanController:
             mission,
             drone_exists=drone is not None,
             in_air=status.drone is not None and self._cache.fleet.is_in_flight(status.drone) and not landed,
+            lost=not landed and (drone is None or not (drone.in_air or drone.on_ground)),
             unreported=drone is not None and self._unreported(drone, key, record),
             position=reported.position if reported is not None else None,
             home_m=home.alt if home is not None else None,

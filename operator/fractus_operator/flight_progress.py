@@ -23,6 +23,9 @@ OFF_NOMINAL_S = 600.0
 """Seconds for which off-nominal volumes are reserved. They are renewed when half of the time has passed."""
 
 
+_LOST = "its Drone was deleted and has not reported since, so the airspace stays reserved until it reports a landing"
+
+
 @dataclass(frozen=True, slots=True)
 class FlownMission:
     """The Application of a flight plan, as observed.
@@ -35,6 +38,8 @@ class FlownMission:
         record: Record of its mission, or None before the takeoff.
         drone_exists: True if the Drone of the plan exists.
         in_air: True if the drone of the plan is in the air.
+        lost: True if the Drone was deleted, or has not reported its state since it was created again. Such a drone may be in
+            the air, also if this operator has not observed its takeoff.
         unreported: True if the drone may have taken off for the plan since its last report.
         position: Last reported position of the drone.
         home_m: Ground elevation of the home of the drone above mean sea level, if known.
@@ -47,6 +52,7 @@ class FlownMission:
     record: MissionRecord | None = None
     drone_exists: bool = True
     in_air: bool = False
+    lost: bool = False
     unreported: bool = False
     position: Position | None = None
     home_m: float | None = None
@@ -97,7 +103,7 @@ def flight_progress(
     late = now_s > end_s
     # The objects of a mission that is over stay, so that its logs can be read.
     end = not over and not mission.leaving and (closing or late)
-    if mission.in_air:
+    if mission.in_air or mission.lost:
         aborted = outcome != "Complete" and (over or closing or mission.leaving)
         return _airborne(mission, state, status, late=late, aborted=aborted, end=end)
     if over and mission.unreported:
@@ -115,7 +121,10 @@ def _airborne(
     mission: FlownMission, state: PlanState, status: FlightPlanStatus, *, late: bool, aborted: bool, end: bool
 ) -> Progress:
     if state == "Contingent" or aborted:
-        return Progress("Contingent", f"the system ends the flight of {status.drone}: {_result(mission)}", end)
+        message = f"the system ends the flight of {status.drone}: {_result(mission)}"
+        return Progress("Contingent", f"{message}; {_LOST}" if mission.lost else message, end)
+    if mission.lost and not late:
+        return Progress("Activated", f"{status.drone} may be in the air: {_LOST}")
     if outside(mission, status):
         return Progress("Nonconforming", f"{status.drone} is outside the volumes of the plan", end)
     if late:

@@ -62,8 +62,8 @@ def _may_take_off(drone: Body) -> bool:
 
 
 def _grounded_by_hand(drone: Body) -> bool:
-    seen = (drone.get("status") or {}).get("lastSeen")
-    return seen is not None and (drone["metadata"].get("annotations") or {}).get(GROUNDED_ANNOTATION) == seen
+    seen = (drone.get("status") or {}).get("lastSeen", "never")
+    return bool((drone["metadata"].get("annotations") or {}).get(GROUNDED_ANNOTATION) == seen)
 
 
 def _listed(names: Sequence[str], most: int = 5) -> str:

@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 from depth import examples
+from fractus_core.airspace.lifecycle import OFF_NOMINAL
 from fractus_core.api.plans import DeploymentPlanSpec, MissionRecord
 from fractus_core.planning import Settings
 from fractus_operator import kinds
@@ -117,7 +118,9 @@ class World:
         self.now_s = DAY_BEFORE_S
         stock = inventory(drones or [located("d")])
         for drone in stock.drones.values():
-            self.api.put(kinds.DRONE, drone.to_dict())
+            body = drone.to_dict()
+            body["status"]["flightState"] = "inactive"
+            self.api.put(kinds.DRONE, body)
         for depot in stock.depots.values():
             self.api.put(kinds.DEPOT, depot.to_dict())
         for host in stock.hosts.values():
@@ -359,6 +362,50 @@ async def test_ended_flight_keeps_its_airspace_until_the_drone_has_reported(stat
     assert reserved is not None
     assert reserved.end_s > world.now_s
     world.mission("False")
+    assert (await world.step())["state"] == "Ended"
+
+
+@pytest.mark.parametrize("aborted", [False, True])
+async def test_airspace_of_deleted_drone_stays_reserved_after_operator_restart_until_it_reports_a_landing(
+    aborted: bool,
+) -> None:
+    world = await started()
+    world.flies("flying")
+    await world.step()
+    drone = world.api.objects.pop(kinds.DRONE.path("", "d"))
+    if aborted:
+        del world.api.objects[kinds.APPLICATION.path(*FLIGHT)]
+    world.lead()
+    world.now_s = END_S + 60
+    for _ in range(3):
+        assert (await world.step())["state"] in OFF_NOMINAL
+        reserved = world.cache.flights.get(PLAN)
+        assert reserved is not None
+        assert reserved.end_s > world.now_s
+        world.now_s += 600
+    del drone["status"]
+    world.api.put(kinds.DRONE, drone)
+    world.watch()
+    assert (await world.step())["state"] != "Ended", "the new object has no report"
+    drone["status"] = {"flightState": "inactive"}
+    world.api.put(kinds.DRONE, drone)
+    world.api.objects.pop(kinds.APPLICATION.path(*FLIGHT), None)
+    world.watch()
+    assert (await world.step())["state"] == "Ended"
+
+
+async def test_airspace_of_drone_that_is_gone_is_released_by_the_annotation_of_its_new_object() -> None:
+    world = await started()
+    drone = world.api.objects.pop(kinds.DRONE.path("", "d"))
+    del world.api.objects[kinds.APPLICATION.path(*FLIGHT)]
+    world.watch()
+    status = await world.step()
+    assert status["state"] == "Contingent"
+    assert "its Drone was deleted" in status["message"]
+    del drone["status"]
+    drone["metadata"]["annotations"] = {"fractus.dev/grounded": "never"}
+    world.api.put(kinds.DRONE, drone)
+    world.watch()
     assert (await world.step())["state"] == "Ended"
 
 

@@ -38,8 +38,8 @@ They let the agent and the operator write different entries of the list.
 
 
 GROUNDED_ANNOTATION = f"{GROUP}/grounded"
-"""Annotation of a Drone: a person saw the drone on the ground. The value is the `lastSeen` of the drone's last report.
-After the next report, the annotation is ignored."""
+"""Annotation of a Drone: a person saw the drone on the ground. The value is the `lastSeen` of the drone's last report, or
+`never` before its first report. After the next report, the annotation is ignored."""
 
 ON_MISSION = "OnMission"
 """Condition of a Drone, set by the operator.
@@ -342,6 +342,14 @@ class Drone(Resource, plural="drones", short="drn"):
         return self.status is not None and self.status.in_air and not self.grounded_by_hand
 
     @property
+    def on_ground(self) -> bool:
+        """True if the drone is on the ground according to its last known state. It is False before the first report."""
+        if self.status is None or self.grounded_by_hand:
+            return self.grounded_by_hand
+        states = {self.status.flight_state, self.status.last_flight_state}
+        return not self.in_air and not states.isdisjoint(GROUNDED)
+
+    @property
     def may_take_off(self) -> bool:
         """True if the drone may have taken off since its last report."""
         conditions = self.status.conditions if self.status is not None else ()
@@ -354,7 +362,7 @@ class Drone(Resource, plural="drones", short="drn"):
         declared = self.metadata.annotations.get(GROUNDED_ANNOTATION)
         last_seen = self.status.last_seen if self.status is not None else None
         if declared is None or last_seen is None:
-            return False
+            return declared == "never"
         try:
             return datetime.fromisoformat(declared.replace("Z", "+00:00")) == last_seen
         except ValueError:

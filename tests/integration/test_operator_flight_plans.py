@@ -115,8 +115,10 @@ def test_only_the_operator_creates_applications_of_flight_plans(
         assert created(operator, namespace, name, flight_owner) == ""
         assert "only Applications of FlightPlans" in created(operator, namespace, name)
         assert "only Applications of FlightPlans" in created(operator, namespace, "other", flight_owner)
-        assert created(world.api, namespace, name) == ""
-        assert "belongs to a FlightPlan" in created(world.api, namespace, name, flight_owner)
+        assert f"metadata.name: {name} is reserved" in created(world.api, namespace, name)
+        assert f"metadata.name: {name} is reserved" in created(world.api, namespace, name, flight_owner)
+        assert "belongs to a FlightPlan" in created(world.api, namespace, "other", flight_owner)
+        assert created(world.api, namespace, "flight-1") == ""
         with pytest.raises(KubeError, match="may delete only dry runs"):
             operator.delete(f"{FRACTUS}/namespaces/{namespace}/flightplans/flight")
         with pytest.raises(KubeError, match="may not write the spec of FlightPlans"):

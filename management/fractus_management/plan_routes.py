@@ -123,15 +123,33 @@ async def check(caller: CallerOf, spec: PlanSpec, namespace: Namespace = None) -
     return JSONResponse(public(await dry_run(caller, spec, namespace), PLAN))
 
 
-async def dry_run(caller: Caller, spec: FlightPlanSpec, namespace: str | None) -> Body:
+@router.post("/plans/{name:object}:check", response_model=FlightPlan, responses=problems(408, 409, 413))
+async def check_change(caller: CallerOf, name: ObjectName, spec: PlanSpec, namespace: Namespace = None) -> Response:
+    """Get the decision on a change of a plan without changing it. The response is a plan that is never flown and deleted after a minute.
+
+    The changed plan does not conflict with its present version.
+    """
+    original = await _get(caller, name, namespace)
+    return JSONResponse(public(await dry_run(caller, spec, namespace, original), PLAN))
+
+
+async def dry_run(caller: Caller, spec: FlightPlanSpec, namespace: str | None, original: Body | None = None) -> Body:
     """Return the decision on a plan without a reservation.
+
+    Args:
+        caller: Sender of the request.
+        spec: Specification of the plan.
+        namespace: Namespace of the plan; None: the default namespace.
+        original: Plan whose change is decided; None: a new plan.
 
     Raises:
         Refused: The operator has not decided in time.
         KubeError: The API server refused the plan.
     """
     name = f"check-{secrets.token_hex(8)}"
-    created = await caller.client.create(PLAN, _new(caller, namespace, name, spec.model_copy(update={"dry_run": True})))
+    change_of = original["metadata"]["name"] if original is not None else None
+    checked = spec.model_copy(update={"dry_run": True, "change_of": change_of})
+    created = await caller.client.create(PLAN, _new(caller, namespace, name, checked))
     decided = await _decided(caller, created)
     if not _considered(decided):
         raise refused(503, "NotDecided", "the operator has not decided in time, try again; check that it runs")

@@ -244,10 +244,15 @@ class ClusterCache:
         message = shared_flight_lost(application, plan, observed.host[1], flights.get(node), radius_m)
         return inventory, ("SharedFlightLost", message) if message is not None else None
 
-    def flight_inventory(self, plan: FlightPlan, now_s: float) -> Inventory:
+    def flight_inventory(self, plan: FlightPlan, now_s: float, own: str | None) -> Inventory:
         """Return the input for matching a flight plan with a drone. The result is valid until the next await.
 
         Claims that end before the window are missing, and bookings are missing if the window begins later than `SOON_S`.
+
+        Args:
+            plan: The plan.
+            now_s: Time in seconds since 1970 UTC.
+            own: Uid of the plan whose reservation is missing, because the plan may use it.
         """
         begin_s = max(plan.spec.window.begin_s, now_s)
         inventory = self.snapshot(("", ""), "")
@@ -260,7 +265,7 @@ class ClusterCache:
             inventory,
             hosts=ByName(self.hosts) if begin_s - now_s > SOON_S else inventory.hosts,
             claimed=claimed,
-            reservations=self.flights.reservations(plan.metadata.uid),
+            reservations=self.flights.reservations(own),
         )
 
     def _claimed_until_s(self, claim: Claim, now_s: float) -> float:

@@ -19,7 +19,7 @@ from fractus_operator import kinds
 from fractus_operator.cache import ClusterCache
 from fractus_operator.flight_matching import SOON_S
 from fractus_operator.flight_plan_index import reserved_flight
-from fractus_operator.flight_plan_steps import STARTED, PlanSituation, PlanStep, plan_step
+from fractus_operator.flight_plan_steps import FLYING, STARTED, PlanSituation, PlanStep, plan_step
 from fractus_operator.flight_progress import FlownMission
 from fractus_operator.kinds import Body, Key
 from fractus_operator.labels import FINALIZER, LANDING_FINALIZER
@@ -32,8 +32,6 @@ log = logging.getLogger(__name__)
 
 DRY_RUN_S = 60.0
 """Seconds for which a dry run is kept."""
-
-_FLYING = frozenset({"Activated", "Nonconforming", "Contingent"})
 
 
 class FlightPlanController:
@@ -83,7 +81,7 @@ class FlightPlanController:
         now_s = self._clock().timestamp()
         missing = self._cache.drone(key[1]) is None
         for plan, reserved in self._cache.flights.on_drone(key[1]):
-            if missing or reserved.intent.state in _FLYING or reserved.begin_s - SOON_S <= now_s:
+            if missing or reserved.intent.state in FLYING or reserved.begin_s - SOON_S <= now_s:
                 self.work_queue.add(plan)
 
     # -- steps --
@@ -108,7 +106,7 @@ class FlightPlanController:
         if reserved is not None:
             self._cache.flights.decide(key, reserved)
         try:
-            if step.status.state in _FLYING:
+            if step.status.state in FLYING:
                 await self._set_finalizer(plan, wanted=True)
             await self._report(plan, step, now)
         except KubeError as error:
@@ -120,7 +118,7 @@ class FlightPlanController:
             await self._start(plan, step.start)
         if step.end:
             await self._store.delete(kinds.APPLICATION, (key[0], application_name(plan.metadata.uid or "")))
-        if step.status.state not in _FLYING:
+        if step.status.state not in FLYING:
             await self._set_finalizer(plan, wanted=False)
         loop = asyncio.get_running_loop()
         self._timers[key] = loop.call_later(step.next_s, self.work_queue.add, key)
@@ -128,14 +126,20 @@ class FlightPlanController:
     def _situation(self, plan: FlightPlan, now: datetime) -> PlanSituation:
         now_s = now.timestamp()
         template = self._cache.templates.get(("", plan.spec.template))
+        original = None
+        if plan.spec.change_of is not None:
+            found = self._cache.flight_plans.get((plan.metadata.namespace or "", plan.spec.change_of))
+            original = found if isinstance(found, FlightPlan) else None
+        own = original or plan
         return PlanSituation(
             plan,
             template,
-            lambda: self._cache.flight_inventory(plan, now_s),
+            lambda: self._cache.flight_inventory(plan, now_s, own.metadata.uid),
             self._settings,
             self._cache.flights.airspace,
-            self._mission(plan),
+            self._mission(own),
             now_s,
+            original,
         )
 
     def _mission(self, plan: FlightPlan) -> FlownMission:
@@ -186,7 +190,7 @@ class FlightPlanController:
         created = plan.metadata.creation_timestamp
         if created is None or plan.status is None or (now - created).total_seconds() < DRY_RUN_S:
             return False
-        if plan.status.state in _FLYING:
+        if plan.status.state in FLYING:
             return False
         await self._store.delete(kinds.FLIGHT_PLAN, (plan.metadata.namespace or "", plan.name), plan.metadata.uid)
         return True

@@ -29,6 +29,9 @@ RETRY_S = 5.0
 RECHECK_S = 300.0
 """Maximum seconds until the next step of a plan. The clock may jump, so no step waits until a distant time."""
 
+FLYING: frozenset[PlanState] = frozenset({"Activated", "Nonconforming", "Contingent"})
+"""States of a plan whose Application exists or is created next."""
+
 STARTED = "Started"
 """Condition of a plan whose Application was created. It is never created again."""
 
@@ -45,6 +48,7 @@ class PlanSituation:
         airspace: Operational intents of all plans.
         mission: The Application of the plan.
         now_s: Time in seconds since 1970 UTC.
+        original: Plan whose change a dry run decides, if it exists. `mission` is then its Application.
     """
 
     plan: FlightPlan
@@ -54,11 +58,12 @@ class PlanSituation:
     airspace: Airspace
     mission: FlownMission
     now_s: float
+    original: FlightPlan | None = None
 
     @property
     def name(self) -> str:
-        """namespace/name of the plan."""
-        return f"{self.plan.metadata.namespace or 'default'}/{self.plan.name}"
+        """namespace/name of the plan, or of the plan whose change a dry run decides. The reservation of this plan is its own."""
+        return f"{self.plan.metadata.namespace or 'default'}/{self.plan.spec.change_of or self.plan.name}"
 
     @property
     def status(self) -> FlightPlanStatus:
@@ -137,6 +142,10 @@ def _decide_new(now: PlanSituation) -> PlanStep:
     """Decide on a plan that is not in force: Accepted, Rejected, or Draft while the user must select actions."""
     if now.closing:
         return _rejected(now, Unfit("Closed", "the plan was closed before it was accepted"))
+    if now.plan.spec.change_of is not None:
+        step = _check_change(now)
+        if step is not None:
+            return step
     try:
         match = _match(now)
     except Unfit as unfit:
@@ -153,6 +162,35 @@ def _decide_new(now: PlanSituation) -> PlanStep:
         refusals = tuple(map(plan_finding, decision.refusals))
         return _rejected(now, Unfit(refusals[0].reason, refusals[0].message), refusals)
     return _accepted(now, match, intent)
+
+
+def _check_change(now: PlanSituation) -> PlanStep | None:
+    """Decide on a dry run of a change. Return None if the change is decided like a new plan, because no flight has begun."""
+    original = now.original
+    if original is None:
+        message = f"there is no FlightPlan {now.plan.spec.change_of}; correct spec.changeOf"
+        return _rejected(now, Unfit("PlanMissing", message))
+    present = original.status or FlightPlanStatus()
+    if present.state == "Ended":
+        return _rejected(now, Unfit("ChangeNotPermitted", "the plan has ended; create another flight plan"))
+    if present.state not in FLYING:
+        return None
+    spec = now.plan.spec.model_copy(update={"dry_run": False, "change_of": None})
+    step = _change_in_flight(replace(now, plan=original.model_copy(update={"spec": spec})))
+    refusals = step.status.refusals if step is not None else ()
+    if refusals:
+        return _rejected(now, Unfit(refusals[0].reason, refusals[0].message), refusals)
+    status = FlightPlanStatus(
+        observed_generation=now.plan.metadata.generation,
+        decided_for=now.plan.metadata.generation,
+        state="Accepted",
+        message=f"the flight of {present.drone} can be changed",
+        priority_class=spec.priority_class,
+        drone=present.drone,
+        volumes=step.status.volumes if step is not None else present.volumes,
+        restrictions=present.restrictions,
+    )
+    return PlanStep(status, _conditions(status))
 
 
 def _accepted(now: PlanSituation, match: Match, intent: OperationalIntent) -> PlanStep:
@@ -377,7 +415,9 @@ def _ended(now: PlanSituation, message: str) -> PlanStep:
 
 
 def _match(now: PlanSituation) -> Match:
-    return match_flight(now.plan, now.template, now.inventory(), now.settings, now.now_s, preferred=now.status.drone)
+    status = now.original.status if now.original is not None else now.plan.status
+    preferred = status.drone if status is not None else None
+    return match_flight(now.plan, now.template, now.inventory(), now.settings, now.now_s, preferred=preferred)
 
 
 def _intent(now: PlanSituation, state: PlanState, volumes: tuple[Volume4D, ...]) -> OperationalIntent:
@@ -415,7 +455,7 @@ def _keep(now: PlanSituation) -> PlanStep:
     if now.state == "Accepted":
         status = status.model_copy(
             update={
-                "advisories": _policy_advisories(status) + _overlaps(intent_of(now.plan), now),
+                "advisories": _policy_advisories(status) + _overlaps(replace(intent_of(now.plan), name=now.name), now),
                 "message": f"{status.drone} is reserved",
             }
         )

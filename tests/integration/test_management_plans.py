@@ -48,6 +48,15 @@ def test_check_decides_without_a_reservation(pilot: User) -> None:
     assert pilot("POST", "/v1/plans:check", plan()).body["status"]["state"] == "Rejected"
 
 
+def test_check_of_a_change_does_not_conflict_with_the_plan_itself(pilot: User) -> None:
+    created = submitted(pilot)
+    longer = plan() | {"window": created.body["spec"]["window"] | {"duration": 20}}
+    checked = pilot("POST", f"{path_of(created)}:check", longer)
+    assert checked.body["status"]["state"] == "Accepted", checked.body["status"]
+    assert pilot("GET", path_of(created)).body["spec"]["window"]["duration"] == 15
+    problem(pilot("POST", "/v1/plans/other:check", longer), 404)
+
+
 def test_change_needs_the_present_version(pilot: User) -> None:
     created = submitted(pilot)
     later = plan(in_s=7200)

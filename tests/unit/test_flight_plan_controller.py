@@ -24,7 +24,7 @@ from fractus_operator.store import Conflict, KubeError, NotFound, Store
 from test_airspace_flights import located
 from test_flight_plan_steps import BEGIN_S, DAY_BEFORE_S, END_S, accepted
 from test_ordered_applications import flight, template
-from test_planning import inventory
+from test_planning import at, inventory
 
 PLAN = ("team", "morning")
 FLIGHT = ("team", "flight-3e0a")
@@ -489,6 +489,41 @@ async def test_dry_run_is_decided_without_a_reservation_and_deleted() -> None:
     world.now_s += 61
     await world.step()
     assert world.api.find(kinds.FLIGHT_PLAN, PLAN) is None
+
+
+def check_named(change_of: str | None, **spec: Any) -> Any:
+    return plan_named("check", "u2", dryRun=True, changeOf=change_of, **spec)
+
+
+@pytest.mark.parametrize(
+    ("change_of", "state"), [("morning", "Accepted"), (None, "Rejected"), ("noon", "Rejected"), ("other", "Rejected")]
+)
+async def test_dry_run_of_a_change_conflicts_with_all_plans_but_the_changed_one(
+    change_of: str | None, state: str
+) -> None:
+    """The changed plan has reserved the only drone."""
+    world = World(flight(), plan_named("noon", "u3"), check_named(change_of))
+    await world.step()
+    status = await world.step(("team", "check"))
+    assert status["state"] == state
+    if state == "Accepted":
+        await world.step(("team", "check"))
+        assert world.status(("team", "check")).get("advisories", []) == []
+        assert world.cache.flights.get(("team", "check")) is None
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [({}, None), ({"window": {"start": "2027-01-15T08:00:00Z", "duration": 20}}, None),
+     ({"waypoints": [at(40, 40, 20)]}, "ChangeNotPermitted")],
+)  # fmt: skip
+async def test_dry_run_of_a_change_in_flight_gets_the_decision_on_the_change(change: Body, reason: str | None) -> None:
+    world = await started()
+    world.api.put(kinds.FLIGHT_PLAN, check_named("morning", **change).to_dict())
+    world.watch()
+    status = await world.step(("team", "check"))
+    assert status["state"] == ("Rejected" if reason else "Accepted"), status["message"]
+    assert [each["reason"] for each in status.get("refusals", [])] == ([reason] if reason else [])
 
 
 async def test_dry_run_is_never_flown() -> None:

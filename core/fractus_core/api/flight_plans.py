@@ -215,9 +215,21 @@ class FlightPlanSpec(Model):
     dry_run: bool = Field(
         default=False, description="True to decide the plan without a reservation, and to delete it after a minute."
     )
+    change_of: Name | None = Field(
+        default=None,
+        description="Dry runs only: name of the plan in this namespace whose change is decided. The plan does not conflict with"
+        " its own change. Unset: a new plan is decided.",
+    )
 
     _one_place = one_of("waypoints", "region")
     _distinct_policies = one_action_for_each_policy()
+
+    @rule(
+        "!has(self.changeOf) || (has(self.dryRun) && self.dryRun)",
+        "only a dry run may have changeOf; change the plan itself, or set dryRun: true",
+    )
+    def _checked_change(self) -> Violation:
+        return "changeOf" if self.change_of is not None and not self.dry_run else None
 
     @rule(
         "has(self.region) == has(self.stay)",

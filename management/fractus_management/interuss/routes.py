@@ -156,7 +156,7 @@ async def _upsert(caller: Caller, name: str, request: UpsertRequest) -> Planning
             raise Unplannable("Rejected", "the flight has ended; close it, or use another flight_plan_id")
         spec = flight_plan_spec(flight, _testing(caller).template, time.time())
         if request.execution_style == "Hypothetical":
-            return await _hypothetical(caller, request, spec)
+            return await _hypothetical(caller, request, spec, present)
         written = await _write(caller, name, present, spec)
     except Unplannable as unplannable:
         return response_of(present, unplannable.result, str(unplannable))
@@ -170,8 +170,10 @@ async def _upsert(caller: Caller, name: str, request: UpsertRequest) -> Planning
     return response_of(remaining, problem.result, str(problem))
 
 
-async def _hypothetical(caller: Caller, request: UpsertRequest, spec: FlightPlanSpec) -> PlanningResponse:
-    decided = await dry_run(caller, spec, None)
+async def _hypothetical(
+    caller: Caller, request: UpsertRequest, spec: FlightPlanSpec, present: Body | None
+) -> PlanningResponse:
+    decided = await dry_run(caller, spec, None, present)
     problem = await _problem(caller, request, decided)
     if problem is not None:
         return response_of(None, problem.result, str(problem))

@@ -100,7 +100,7 @@ def test_plans_page_leads_from_a_token_to_an_accepted_plan(page: Page, pilot: Us
     expect_decision(page, "Add a waypoint.")
     expect(submit).to_be_disabled()
     page.wait_for_selector("#map[data-map=ready]")
-    # The map shows nothing yet, so the first point is imported, and the map then shows its surroundings.
+    # The map shows the surroundings of imported points.
     takeoff = {"type": "SimpleItem", "command": 22, "frame": 3, "params": [0, 0, 0, None, 0, 0, 10]}
     waypoint = {
         "type": "SimpleItem",
@@ -128,6 +128,18 @@ def test_plans_page_leads_from_a_token_to_an_accepted_plan(page: Page, pilot: Us
     item.get_by_role("button", name="End").click()
     expect(item).to_contain_text("Ended", timeout=TIMEOUT_MS)
     expect(page.locator("#announcer")).to_contain_text("Ended", timeout=TIMEOUT_MS)
+
+
+def test_plans_page_shows_a_route_across_the_antimeridian_in_one_piece(page: Page, pilot: User) -> None:
+    sign_in(page, pilot)
+    page.wait_for_selector("#map[data-map=ready]")
+    # The map shows the imported points, so its middle is on the antimeridian.
+    import_file(page, json.dumps({"type": "LineString", "coordinates": [[179.999, -17], [-179.999, -17]]}))
+    expect(page.locator("#route tr")).to_have_count(2)
+    page.locator("#map canvas").click()
+    expect(page.locator("#route tr")).to_have_count(3)
+    longitude = float(page.get_by_label("Longitude of point 3").input_value())
+    assert 180 - abs(longitude) < 0.0005
 
 
 def test_plans_page_submits_a_plan_of_a_region(page: Page, pilot: User, world: World) -> None:

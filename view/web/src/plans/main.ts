@@ -11,6 +11,7 @@ import { differences } from "./differences";
 import { PlanForm } from "./plan_form";
 import { PlanList, stateOf } from "./plan_list";
 import type { PlanMap } from "./plan_map";
+import { pointFeature, routeFeatures, specFeatures, volumeFeatures } from "./shapes";
 import type { ApplicationTemplate, Drone, FlightPlan, FlightPlanSpec, FlightPlanStatus } from "./types";
 
 const CHECK_DELAY_MS = 500;
@@ -19,12 +20,9 @@ const REFRESH_MS = 10_000;
 const CHANGE_ATTEMPTS = 5;
 const RESERVING = new Set(["Accepted", "Activated", "Nonconforming", "Contingent"]);
 
-type Maps = typeof import("./plan_map");
-
 let api: Api | undefined;
 let plans: FlightPlan[] = [];
 let drones: Drone[] = [];
-let maps: Maps | undefined;
 let map: PlanMap | undefined;
 /** Time since which the server does not respond, in Unix milliseconds. */
 let lost: number | undefined;
@@ -44,7 +42,7 @@ let following = new AbortController();
 let followed = "";
 
 const submit = byId<HTMLButtonElement>("submit");
-const form = new PlanForm(edited);
+const form = new PlanForm(edited, () => map?.fit(routeOfForm()));
 const list = new PlanList({
   follow,
   start: (plan) => void act(plan, (client) => sendSeen(client, plan, "POST", ":activate")),
@@ -157,10 +155,10 @@ function decide(status: FlightPlanStatus): void {
   form.choices.show(status.restrictions ?? []);
   showFindings(status, showPlan);
   showDecision();
-  map?.set("operationArea", maps!.volumeFeatures(status.volumes ?? []));
+  map?.set("operationArea", volumeFeatures(status.volumes ?? []));
   const others = [...(status.refusals ?? []), ...(status.advisories ?? [])].map(({ plan }) => plan);
   const conflicting = plans.filter((plan) => others.includes(nameOf(plan)));
-  map?.set("exclusion", conflicting.flatMap((plan) => maps!.volumeFeatures(plan.status?.volumes ?? [])));
+  map?.set("exclusion", conflicting.flatMap((plan) => volumeFeatures(plan.status?.volumes ?? [])));
 }
 
 /** Returns why the plan cannot be submitted, or an empty text. */
@@ -341,7 +339,7 @@ function put(plan: FlightPlan): void {
 function showPlans(): void {
   list.show(plans, followed);
   const others = plans.filter((plan) => RESERVING.has(stateOf(plan)) && plan.metadata.name !== changed?.metadata.name);
-  map?.set("corridor", others.flatMap(({ status }) => maps!.volumeFeatures([...(status?.volumes ?? []), ...(status?.offNominalVolumes ?? [])])));
+  map?.set("corridor", others.flatMap(({ status }) => volumeFeatures([...(status?.volumes ?? []), ...(status?.offNominalVolumes ?? [])])));
 }
 
 /** Shows a plan with the name namespace/name on the map. */
@@ -351,8 +349,8 @@ function showPlan(name: string): void {
     showProblem("submit-problem", `You cannot see the plan ${name}, because it is in another namespace or was deleted.`);
     return;
   }
-  if (maps === undefined || map === undefined) return;
-  const features = [...maps.specFeatures(plan.spec), ...maps.volumeFeatures(plan.status?.volumes ?? [])];
+  if (map === undefined) return;
+  const features = [...specFeatures(plan.spec), ...volumeFeatures(plan.status?.volumes ?? [])];
   map.set("exclusion", features);
   map.fit(features);
 }
@@ -360,20 +358,24 @@ function showPlan(name: string): void {
 // -- map and connection --
 
 function showRoute(): void {
-  map?.set("path", maps!.routeFeatures(form.route.points, form.route.isRegion));
+  map?.set("path", routeOfForm());
+}
+
+function routeOfForm(): GeoJSON.Feature[] {
+  return routeFeatures(form.route.points, form.route.isRegion);
 }
 
 function showDrones(): void {
   const positions = drones.flatMap(({ status }) => (status?.position ? [status.position] : []));
-  map?.set("depot", positions.map(maps!.pointFeature));
+  map?.set("depot", positions.map(pointFeature));
 }
 
 async function openMap(): Promise<void> {
   const style = getComputedStyle(document.documentElement);
   const colours = (name: string): string => style.getPropertyValue(`--${name}`).trim();
   try {
-    maps = await import("./plan_map");
-    map = new maps.PlanMap(byId("map"), colours, (point) => form.route.add(point));
+    const { PlanMap } = await import("./plan_map");
+    map = new PlanMap(byId("map"), colours, (point) => form.route.add(point));
     const opened = map;
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => opened.paint(colours));
   } catch (error) {

@@ -26,8 +26,8 @@ export class PlanForm {
   /** Specification whose other fields are kept. */
   private base: Partial<FlightPlanSpec> = {};
 
-  /** `changed` is called after each change of the entered values. */
-  constructor(changed: () => void) {
+  /** `changed` is called after each change of the entered values, and `imported` after the import of a file. */
+  constructor(changed: () => void, private readonly imported: () => void) {
     this.route = new Route(changed);
     this.choices = new Choices(byId("choices"));
     this.start.value = local(Date.now() + DEFAULT_DELAY_MS);
@@ -125,6 +125,7 @@ export class PlanForm {
     let problem = "";
     try {
       this.route.set(importedPoints(await file.text()), this.route.isRegion);
+      this.imported();
     } catch (error) {
       problem = (error as Error).message;
     }

@@ -1,16 +1,15 @@
 // Map of a plan: route, volumes, other plans and drones. A click adds a point to the route.
 
-import { type GeoJSONSource, LngLatBounds, Map as MapLibre, NavigationControl, ScaleControl, type StyleSpecification, setWorkerUrl } from "maplibre-gl";
+import { type GeoJSONSource, Map as MapLibre, NavigationControl, ScaleControl, type StyleSpecification, setWorkerUrl } from "maplibre-gl";
 import "maplibre-gl/dist/maplibre-gl.css";
 import workerUrl from "maplibre-gl/dist/maplibre-gl-worker.mjs?url";
 
-import type { Area, FlightPlanSpec, Point, ReservedVolume } from "./types";
+import { extent } from "./shapes";
+import type { Point } from "./types";
 
 setWorkerUrl(new URL(workerUrl, window.location.href).href);
 
 const FIT = { padding: 60, maxZoom: 18, animate: false };
-const CIRCLE_CORNERS = 64;
-const M_PER_DEGREE = 111_195;
 /** Layers of the map in drawing order. Their names are those of colours of the style sheet. */
 const LAYERS = ["corridor", "operationArea", "exclusion", "path", "depot"] as const;
 /** Volumes of other plans have dashed outlines, so that colours are not needed to tell them apart. */
@@ -64,9 +63,8 @@ export class PlanMap {
   }
 
   fit(features: GeoJSON.Feature[]): void {
-    const bounds = new LngLatBounds();
-    for (const { geometry } of features) if ("coordinates" in geometry) extend(bounds, geometry.coordinates);
-    if (bounds.isEmpty()) return;
+    const bounds = extent(features);
+    if (bounds === undefined) return;
     this.fitted = true;
     this.map.fitBounds(bounds, FIT);
   }
@@ -77,45 +75,6 @@ export class PlanMap {
       source?.setData({ type: "FeatureCollection", features: this.features.get(layer) ?? [] });
     }
   }
-}
-
-/** Returns the features of a route: its line or area, and its points. */
-export function routeFeatures(points: Point[], isRegion: boolean): GeoJSON.Feature[] {
-  const placed = points.filter(({ lat, lon }) => Math.abs(lat) <= 90 && Math.abs(lon) <= 180);
-  const line = placed.map(coordinates);
-  const corners = placed.map((point) => feature({ type: "Point", coordinates: coordinates(point) }));
-  if (placed.length < 2) return corners;
-  if (isRegion && placed.length > 2) return [feature({ type: "Polygon", coordinates: [[...line, line[0]!]] }), ...corners];
-  return [feature({ type: "LineString", coordinates: line }), ...corners];
-}
-
-/** Returns the route of a specification. */
-export function specFeatures(spec: FlightPlanSpec): GeoJSON.Feature[] {
-  return spec.region ? areaFeatures(spec.region) : routeFeatures(spec.waypoints ?? [], false);
-}
-
-/** Returns the ground areas of volumes. */
-export function volumeFeatures(volumes: ReservedVolume[]): GeoJSON.Feature[] {
-  return volumes.flatMap(({ areas }) => areas.flatMap(areaFeatures));
-}
-
-export function pointFeature(point: Point): GeoJSON.Feature {
-  return feature({ type: "Point", coordinates: coordinates(point) });
-}
-
-function areaFeatures({ circle, polygon }: Area): GeoJSON.Feature[] {
-  const rings = polygon ? [polygon.exterior, ...(polygon.holes ?? [])] : [];
-  if (circle) {
-    const angles = Array.from({ length: CIRCLE_CORNERS }, (_, index) => (2 * Math.PI * index) / CIRCLE_CORNERS);
-    const degrees = circle.radius / M_PER_DEGREE;
-    const widening = 1 / Math.cos((circle.center.lat * Math.PI) / 180);
-    const corner = (angle: number) => ({
-      lat: circle.center.lat + degrees * Math.sin(angle),
-      lon: circle.center.lon + degrees * widening * Math.cos(angle),
-    });
-    rings.push(angles.map(corner));
-  }
-  return rings.length === 0 ? [] : [feature({ type: "Polygon", coordinates: rings.map((ring) => [...ring, ring[0]!].map(coordinates)) })];
 }
 
 function style(colours: Colours): StyleSpecification {
@@ -129,20 +88,6 @@ function style(colours: Colours): StyleSpecification {
     layers.push({ id: `${name}-point`, type: "circle", source: name, filter: ["==", "$type", "Point"], paint: { "circle-color": colour, "circle-radius": 5 } });
   }
   return { version: 8, sources: Object.fromEntries(LAYERS.map((name) => [name, source])), layers };
-}
-
-function feature(geometry: GeoJSON.Geometry): GeoJSON.Feature {
-  return { type: "Feature", properties: {}, geometry };
-}
-
-function coordinates({ lat, lon }: Point): [number, number] {
-  return [lon, lat];
-}
-
-function extend(bounds: LngLatBounds, value: unknown): void {
-  const [first, second] = value as unknown[];
-  if (typeof first === "number") bounds.extend([first, second as number]);
-  else for (const each of value as unknown[]) extend(bounds, each);
 }
 
 /** Rounds to about a centimetre. */

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import pytest
 from fractus_testing import Results, Scene, VirtualDrone, until
 
@@ -11,7 +13,9 @@ OUT = {"do": "goto", "north": 40, "east": 0, "alt": 10}
 BACK = {"do": "returnToLaunch"}
 
 
-def drone_with(fractus: Scene, *steps: dict[str, object], name: str = "vDrone-1", east_m: float = 0.0) -> VirtualDrone:
+def drone_with(
+    fractus: Scene, *steps: Mapping[str, object], name: str = "vDrone-1", east_m: float = 0.0
+) -> VirtualDrone:
     """Return a drone that flies steps, this far east of the common start position."""
     drone = fractus.vDrone(name)
     drone.set_pos((HOME[0], HOME[1] + east_m / 86_000, HOME[2]))
@@ -84,7 +88,7 @@ def test_mission_waypoints_are_reached(fractus: Scene) -> None:
     drone = drone_with(fractus, {"do": "mission", "takeoff": 10, "waypoints": waypoints})
     results = flown(fractus, drone)
     for waypoint in waypoints:
-        results.check("reached", **waypoint)
+        results.check("reached", "vDrone-1", **waypoint)
 
 
 def test_drone_that_lands_elsewhere_fails_the_check(fractus: Scene) -> None:

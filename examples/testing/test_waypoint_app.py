@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import config
 import pytest
 from fractus_testing import (
@@ -22,7 +24,7 @@ from fractus_testing import (
 )
 
 
-def start(fractus: Scene, params: dict[str, object]) -> tuple[VirtualController, VirtualDrone]:
+def start(fractus: Scene, params: Mapping[str, object]) -> tuple[VirtualController, VirtualDrone]:
     """Start the application on a virtual drone."""
     controller = fractus.vController()
     drone = fractus.vDrone("vDrone-1", SITL,

@@ -160,14 +160,14 @@ class VirtualDrone:
         self._scene.require_not_started("set_app")
         self.apps.append(app_of(program, params or {}, component, port, interface))
 
-    def set_task(self, *steps: dict[str, Any]) -> None:
+    def set_task(self, *steps: Mapping[str, object]) -> None:
         """Let a ground station fly the vehicle alone, without services and programs.
 
         Args:
             steps: Task steps as in experiment files, such as `{"do": "takeoff", "alt": 10}`.
         """
         self._scene.require_not_started("set_task")
-        self.task = list(steps)
+        self.task = [dict(step) for step in steps]
 
     def set_camera(self, world: World) -> None:
         """Add a camera, and the world that it sees."""

@@ -1,4 +1,4 @@
-"""Wheels: contents and requirements, and strict type checks of the examples against the wheel fractus-drones."""
+"""Wheels: contents and requirements, and strict type checks of the examples against the installed wheels."""
 
 from __future__ import annotations
 
@@ -13,7 +13,11 @@ from zipfile import ZipFile
 import pytest
 
 ROOT = Path(__file__).parents[2]
-EXAMPLES = sorted({path.parent for path in (ROOT / "examples").rglob("*.py")})
+TESTING = ROOT / "examples" / "testing"
+GENERATED_CLIENT = ROOT / "examples" / "flights"
+"""Example that imports a client which its user generates. `test_management_client.py` generates it and runs the example."""
+
+EXAMPLES = sorted({path.parent for path in (ROOT / "examples").rglob("*.py")} - {TESTING, GENERATED_CLIENT})
 SIMULATOR = ("cluster", "pytest", "radio", "sim", "testing", "vehicle", "world")
 SHIPPED = ("agent", "cli", "core", "management", "operator", "proto", "runtime", "services", "view")
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
@@ -35,14 +39,34 @@ def wheels(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     return {path.name.partition("-")[0]: path for path in folder.glob("*.whl")}
 
 
+def site_packages(interpreter: Path) -> Path:
+    """Return the directory of the packages of a virtual environment."""
+    (packages,) = (interpreter.parents[1] / "lib").glob("python*/site-packages")
+    return packages
+
+
 @pytest.fixture(scope="module")
 def interpreter(wheels: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Python interpreter in whose environment only the wheel fractus-drones is installed."""
     folder = tmp_path_factory.mktemp("wheel")
     venv.create(folder / "venv", with_pip=False)
-    (packages,) = (folder / "venv" / "lib").glob("python*/site-packages")
-    shutil.unpack_archive(wheels["fractus_drones"], packages, format="zip")
-    return folder / "venv" / "bin" / "python"
+    python = folder / "venv" / "bin" / "python"
+    shutil.unpack_archive(wheels["fractus_drones"], site_packages(python), format="zip")
+    return python
+
+
+@pytest.fixture(scope="module")
+def testing_interpreter(wheels: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Python interpreter in whose environment both wheels and pytest are installed, as for tests of applications."""
+    folder = tmp_path_factory.mktemp("wheels-testing")
+    venv.create(folder / "venv", with_pip=False)
+    python = folder / "venv" / "bin" / "python"
+    packages = site_packages(python)
+    for wheel in wheels.values():
+        shutil.unpack_archive(wheel, packages, format="zip")
+    for name in ("pytest", "_pytest"):
+        (packages / name).symlink_to(Path(pytest.__file__).parents[1] / name)
+    return python
 
 
 def contents(wheel: Path) -> set[str]:
@@ -83,6 +107,11 @@ def mypy(interpreter: Path, folder: Path, *files: Path) -> subprocess.CompletedP
 @pytest.mark.parametrize("folder", EXAMPLES, ids=lambda folder: folder.name)
 def test_examples_pass_strict_type_checks_against_the_wheel(interpreter: Path, folder: Path) -> None:
     result = mypy(interpreter, folder, *folder.glob("*.py"))
+    assert result.returncode == 0, result.stdout + result.stderr
+
+
+def test_examples_of_tests_pass_strict_type_checks_against_both_wheels(testing_interpreter: Path) -> None:
+    result = mypy(testing_interpreter, TESTING, *TESTING.glob("*.py"))
     assert result.returncode == 0, result.stdout + result.stderr
 
 

@@ -32,6 +32,10 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         "--fractus-out", type=Path, default=Path("out/tests"), help="Folder of the tests' logs and reports. [out/tests]"
     )
     group.addoption("--fractus-keep", action="store_true", help="Keep the folders of passed tests, with their reports.")
+    group.addoption(
+        "--fractus-repeats", type=int, default=1, metavar="N",
+        help="Run each test with virtual drones N times, to find tests that do not always pass. [1]",
+    )  # fmt: skip
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -43,18 +47,26 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
-    """Repeat a test with several seeds.
+    """Repeat a test with several seeds, and as often as the option requires.
 
     Raises:
-        UsageError: The marker has an unknown field.
+        UsageError: The marker has an unknown field, or the number of repeats is below 1.
     """
     if "fractus_seed" not in metafunc.fixturenames:
         return
     fields = _marker_fields(metafunc.definition)
-    if "seeds" in fields:
-        first = int(fields.get("seed", 1))
-        seeds = range(first, first + int(fields["seeds"]))
-        metafunc.parametrize("fractus_seed", seeds, indirect=True, ids=[f"seed{seed}" for seed in seeds])
+    repeats = int(metafunc.config.getoption("fractus_repeats"))
+    if repeats < 1:
+        raise pytest.UsageError(f"--fractus-repeats {repeats}: specify 1 or more")
+    if "seeds" not in fields and repeats == 1:
+        return
+    first = int(fields.get("seed", 1))
+    cases = [
+        (seed, f"seed{seed}" if repeats == 1 else f"seed{seed}-run{run}")
+        for run in range(1, repeats + 1)
+        for seed in range(first, first + int(fields.get("seeds", 1)))
+    ]
+    metafunc.parametrize("fractus_seed", [seed for seed, _ in cases], indirect=True, ids=[name for _, name in cases])
 
 
 @pytest.fixture

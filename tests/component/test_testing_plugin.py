@@ -70,6 +70,17 @@ def test_test_is_repeated_with_each_seed(pytester: pytest.Pytester) -> None:
     assert seeds == ["3", "4"]
 
 
+def test_test_runs_as_often_as_the_option_requires(pytester: pytest.Pytester) -> None:
+    pytester.makepyfile(flight(marker=", seeds=2"))
+    names = ["seed3-run1", "seed4-run1", "seed3-run2", "seed4-run2"]
+    result = pytester.runpytest_inprocess("--collect-only", "-q", "--fractus-repeats", "2")
+    result.stdout.fnmatch_lines([f"*::test_hop[[]{name}[]]" for name in names])
+    pytester.makepyfile("def test_nothing(fractus): pass")
+    result = pytester.runpytest_inprocess("--fractus-repeats", "0")
+    assert result.ret != 0
+    result.stdout.fnmatch_lines(["*--fractus-repeats 0: specify 1 or more*"])
+
+
 def test_unknown_field_of_the_marker_is_named(pytester: pytest.Pytester) -> None:
     pytester.makepyfile(flight(marker=", speed=2"))
     result = pytester.runpytest_inprocess()

@@ -435,10 +435,11 @@ def test_pending_data_stays_bounded_after_clock_is_set_back(tmp_path: Path) -> N
 
 def test_pictures_are_recorded_unchanged(tmp_path: Path) -> None:
     writer = writer_in(tmp_path, always=True)
-    writer.picture(T0, b"\xff\xd8 a picture")
+    writer.picture(T0, b"\xff\xd8 a picture", "uid/identity")
     writer.end()
     ((time_ns, picture),) = mcap(files(tmp_path, ".mcap")[0])["/drone-1/picture foxglove.CompressedImage"]
     assert (time_ns, base64.b64decode(picture["data"]), picture["format"]) == (T0, b"\xff\xd8 a picture", "jpeg")
+    assert picture["owner"] == "uid/identity"
 
 
 def until(condition: Callable[[], object]) -> None:
@@ -460,7 +461,7 @@ def test_recording_is_off_without_directory_or_space(tmp_path: Path) -> None:
     assert segments_in(tmp_path, 0) is None
     disabled = Recorder(None, "n")
     disabled.take_received(b"x")
-    disabled.take_picture(0.0, b"x")
+    disabled.take_picture("owner", 0.0, b"x")
     asyncio.run(disabled.close())
     assert not disabled.problem
 

@@ -104,7 +104,10 @@ async def test_recording_has_flight_and_pictures_and_survives_kill(rig: Rig) -> 
     frame_names = frames(mobility)
     assert {("HEARTBEAT", 1), ("HEARTBEAT", 244), ("GLOBAL_POSITION_INT", 1), ("COMMAND_ACK", 1)} <= frame_names
     taken = messages(pictures)
-    assert taken[f"/{NODE}/picture foxglove.CompressedImage"]
+    owners = {picture["owner"] for picture in taken[f"/{NODE}/picture foxglove.CompressedImage"]}
+    assert {owner.partition("/")[2] for owner in owners} == {
+        component_identity("default", "app", "AerialViewer", "app-aerial-viewer")
+    }
     callers = {message["caller"] for message in taken[f"/{NODE}/decisions fractus.Decision"]}
     assert component_identity("default", "app", "AerialViewer", "app-aerial-viewer") in callers
 

@@ -125,7 +125,7 @@ class ImageStore:
         keep_bytes: Maximum size of the images of an owner, in bytes.
         keep_total_bytes: Maximum size of all images, in bytes. Images of owners without a Grant are removed to stay below it.
         owners: Returns the owners that have a Grant now.
-        on_added: Callback invoked with the time (Unix seconds) and the data of each new image, from any thread.
+        on_added: Callback invoked with the owner, the time (Unix seconds) and the data of each new image, from any thread.
     """
 
     def __init__(
@@ -136,7 +136,7 @@ class ImageStore:
         keep_total_bytes: int = 10**13,
         owners: Callable[[], Iterable[str]] = tuple,
         *,
-        on_added: Callable[[float, bytes], None] = lambda _time_s, _data: None,
+        on_added: Callable[[str, float, bytes], None] = lambda _owner, _time_s, _data: None,
     ) -> None:
         self._on_added = on_added
         self._directory = directory
@@ -198,7 +198,7 @@ class ImageStore:
             except OSError:
                 image.unlink(missing_ok=True)
                 raise
-        self._on_added(record.time_s, data)
+        self._on_added(owner, record.time_s, data)
 
     def find(self, owner: str, name: str) -> ImageRecord:
         """Return the record of an image.

@@ -45,7 +45,7 @@ SCHEMAS = dict(
         schema("foxglove.GeoJSON", geojson=_TEXT),
         schema(
             "foxglove.CompressedImage", timestamp=_TIME, frame_id=_TEXT,
-            data={"type": "string", "contentEncoding": "base64"}, format=_TEXT,
+            data={"type": "string", "contentEncoding": "base64"}, format=_TEXT, owner=_TEXT,
         ),
         schema("fractus.Attitude", roll_rad=_NUMBER, pitch_rad=_NUMBER, yaw_rad=_NUMBER),
         schema(
@@ -107,10 +107,11 @@ def zones(time_ns: int, features: Sequence[Mapping[str, Any]]) -> Record:
     return Record("zones", "foxglove.GeoJSON", time_ns, {"geojson": json.dumps(collection, separators=(",", ":"))})
 
 
-def picture(time_ns: int, node: str, jpeg: bytes) -> Record:
-    """Return an image."""
+def picture(time_ns: int, node: str, jpeg: bytes, owner: str = "") -> Record:
+    """Return an image. Its owner is the component instance that took it: uid of the Application, slash, SPIFFE ID."""
     content = {
         "timestamp": _timestamp(time_ns), "frame_id": node, "data": b64encode(jpeg).decode(), "format": "jpeg",
+        "owner": owner,
     }  # fmt: skip
     return Record("picture", "foxglove.CompressedImage", time_ns, content)
 

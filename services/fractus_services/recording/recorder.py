@@ -161,9 +161,9 @@ class FlightWriter:
         if self._segment is not None:
             self._segment.write(time_ns, b"", (self._map,))
 
-    def picture(self, time_ns: int, jpeg: bytes) -> None:
+    def picture(self, time_ns: int, jpeg: bytes, owner: str) -> None:
         """Record an image as components receive it."""
-        self._write(time_ns, b"", (messages.picture(time_ns, self._node, jpeg),))
+        self._write(time_ns, b"", (messages.picture(time_ns, self._node, jpeg, owner),))
 
     def tick(self) -> None:
         """Flush or close the segment when due. Without an open segment, continue to rebuild indexes.
@@ -342,9 +342,9 @@ class Recorder:
         time_ns = self._clock()
         self._offer(lambda writer: writer.grants(time_ns, specs))
 
-    def take_picture(self, time_s: float, jpeg: bytes) -> None:
-        """Record an image as components receive it, with its Unix time in seconds."""
-        self._offer(lambda writer: writer.picture(int(time_s * 1e9), jpeg))
+    def take_picture(self, owner: str, time_s: float, jpeg: bytes) -> None:
+        """Record an image as components receive it, with its owner and its Unix time in seconds."""
+        self._offer(lambda writer: writer.picture(int(time_s * 1e9), jpeg, owner))
 
     async def close(self) -> None:
         """Write the remaining messages."""

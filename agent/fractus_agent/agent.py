@@ -18,6 +18,7 @@ from fractus_agent.agent_metrics import AgentMetrics
 from fractus_agent.grant_synchronizer import GrantDirectory, GrantSynchronizer, GrantVerifier
 from fractus_agent.identity import NodeIdentity
 from fractus_agent.links.link_manager import LinkManager
+from fractus_agent.records.record_server import RecordServer
 from fractus_agent.registration.diagnostics import (
     read_audit_heads,
     read_gateway_problem,
@@ -88,6 +89,8 @@ class Agent:
         self._supervisor.add("contact", self._keep_contact)
         if settings.direct_links:
             self._supervisor.add("links", self._run_links)
+        if settings.records:
+            self._supervisor.add("records", self._serve_records)
 
     async def run(self) -> None:
         """Run all parts until cancelled.
@@ -136,6 +139,14 @@ class Agent:
             if self._grants.depends_on_contact:
                 await self._store.is_reachable(CONTACT_TIMEOUT_S)
             await asyncio.sleep(CONTACT_INTERVAL_S)
+
+    async def _serve_records(self) -> None:
+        """Serve the records of flights once the node has a mobility service. Other nodes have no flights."""
+        await self._mobility.wait()
+        server = RecordServer(
+            self._settings.records, self._settings.node, self._settings.state, self._settings.tls, self._store
+        )
+        await server.run(self._identity)
 
     async def _run_links(self) -> None:
         """Run direct links once the node has a direct interface and a certificate."""
@@ -198,6 +209,7 @@ class Agent:
             audit_heads=read_audit_heads(self._settings.audit, self._settings.gateway_audit),
             recording_problems=read_recording_problems(self._settings.state),
             gateway_problem=read_gateway_problem(self._settings.state),
+            records_address=self._settings.records,
         )
 
     def _on_telemetry(self) -> None:

@@ -33,6 +33,8 @@ class Settings:
         log_format: Log format, text or json (FRACTUS_LOG_FORMAT).
         direct_links: True to use direct links (FRACTUS_DIRECT_LINKS).
         metrics: Host and port of the Prometheus endpoint, empty for none (FRACTUS_METRICS).
+        records: Host and port of the recording endpoint, empty for none (FRACTUS_RECORDS). The status of the Drone contains it,
+            so the host must be an address that other nodes can reach.
         drain_s: Time for which connections may stay on a working path that their service has left, in seconds
             (FRACTUS_DRAIN_S).
     """
@@ -45,6 +47,7 @@ class Settings:
     log_format: str = "text"
     direct_links: bool = True
     metrics: str = ""
+    records: str = ""
     drain_s: float = DEFAULT_DRAIN_S
 
     @property
@@ -97,6 +100,7 @@ class Settings:
             drain_s=drain_s,
             direct_links=environment.get("FRACTUS_DIRECT_LINKS", "true").lower() == "true",
             metrics=environment.get("FRACTUS_METRICS", ""),
+            records=environment.get("FRACTUS_RECORDS", ""),
             log_format=environment.get("FRACTUS_LOG_FORMAT") or "text",
             log_level=environment.get("FRACTUS_LOG_LEVEL", "INFO").upper(),
         )

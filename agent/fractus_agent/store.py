@@ -13,10 +13,11 @@ import os
 import time
 from collections.abc import AsyncGenerator, Mapping, Sequence
 from dataclasses import dataclass
+from http import HTTPStatus
 from pathlib import Path
 from typing import Literal
 
-from fractus_core.api import DirectLink, Drone, EdgeNode, InvalidObject, NodeGrants
+from fractus_core.api import DirectLink, Drone, EdgeNode, FlightPlan, InvalidObject, NodeGrants
 from fractus_core.api.grants import NODE_GRANTS_NAMESPACE, NodeGrantsStatus, ReportedGrant, unpack
 from fractus_core.api.model import API_VERSION, GROUP
 from fractus_core.api.names import NODE_SIGNER
@@ -122,6 +123,11 @@ _NODE_GRANTS = Kind(API_VERSION, NodeGrants.KIND, NodeGrants.PLURAL, namespaced=
 _NODE = Kind("v1", "Node", "nodes", namespaced=False)
 _SIGNING_REQUEST = Kind("certificates.k8s.io/v1", "CertificateSigningRequest", "certificatesigningrequests", False)
 _CONFIG_MAP = Kind("v1", "ConfigMap", "configmaps", namespaced=True)
+_FLIGHT_PLAN = Kind(API_VERSION, FlightPlan.KIND, FlightPlan.PLURAL, namespaced=True)
+_ACCESS_REVIEW = Kind(
+    "authorization.k8s.io/v1", "SelfSubjectAccessReview", "selfsubjectaccessreviews", namespaced=False
+)
+_REVIEW_TIMEOUT_S = 5.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,6 +177,7 @@ class Store:
         self._client = client
         # All agents share one account, which may not read Grants. Each node has its own account for its Grants.
         self._own_client = client.account(node, NODE_GRANTS_NAMESPACE, node)
+        self._anonymous = client.without_credentials()
         self._node = node
         self._times = times or WatchTimes()
         self._last_event_s: dict[str, float] = {}
@@ -354,8 +361,35 @@ class Store:
         """Return True if the API server responds within the timeout. A refusal counts as a response."""
         return await self._client.responds(timeout_s)
 
+    async def plan_with_records(self, token: str, namespace: str, name: str) -> Object:
+        """Return a FlightPlan whose records the holder of a token may read.
+
+        The API server is asked with this token, so the agent needs no permission on plans of any user.
+
+        Raises:
+            KubeError: The holder may not read the plan or its records, the plan does not exist, or the API server does not respond.
+        """
+        client = self._anonymous.on_behalf_of(token)
+        attributes = {
+            "group": GROUP, "resource": FlightPlan.PLURAL, "subresource": "records", "verb": "get", "namespace": namespace,
+            "name": name,
+        }  # fmt: skip
+        review: Body = {
+            "apiVersion": _ACCESS_REVIEW.api_version,
+            "kind": _ACCESS_REVIEW.name,
+            "spec": {"resourceAttributes": attributes},
+        }
+        reviewed = await client.request("POST", _ACCESS_REVIEW.path(""), review, timeout_s=_REVIEW_TIMEOUT_S)
+        if (reviewed.get("status") or {}).get("allowed") is not True:
+            message = (
+                f"you may not read the records of {name}: you need get on flightplans/records in namespace {namespace}"
+            )
+            raise KubeError(HTTPStatus.FORBIDDEN, "Forbidden", message)
+        return await client.request("GET", _FLIGHT_PLAN.path(namespace, name), timeout_s=_REVIEW_TIMEOUT_S)
+
     async def close(self) -> None:
         """Close the connections."""
+        await self._anonymous.aclose()
         await self._own_client.aclose()
         await self._client.aclose()
 

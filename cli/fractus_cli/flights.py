@@ -10,7 +10,7 @@ from datetime import UTC, datetime
 from typing import Any
 
 import click
-from fractus_core.planning.ordered_application import application_name
+from fractus_core.api.flight_plans import application_name
 from fractus_runtime.kubernetes import BlockingClient, Conflict, Invalid, KubeError
 
 from fractus_cli import EXIT_INFEASIBLE, EXIT_OK

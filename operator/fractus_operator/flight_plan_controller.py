@@ -10,10 +10,9 @@ from datetime import datetime
 
 from fractus_core.api import Application, Drone, FlightPlan
 from fractus_core.api.conditions import ConditionUpdate, merge_conditions
-from fractus_core.api.flight_plans import FlightPlanStatus
+from fractus_core.api.flight_plans import FlightPlanStatus, application_name
 from fractus_core.api.plans import MissionRecord
 from fractus_core.planning.inventory import Settings
-from fractus_core.planning.ordered_application import application_name
 
 from fractus_operator import kinds
 from fractus_operator.cache import ClusterCache

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from typing import Any, Protocol, TypeVar
 
 from fractus_core.api import Application, Condition, DeploymentPlan, InvalidObject, Metadata, Resource
+from fractus_core.api.flight_plans import application_name
 from fractus_core.api.plans import DeploymentPlanSpec
-from fractus_core.planning.ordered_application import application_name
 from pydantic import ValidationError
 
 from fractus_operator.kinds import Body, Key

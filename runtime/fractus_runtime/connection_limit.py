@@ -1,4 +1,4 @@
-"""Limit of the connections to the view. Clients without the token can neither keep nor use up connections."""
+"""Limit of the connections to a web server (aiohttp). Clients without authorization can neither keep nor use up connections."""
 
 from __future__ import annotations
 

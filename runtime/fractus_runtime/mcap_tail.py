@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -21,6 +22,8 @@ MAX_RECORD_BYTES = 100_000_000
 """Maximum length of a record. A larger value means a damaged file."""
 
 _HEAD = struct.Struct("<BQ")
+_SKIPPED = 0
+"""Opcode that no record has."""
 
 
 class DamagedFile(ValueError):
@@ -56,13 +59,15 @@ class Tail:
 
     Args:
         path: MCAP file.
+        max_record_bytes: Larger records, compressed or not, are skipped, which bounds the memory of the reader.
 
     Attributes:
         finished: True if the writer closed the file and all its messages were read.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, max_record_bytes: int = MAX_RECORD_BYTES) -> None:
         self.path = path
+        self._max_record_bytes = max_record_bytes
         self.finished = False
         self._offset = 0
         self._schemas: dict[int, str] = {}
@@ -78,7 +83,7 @@ class Tail:
         with open_file(self.path) as file:
             while not self.finished:
                 offset = self._offset
-                record = _read_record(file, offset, self.path)
+                record = _read_record(file, offset, self.path, self._max_record_bytes)
                 if record is None:
                     return
                 opcode, body, self._offset = record
@@ -87,7 +92,7 @@ class Tail:
                 yield from self._messages(opcode, body, offset)
 
     def _messages(self, opcode: int, body: bytes, offset: int) -> Iterator[RecordedMessage]:
-        for index, record in enumerate(_parse_record(opcode, body, self.path)):
+        for index, record in enumerate(_parse_record(opcode, body, self.path, self._max_record_bytes)):
             if isinstance(record, Schema):
                 self._schemas[record.id] = record.name
             elif isinstance(record, Channel) and record.message_encoding == "json":
@@ -117,10 +122,12 @@ def message_at(path: Path, location: MessageLocation) -> dict[str, Any] | None:
     return _content(message) if isinstance(message, Message) else None
 
 
-def _read_record(file: IO[bytes], offset: int, path: Path) -> tuple[int, bytes, int] | None:
+def _read_record(
+    file: IO[bytes], offset: int, path: Path, max_bytes: int = MAX_RECORD_BYTES
+) -> tuple[int, bytes, int] | None:
     """Return opcode and content of the record at an offset, and the offset of the next record.
 
-    Return None if the record is incomplete.
+    Return None if the record is incomplete. The content of a record above `max_bytes` is empty.
     """
     if offset == 0:
         start = file.read(len(MAGIC))
@@ -134,17 +141,22 @@ def _read_record(file: IO[bytes], offset: int, path: Path) -> tuple[int, bytes, 
     opcode, length = _HEAD.unpack(head)
     if length > MAX_RECORD_BYTES:
         raise DamagedFile(f"{path_text(path)} is damaged at byte {offset}")
+    next_offset = offset + _HEAD.size + length
+    if length > max_bytes:
+        complete = file.seek(0, os.SEEK_END) >= next_offset
+        return (_SKIPPED, b"", next_offset) if complete else None
     body = file.read(length)
-    return (opcode, body, offset + _HEAD.size + length) if len(body) == length else None
+    return (opcode, body, next_offset) if len(body) == length else None
 
 
-def _parse_record(opcode: int, body: bytes, path: Path) -> list[Any]:
+def _parse_record(opcode: int, body: bytes, path: Path, max_bytes: int = MAX_RECORD_BYTES) -> list[Any]:
     """Return the records of a chunk, or a single schema, channel or message. Other records have no messages."""
     stream = ReadDataStream(BytesIO(body))
     try:
         match opcode:
             case Opcode.CHUNK:
-                return list(breakup_chunk(Chunk.read(stream), validate_crc=True))
+                chunk = Chunk.read(stream)
+                return list(breakup_chunk(chunk, validate_crc=True)) if chunk.uncompressed_size <= max_bytes else []
             case Opcode.SCHEMA:
                 return [Schema.read(stream)]
             case Opcode.CHANNEL:

@@ -18,6 +18,7 @@ import pytest
 from aiohttp import ClientSession, hdrs, web
 from click.testing import CliRunner
 from fractus_cluster.ports import free_port
+from fractus_runtime.connection_limit import ConnectionLimit
 from fractus_runtime.mcap_tail import DamagedFile, Tail
 from fractus_runtime.metrics import metrics_text
 from fractus_services.recording import messages
@@ -25,7 +26,6 @@ from fractus_services.recording.messages import Record
 from fractus_services.recording.segment_writer import McapWriter
 from fractus_view import command, server
 from fractus_view.command import ServerOptions, view
-from fractus_view.connections import ConnectionLimit
 from fractus_view.events import Event, Fix, Problem, State, Verdict
 from fractus_view.hub import RECENT, TRAIL, Hub, Trail
 from fractus_view.server import PAGE, ViewServer
@@ -352,7 +352,7 @@ async def test_idle_connections_shut_nobody_out(limited: tuple[int, ViewServer])
 async def test_connection_without_authorized_request_is_closed(
     limited: tuple[int, ViewServer], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("fractus_view.connections.UNAUTHORIZED_TIMEOUT_S", 0.2)
+    monkeypatch.setattr("fractus_runtime.connection_limit.UNAUTHORIZED_TIMEOUT_S", 0.2)
     port, live_view = limited
     async with asyncio.timeout(20):
         reader, writer = await asyncio.open_connection("127.0.0.1", port)

@@ -81,6 +81,7 @@ class Node:
         self.mobility = Mobility()
         self.port = free_port()
         self.metrics = free_port()
+        self.records = free_port()
         self.process: subprocess.Popen[bytes] | None = None
         self._grpc: grpc.Server | None = None
         labels = {"fractus.dev/class": self.class_}
@@ -113,6 +114,7 @@ class Node:
             "FRACTUS_STATE_DIR": str(self.state),
             "FRACTUS_MOBILITY": f"127.0.0.1:{self.port}",
             "FRACTUS_METRICS": f"127.0.0.1:{self.metrics}",
+            "FRACTUS_RECORDS": f"127.0.0.1:{self.records}",
             "MALLOC_ARENA_MAX": "2",
         }
         log = (self.directory / "agent.log").open("ab")

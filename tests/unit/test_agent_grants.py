@@ -562,6 +562,9 @@ class FakeClient:
     def __init__(self, body: dict[str, Any]) -> None:
         self._body = body
 
+    def without_credentials(self) -> Self:
+        return self
+
     def account(self, *_: str) -> Self:
         return self
 

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import click
 from aiohttp import web
+from fractus_runtime.connection_limit import ConnectionLimit
 from fractus_runtime.files import open_file, path_text, read_file
 from fractus_runtime.kubernetes import Client, KubeError, Unconfigured, from_environment, kubeconfig
 from fractus_runtime.loopback import is_loopback
@@ -23,7 +24,6 @@ from prometheus_client import Metric
 
 from fractus_view.base_map import BaseMap, UnsuitableMap, open_map
 from fractus_view.cluster import ClusterSource
-from fractus_view.connections import ConnectionLimit
 from fractus_view.server import ViewServer
 from fractus_view.sources import GrowingRecordings, Replay, Source
 

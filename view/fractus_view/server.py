@@ -14,13 +14,13 @@ from ipaddress import ip_address
 from pathlib import Path
 
 from aiohttp import hdrs, web
+from fractus_runtime.connection_limit import mark_authorized
 from fractus_runtime.metrics import gauge
 from fractus_runtime.page_headers import PAGE_HEADERS
 from fractus_runtime.thumbnails import thumbnail
 from prometheus_client import Counter, Metric
 
 from fractus_view.base_map import MAX_ZOOM, BaseMap, image_type
-from fractus_view.connections import mark_authorized
 from fractus_view.sources import Source
 
 log = logging.getLogger(__name__)

@@ -71,6 +71,7 @@ class NodeObservation:
         audit_heads: Heads of the audit logs.
         recording_problems: Reasons why services other than mobility record nothing although they should.
         gateway_problem: Reason why MAVLink programs cannot fly, empty for none.
+        records_address: Address of the recording endpoint, empty for none.
     """
 
     kind: str
@@ -84,6 +85,7 @@ class NodeObservation:
     audit_heads: Sequence[str] = ()
     recording_problems: Sequence[str] = ()
     gateway_problem: str = ""
+    records_address: str = ""
 
 
 def ready_condition(observed: NodeObservation) -> ConditionUpdate:
@@ -140,6 +142,8 @@ def node_status(observed: NodeObservation, previous: Object, generation: int | N
     if audit_heads:
         status["audit"] = audit_heads
     if observed.kind == "Drone":
+        if observed.records_address:
+            status["recordsAddress"] = observed.records_address
         snapshot = observed.snapshot if observed.telemetry_problem is None else None
         status |= {key: previous[key] for key in ("position", "battery") if key in previous}
         status |= {"flightState": "unknown"} | (_flight_status(snapshot) if snapshot is not None else {})

@@ -16,7 +16,7 @@ from fractus_core.airspace.flight_volumes import HEIGHT_MARGIN_M, enlarged
 from fractus_core.airspace.lifecycle import RESERVING
 from fractus_core.airspace.plan_status import intent_of
 from fractus_core.airspace.volumes import TOLERANCE_M
-from fractus_core.api.flight_plans import FlightPlan, PlanState
+from fractus_core.api.flight_plans import FlightPlan, PlanState, application_name
 from fractus_core.api.geometry import AltitudeBand, Point
 from fractus_core.api.grants import ENDED, ApplicationReference, Grant
 from fractus_core.api.model import Model
@@ -26,7 +26,6 @@ from fractus_core.api.policies import ApplicationSelector, PolicySpec, Zone
 from fractus_core.api.schedules import active_between
 from fractus_core.geo import LocalFrame, area_center, area_polygon
 from fractus_core.planning.grant_compiler import surely_beyond
-from fractus_core.planning.ordered_application import application_name
 from fractus_core.policy.compiled_grant import band_limits_m
 from fractus_core.policy.decision_types import Home
 from fractus_core.policy.selectors import node_attributes, policy_applies

@@ -177,6 +177,11 @@ class FlightWindow(Model):
         return self.begin_s + self.duration * 60
 
 
+def application_name(uid: str) -> str:
+    """Return the name of the Application that flies the flight plan with a uid."""
+    return f"flight-{uid}"
+
+
 class FlightPlanSpec(Model):
     """A flight that a user orders."""
 

@@ -310,6 +310,11 @@ class DroneStatus(OpenModel):
     )
     last_seen: datetime | None = Field(default=None, description="Time of the last report of the agent.")
     audit: tuple[str, ...] = _AUDIT
+    records_address: str | None = Field(
+        default=None,
+        max_length=270,
+        description="HOST:PORT of the agent's recording endpoint; unset: the agent serves no records.",
+    )
     conditions: Conditions = Field(default=(), json_schema_extra=CONDITIONS_BY_TYPE)
 
     @property

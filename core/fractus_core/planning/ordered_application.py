@@ -7,16 +7,11 @@ from typing import Any
 
 from fractus_core.api.applications import Application, ApplicationSpec
 from fractus_core.api.components import Component
-from fractus_core.api.flight_plans import ApplicationTemplate, FlightPlan, FlightPlanSpec
+from fractus_core.api.flight_plans import ApplicationTemplate, FlightPlan, FlightPlanSpec, application_name
 from fractus_core.api.model import API_VERSION, InvalidObject
 
 PARAMETERS = "FLIGHT_PARAMETERS"
 """Environment variable of every container with the parameters of the plan as JSON."""
-
-
-def application_name(uid: str) -> str:
-    """Return the name of the Application that flies the flight plan with a uid."""
-    return f"flight-{uid}"
 
 
 def ordered_application(plan: FlightPlan, template: ApplicationTemplate) -> Application:

@@ -14,7 +14,7 @@ from functools import partial
 
 import aiohttp
 
-from fractus_runtime.kubernetes.access import unchanging, with_tokens
+from fractus_runtime.kubernetes.access import unchanging, with_tokens, without_credentials
 from fractus_runtime.kubernetes.connection import Connection, ContentType, translated
 from fractus_runtime.kubernetes.errors import Conflict, NotFound, from_status
 from fractus_runtime.kubernetes.objects import Body, Key, Kind, key_of
@@ -84,6 +84,10 @@ class Client(Connection):
 
         access = with_tokens(self._access.configuration, token, _TOKEN_LIFE_S / 2)
         return Client(access, self.field_manager, trust_env=self._trust_env)
+
+    def without_credentials(self) -> Client:
+        """Return a client for the same API server without credentials, which must be closed separately."""
+        return Client(without_credentials(self._access.configuration), self.field_manager, trust_env=self._trust_env)
 
     def on_behalf_of(self, token: str) -> Client:
         """Return a client that sends a bearer token instead of the credentials of this client, over the same connections.

@@ -7,6 +7,7 @@ The plugin is a package of its own, because every run of pytest in its environme
 from __future__ import annotations
 
 import hashlib
+import os
 import re
 import shutil
 from collections.abc import Generator, Iterator
@@ -24,6 +25,9 @@ _SCENE = pytest.StashKey["Scene"]()
 _FAILED = pytest.StashKey[bool]()
 _MAX_NAME = 80
 
+BUSY_LOAD = 1.5
+"""Running programs per processor above which services may react too late at a high speedup."""
+
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     """Add the options of the plugin."""
@@ -32,6 +36,10 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         "--fractus-out", type=Path, default=Path("out/tests"), help="Folder of the tests' logs and reports. [out/tests]"
     )
     group.addoption("--fractus-keep", action="store_true", help="Keep the folders of passed tests, with their reports.")
+    group.addoption(
+        "--fractus-speedup", type=float, metavar="X",
+        help="Highest factor of real time of tests with services, whatever their markers contain. Use 1 on a busy computer.",
+    )  # fmt: skip
     group.addoption(
         "--fractus-repeats", type=int, default=1, metavar="N",
         help="Run each test with virtual drones N times, to find tests that do not always pass. [1]",
@@ -86,8 +94,15 @@ def fractus(request: pytest.FixtureRequest, fractus_seed: int, record_property: 
     speedup = fields.get("speedup")
     folder = (config.rootpath / config.getoption("fractus_out")) / _folder_name(request.node.nodeid)
     record_property("fractus_seed", fractus_seed)
+    highest = config.getoption("fractus_speedup")
+    if highest is not None and not highest > 0:
+        raise pytest.UsageError(f"--fractus-speedup {highest:g}: specify a number above 0")
     with Scene(
-        folder, base=request.path.parent, speedup=None if speedup is None else float(speedup), seed=fractus_seed
+        folder,
+        base=request.path.parent,
+        speedup=None if speedup is None else float(speedup),
+        max_speedup=highest,
+        seed=fractus_seed,
     ) as scene:
         request.node.stash[_SCENE] = scene
         yield scene
@@ -114,7 +129,7 @@ def pytest_runtest_makereport(
         lines = scene.write_report()
     except Exception as error:
         lines = [f"folder: {scene.folder}", f"the report could not be written: {error}"]
-    report.sections.append(("fractus", "\n".join(lines)))
+    report.sections.append(("fractus", "\n".join([*lines, *_busy_lines()])))
     if (scene.folder / "map.png").exists():
         item.user_properties.append(("fractus_map", str(scene.folder / "map.png")))
     return report
@@ -135,6 +150,15 @@ def _marker_fields(node: pytest.Item | pytest.Function | Any) -> dict[str, Any]:
         message = f"{node.nodeid}: marker fractus: {problem}; known: {', '.join(sorted(_MARKER_FIELDS))}"
         raise pytest.UsageError(message)
     return dict(marker.kwargs)
+
+
+def _busy_lines() -> list[str]:
+    """Return a remark for the report of a failed test if the computer has too many running programs for its processors."""
+    load = os.getloadavg()[0]
+    processors = os.cpu_count() or 1
+    if load <= BUSY_LOAD * processors:
+        return []
+    return [f"the computer is busy: load {load:.1f} on {processors} processors; try --fractus-speedup 1"]
 
 
 def _folder_name(nodeid: str) -> str:

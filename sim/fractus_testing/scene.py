@@ -74,6 +74,8 @@ autopilot = "autopilot"
 _LOGS = (app, runtime, autopilot)
 
 DEFINITION = "experiment.yaml"
+DEFAULT_SPEEDUP = 4.0
+AS_FAST_AS_POSSIBLE = 0.0
 TRIGGER_TIMEOUT_S = 300.0
 MAX_DURATION_S = 7200.0
 SETTLE_S = 600.0
@@ -483,13 +485,22 @@ class Scene:
         base: Base directory of relative paths of programs and manifests.
     """
 
-    def __init__(self, folder: Path, *, base: Path | None = None, speedup: float | None = None, seed: int = 1) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        *,
+        base: Path | None = None,
+        speedup: float | None = None,
+        max_speedup: float | None = None,
+        seed: int = 1,
+    ) -> None:
         """Create an empty scene.
 
         Args:
             folder: Output folder. It is emptied.
             base: Base directory of relative paths. Default: the working directory.
             speedup: Factor of real time. Default: 4, and as fast as possible for vehicles alone.
+            max_speedup: Highest factor of real time, except for vehicles that fly alone as fast as possible.
             seed: Seed of noise and wind.
 
         Raises:
@@ -498,6 +509,7 @@ class Scene:
         self.folder = folder.absolute()
         self.base = base or Path.cwd()
         self.speedup = speedup
+        self.max_speedup = max_speedup
         self.seed = seed
         self.lines: list[str] = []
         self._drones: list[VirtualDrone] = []
@@ -861,10 +873,14 @@ class Scene:
         if alone and len(alone) < len(self._drones):
             others = ", ".join(drone.name for drone in self._drones if not drone.task)
             raise ExperimentError(f"set_task() flies vehicles alone, so all drones need it; missing: {others}")
-        speedup = self.speedup if self.speedup is not None else 4.0
+        speedup = self.speedup
+        if speedup is None:
+            speedup = AS_FAST_AS_POSSIBLE if alone else DEFAULT_SPEEDUP
+        if self.max_speedup is not None:
+            speedup = min(speedup, self.max_speedup)
         content: dict[str, Any] = {
             "name": _slug(self.folder.name), "mode": "vehicles" if alone else "standalone", "seed": self.seed,
-            "speedup": (self.speedup or 0.0) if alone else speedup, "timeout": MAX_DURATION_S, "wind": self._wind,
+            "speedup": speedup, "timeout": MAX_DURATION_S, "wind": self._wind,
             "vehicles": [self._vehicle(drone) for drone in self._drones],
             "faults": [fault for drone in self._drones for fault in drone.faults],
         }  # fmt: skip

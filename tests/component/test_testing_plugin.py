@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -50,6 +51,24 @@ def test_failed_test_shows_its_artifacts_and_keeps_its_folder(pytester: pytest.P
     properties = {p.get("name"): p.get("value") for p in ET.parse(pytester.path / "junit.xml").iter("property")}
     assert properties == {"fractus_seed": "3", "fractus_folder": str(folder), "fractus_map": f"{folder}/map.png"}
     assert (folder / "summary.md").exists()
+
+
+@pytest.mark.parametrize(("load", "shown"), [(64.0, True), (0.5, False)])
+def test_failed_test_shows_if_the_computer_is_busy(
+    pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch, load: float, shown: bool
+) -> None:
+    monkeypatch.setattr(os, "getloadavg", lambda: (load, 0.0, 0.0))
+    monkeypatch.setattr(os, "cpu_count", lambda: 2)
+    pytester.makepyfile("def test_nothing(fractus):\n    fractus.vDrone('vDrone-1').start_app()\n")
+    text = pytester.runpytest_inprocess().stdout.str()
+    assert ("the computer is busy: load 64.0 on 2 processors; try --fractus-speedup 1" in text) is shown
+
+
+def test_speedup_above_zero_is_required(pytester: pytest.Pytester) -> None:
+    pytester.makepyfile("def test_nothing(fractus): pass")
+    result = pytester.runpytest_inprocess("--fractus-speedup", "0")
+    assert result.ret != 0
+    result.stdout.fnmatch_lines(["*--fractus-speedup 0: specify a number above 0*"])
 
 
 def test_passed_test_leaves_its_folder_only_on_request(pytester: pytest.Pytester) -> None:

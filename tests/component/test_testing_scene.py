@@ -206,6 +206,35 @@ def test_configuration_cannot_change_after_the_start(scene: Scene) -> None:
         drone.set_pos(HOME)
 
 
+@pytest.mark.parametrize(
+    ("speedup", "highest", "expected"), [(None, None, 4), (None, 1, 1), (8, 2, 2), (1, 2, 1), (8, None, 8)]
+)
+def test_speedup_of_services_is_limited(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, speedup: float | None, highest: float | None, expected: float
+) -> None:
+    monkeypatch.setattr(fractus_testing.scene, "ExperimentRun", lambda *_arguments, **_options: Mock())
+    scene = Scene(tmp_path / "scene", speedup=speedup, max_speedup=highest)
+    drone = scene.vDrone("vDrone-1")
+    drone.set_pos(HOME)
+    drone.set_plan(FlightPlan(path=PATH))
+    drone.set_app("pilot.py")
+    scene.start()
+    assert load(scene.folder / "experiment.yaml").speedup == expected
+
+
+@pytest.mark.parametrize(("speedup", "expected"), [(None, 0), (8, 2)])
+def test_vehicles_alone_stay_in_lockstep_if_the_speedup_is_limited(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, speedup: float | None, expected: float
+) -> None:
+    monkeypatch.setattr(fractus_testing.scene, "ExperimentRun", lambda *_arguments, **_options: Mock())
+    scene = Scene(tmp_path / "scene", speedup=speedup, max_speedup=2)
+    drone = scene.vDrone("vDrone-1")
+    drone.set_pos(HOME)
+    drone.set_task(*TASK)
+    scene.start()
+    assert load(scene.folder / "experiment.yaml").speedup == expected
+
+
 def test_networks_are_written_to_the_experiment(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fractus_testing.scene, "require_networks", lambda: None)
     controller = scene.vController()

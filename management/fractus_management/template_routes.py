@@ -8,10 +8,11 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Query, Response
 from fastapi.responses import JSONResponse
 from fractus_core.api import ApplicationTemplate, FlightPlan, InvalidObject
-from fractus_core.api.flight_plans import ApplicationTemplateSpec, PlanFinding, PlanState
+from fractus_core.api.flight_plans import PARAMETERS_INVALID, ApplicationTemplateSpec, PlanFinding, PlanState
 from fractus_core.api.model import Model
 from fractus_core.api.names import Name
 from fractus_core.api.plans import Alternative, Rejection
+from fractus_core.planning.flight_parameters import check_parameter_schema
 from fractus_runtime.kubernetes import Body
 from pydantic import Field, WrapValidator
 
@@ -74,6 +75,10 @@ async def list_apps(caller: CallerOf, limit: Limit = 100, continue_: Continue = 
 )
 async def publish_app(caller: CallerOf, template: NewTemplate) -> Response:
     """Publish an application. Users can order it after an authority has approved it."""
+    try:
+        check_parameter_schema(template.spec.parameters)
+    except InvalidObject as error:
+        raise invalid(InvalidObject(f"spec.{error.field}", error.problem)) from None
     created = await caller.client.create(TEMPLATE, {**TEMPLATE.header(template.name), "spec": template.spec.to_dict()})
     headers = {"Location": f"/v1/apps/{template.name}", "ETag": f'"{created["metadata"]["resourceVersion"]}"'}
     return JSONResponse(public(created, TEMPLATE), HTTPStatus.CREATED, headers)
@@ -122,5 +127,10 @@ async def match_drones(
     except InvalidObject as error:
         raise invalid(error) from None
     status = (await dry_run(caller, plan, namespace))["status"]
-    parts = {part: status.get(part) or [] for part in ("rejected", "refusals")}
-    return JSONResponse({"state": status["state"], "suitable": status.get("candidates") or [], **parts})
+    # The question contains no parameters.
+    refusals = [each for each in status.get("refusals") or [] if each["reason"] != PARAMETERS_INVALID]
+    candidates = status.get("candidates") or []
+    state = "Accepted" if candidates and not refusals and status["state"] == "Rejected" else status["state"]
+    suitable = [] if refusals else candidates
+    rejected = status.get("rejected") or []
+    return JSONResponse({"state": state, "suitable": suitable, "rejected": rejected, "refusals": refusals})

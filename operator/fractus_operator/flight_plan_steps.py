@@ -13,8 +13,9 @@ from fractus_core.airspace.plan_status import PRIORITIES, intent_of, plan_findin
 from fractus_core.airspace.volumes import utc
 from fractus_core.api import Application, ApplicationTemplate, FlightPlan, InvalidObject
 from fractus_core.api.conditions import ConditionUpdate
-from fractus_core.api.flight_plans import FlightPlanStatus, PlanFinding, PlanState, ReservedVolume
-from fractus_core.api.plans import Rejection
+from fractus_core.api.flight_plans import PARAMETERS_INVALID, FlightPlanStatus, PlanFinding, PlanState, ReservedVolume
+from fractus_core.api.plans import Alternative, Rejection
+from fractus_core.planning.flight_parameters import check_parameters
 from fractus_core.planning.inventory import Inventory, Settings
 
 from fractus_operator.flight_matching import SOON_S, Match, Unfit, application_of, match_flight
@@ -157,11 +158,23 @@ def _decide_new(now: PlanSituation) -> PlanStep:
         needed = ConditionUpdate("ActionNeeded", "True", "ChoicesMissing", message, adverse=True)
         return PlanStep(status, (needed,))
     intent = _intent(now, "Accepted", match.volumes)
-    decision = decide(intent, None, now.airspace, now.now_s)
-    if not decision.accepted:
-        refusals = tuple(map(plan_finding, decision.refusals))
-        return _rejected(now, Unfit(refusals[0].reason, refusals[0].message), refusals)
+    refusals = _refusals(now, intent, None)
+    if refusals:
+        return _rejected(now, Unfit(refusals[0].reason, refusals[0].message), refusals, match.candidates)
     return _accepted(now, match, intent)
+
+
+def _refusals(
+    now: PlanSituation, intent: OperationalIntent, before: OperationalIntent | None
+) -> tuple[PlanFinding, ...]:
+    """Return why a plan for which a drone was found is refused: its parameters, and conflicts with other plans."""
+    findings = tuple(map(plan_finding, decide(intent, before, now.airspace, now.now_s).refusals))
+    assert now.template is not None, "a drone was found for an application of the template"
+    try:
+        check_parameters(now.plan, now.template)
+    except InvalidObject as error:
+        return (PlanFinding(reason=PARAMETERS_INVALID, message=str(error)), *findings)
+    return findings
 
 
 def _check_change(now: PlanSituation) -> PlanStep | None:
@@ -199,7 +212,12 @@ def _accepted(now: PlanSituation, match: Match, intent: OperationalIntent) -> Pl
     return PlanStep(status, _conditions(status), next_s=_until_start_s(now))
 
 
-def _rejected(now: PlanSituation, unfit: Unfit, refusals: tuple[PlanFinding, ...] = ()) -> PlanStep:
+def _rejected(
+    now: PlanSituation,
+    unfit: Unfit,
+    refusals: tuple[PlanFinding, ...] = (),
+    candidates: tuple[Alternative, ...] = (),
+) -> PlanStep:
     refusals = refusals or (PlanFinding(reason=unfit.reason, message=unfit.message),)
     status = FlightPlanStatus(
         observed_generation=now.plan.metadata.generation,
@@ -207,6 +225,7 @@ def _rejected(now: PlanSituation, unfit: Unfit, refusals: tuple[PlanFinding, ...
         state="Rejected",
         message=unfit.message,
         priority_class=now.plan.spec.priority_class,
+        candidates=candidates if now.plan.spec.dry_run else (),
         rejected=unfit.rejected,
         refusals=refusals,
     )
@@ -243,9 +262,9 @@ def _redecide(now: PlanSituation) -> PlanStep:
     if message := match.choices_problem:
         return _refuse_change(now, (PlanFinding(reason="ChoicesMissing", message=message),))
     intent = _intent(now, "Accepted", match.volumes)
-    decision = decide(intent, before, now.airspace, now.now_s)
-    if not decision.accepted:
-        return _refuse_change(now, tuple(map(plan_finding, decision.refusals)))
+    refusals = _refusals(now, intent, before)
+    if refusals:
+        return _refuse_change(now, refusals)
     return _accepted(now, match, intent)
 
 
@@ -286,12 +305,13 @@ def _activate(now: PlanSituation) -> PlanStep:
             return _rejected(now, unfit)
         return _not_startable(now, unfit.reason, unfit.message, unfit.rejected)
     intent = _intent(now, "Activated", match.volumes)
-    decision = decide(intent, intent_of(now.plan), now.airspace, now.now_s)
+    refusals = _refusals(now, intent, intent_of(now.plan))
     if message := match.choices_problem:
         return _not_startable(now, "ChoicesMissing", message)
-    if not decision.accepted:
-        finding = decision.refusals[0]
-        return _not_startable(now, finding.reason, finding.message)
+    if refusals and refusals[0].reason == PARAMETERS_INVALID and now.state == "Accepted":
+        return _rejected(now, Unfit(refusals[0].reason, refusals[0].message), refusals)
+    if refusals:
+        return _not_startable(now, refusals[0].reason, refusals[0].message)
     status = _status_of(now, match, "Activated", f"{match.drone} starts the flight").model_copy(
         update={"application": match.application.name, "advisories": match.advisories + _overlaps(intent, now)}
     )

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from datetime import datetime
 
-from fractus_core.api import ApplicationTemplate
+from fractus_core.api import ApplicationTemplate, InvalidObject
 from fractus_core.api.conditions import ConditionUpdate, merge_conditions
+from fractus_core.planning.flight_parameters import check_parameter_schema
 
 from fractus_operator.cache import ClusterCache
 from fractus_operator.kinds import APPLICATION_TEMPLATE, Key
@@ -49,6 +50,11 @@ class TemplateController:
 def _readiness(template: ApplicationTemplate) -> ConditionUpdate:
     approval = template.status.approval if template.status is not None else None
     generation = template.metadata.generation
+    try:
+        check_parameter_schema(template.spec.parameters)
+    except InvalidObject as error:
+        message = f"spec.{error}"
+        return ConditionUpdate("Ready", "False", "InvalidSchema", message)
     if approval is not None and template.approved:
         return ConditionUpdate("Ready", "True", "Approved", f"{approval.by} has approved generation {generation}")
     message = (

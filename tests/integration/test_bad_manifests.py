@@ -112,6 +112,7 @@ BAD: list[tuple[str, Body, str]] = [
     ("flight to waypoints and a region", flight(region=DISC, stay=5), "give either waypoints or region, and only one of them"),
     ("flight to a region without stay", flight(waypoints=None, region=DISC), "a region needs stay"),
     ("flight that stays at waypoints", flight(stay=5), "a region needs stay"),
+    ("check of a change that is no dry run", flight(changeOf="morning"), "only a dry run may have changeOf"),
     ("flight without a window", flight(window=None), "spec.window"),
     ("flight of no duration", flight(window=WINDOW | {"duration": 0}), "spec.window.duration"),
     ("flight of two days", flight(window=WINDOW | {"duration": 2881}), "spec.window.duration"),

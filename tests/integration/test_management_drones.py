@@ -80,6 +80,29 @@ def test_application_lists_suitable_drones_and_reasons_for_others(pilot: User, w
     assert match["refusals"][0]["reason"] == "Conflict"
 
 
+def test_template_with_invalid_schema_is_refused(authority: User, world: World) -> None:
+    template = world.api.get(f"{FRACTUS}/applicationtemplates/survey")
+    assert template is not None
+    spec = template["spec"] | {"parameters": {"properties": {"speed": {"type": "float"}}}}
+    (reason,) = problem(authority("POST", "/v1/apps", {"name": "other", "spec": spec}), 422)
+    assert reason["field"] == "spec.parameters.properties.speed.type"
+
+
+def test_drones_of_an_application_do_not_depend_on_its_parameters(pilot: User, world: World) -> None:
+    world.api.merge(f"{FRACTUS}/applicationtemplates/survey", {"spec": {"parameters": {"required": ["speed"]}}})
+    approval = {"generation": 2, "by": "admin", "at": "2026-01-01T00:00:00Z"}
+    world.api.merge(f"{FRACTUS}/applicationtemplates/survey/status", {"status": {"approval": approval}})
+
+    def refused() -> bool:
+        checked = pilot("POST", "/v1/plans:check", plan()).body["status"]
+        return [each["reason"] for each in checked.get("refusals", ())] == ["ParametersInvalid"]
+
+    wait_for(refused, "the operator to know the changed template")
+    match = pilot("GET", f"/v1/apps/survey/drones?{query()}").body
+    assert (match["state"], len(match["suitable"]), match["refusals"]) == ("Accepted", 1, [])
+    assert submitted(pilot, parameters={"speed": 2}).body["status"]["state"] == "Accepted"
+
+
 @pytest.mark.parametrize(
     ("parameters", "field"),
     [({"area": "north"}, "area"), ({"duration": "0"}, "duration"), ({"start": "tomorrow"}, "window.start")],

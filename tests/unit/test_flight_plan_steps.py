@@ -24,6 +24,7 @@ END_S = BEGIN_S + 600
 DAY_BEFORE_S = BEGIN_S - 86_400
 DRONE = located("d")
 STOCK = inventory([DRONE])
+PARAMETERS = {"properties": {"speed": {"type": "number", "maximum": 10}}}
 
 
 def situation(plan=None, now_s=DAY_BEFORE_S, *, stock=STOCK, airspace=None, mission=None, using=None):
@@ -101,6 +102,28 @@ def test_plan_without_template_is_rejected_with_the_remedy():
     step = plan_step(replace(situation(), template=None))
     assert step.status.state == "Rejected"
     assert "apply it, or correct spec.template" in step.status.message
+
+
+def test_plan_whose_parameters_violate_the_schema_is_rejected_with_the_parameter():
+    using = template(parameters=PARAMETERS)
+    step = plan_step(situation(flight(parameters={"speed": 30}), using=using))
+    assert (step.status.state, step.status.refusals[0].reason) == ("Rejected", "ParametersInvalid")
+    assert step.status.message.startswith("parameters.speed: 30 is greater than the maximum of 10")
+    assert plan_step(situation(flight(parameters={"speed": 3}), using=using)).status.state == "Accepted"
+
+
+def test_change_to_parameters_that_violate_the_schema_is_refused():
+    using = template(parameters=PARAMETERS)
+    before = accepted(flight(parameters={"speed": 3}), using=using)
+    step = plan_step(situation(changed(before, parameters={"speed": 30}), using=using))
+    assert (step.status.state, conditions(step)["ChangeRefused"]) == ("Accepted", ("True", "ParametersInvalid"))
+
+
+def test_plan_whose_parameters_violate_a_changed_schema_is_rejected_at_its_start():
+    plan = accepted(flight(parameters={"speed": 3}, use="InUse"), using=template(parameters=PARAMETERS))
+    slower = template(parameters={"properties": {"speed": {"maximum": 2}}})
+    step = plan_step(situation(plan, BEGIN_S, using=slower))
+    assert (step.status.state, step.start) == ("Rejected", None)
 
 
 def test_plan_whose_window_is_over_is_rejected():

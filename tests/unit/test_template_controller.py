@@ -31,10 +31,10 @@ class Api:
         self.events.append((reason, warning))
 
 
-def controller(approved: int | None) -> tuple[Api, ClusterCache, TemplateController]:
+def controller(approved: int | None, **spec: Any) -> tuple[Api, ClusterCache, TemplateController]:
     api = Api()
     cache = ClusterCache(cast(Store, None))
-    cache.templates.record_write(KEY, template(approved=approved).to_dict())
+    cache.templates.record_write(KEY, template(approved=approved, **spec).to_dict())
     return api, cache, TemplateController(cast(Any, api), cache, lambda: datetime(2026, 6, 1, tzinfo=UTC))
 
 
@@ -66,3 +66,12 @@ async def test_unchanged_template_is_not_written_again() -> None:
     cache.templates.record_write(KEY, body)
     await templates.reconcile(KEY)
     assert len(api.written) == 1
+
+
+async def test_template_with_invalid_schema_of_parameters_is_not_ready() -> None:
+    api, _, templates = controller(3, parameters={"properties": {"speed": {"type": "float"}}})
+    await templates.reconcile(KEY)
+    ((condition,),) = [status["conditions"] for status in api.written]
+    assert (condition["status"], condition["reason"]) == ("False", "InvalidSchema")
+    assert condition["message"].startswith("spec.parameters.properties.speed.type: 'float' is not valid")
+    assert api.events == [("InvalidSchema", True)]

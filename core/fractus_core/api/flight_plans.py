@@ -36,6 +36,9 @@ Draft: not decided. Rejected: not permitted. Accepted: reserves its volumes. Act
 volumes, or late. Contingent: the system has taken the drone and ends the flight. Ended: over.
 """
 
+PARAMETERS_INVALID = "ParametersInvalid"
+"""Reason of a refusal: the parameters of the plan do not fit the schema of the template."""
+
 PriorityClass = Literal["normal", "elevated", "emergency"]
 
 FreeObject = Annotated[dict[str, Any], WithJsonSchema({"type": "object", "x-kubernetes-preserve-unknown-fields": True})]
@@ -72,7 +75,8 @@ class ApplicationTemplateSpec(Model):
     altitudes: FlightAltitudes
     parameters: FreeObject = Field(
         default_factory=dict,
-        description="JSON schema (2020-12) of the parameters of a plan; empty: no parameters.",
+        description="JSON schema (2020-12) of the parameters of a plan, at most 16 KiB; empty: no parameters. The keywords $ref,"
+        " $dynamicRef, pattern, patternProperties, unevaluatedItems, unevaluatedProperties and uniqueItems are not permitted.",
     )
     template: ApplicationSpec = Field(
         description="Application that flies. The waypoints or the region of a plan replace those of its driver or of its points"

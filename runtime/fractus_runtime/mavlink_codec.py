@@ -280,11 +280,13 @@ class Endpoint:
 
     Attributes:
         parser: Parser of the received bytes.
+        mavlink1: True to encode MAVLink 1 frames. Extension fields are omitted.
     """
 
     def __init__(self, sysid: int, compid: int, *, saturate: bool = False) -> None:
         self.sysid = sysid
         self.compid = compid
+        self.mavlink1 = False
         self._saturate = saturate
         self._protocol = _Protocol(None, srcSystem=sysid, srcComponent=compid)
         self.parser = Parser(protocol=self._protocol)
@@ -310,11 +312,11 @@ class Endpoint:
         self._protocol.signing = signing
 
     def encode(self, name: str, values: Mapping[str, Value]) -> bytes:
-        """Return one MAVLink 2 frame with the next sequence number. Fields that are not given are zero.
+        """Return one frame with the next sequence number. Fields that are not given are zero.
 
         Raises:
             UnknownMessageError: The dialect has no such message.
-            struct.error: A value does not fit its field.
+            struct.error: A value does not fit its field, or the id of the message does not fit into MAVLink 1.
             OverflowError: A number does not fit a float field.
         """
         kind = message_class(name)
@@ -322,15 +324,27 @@ class Endpoint:
             _padded(values.get(field, default), default) if isinstance(default, tuple) else values.get(field, default)
             for field, default in _default_fields(name).items()
         ]
+        message = kind(*fields)  # type: ignore[arg-type]  # pymavlink has no types
         try:
-            frame = kind(*fields).pack(self._protocol)  # type: ignore[arg-type]  # pymavlink has no types
+            frame = message.pack(self._protocol, force_mavlink1=self.mavlink1)
         except (struct.error, OverflowError):
             if not self._saturate:
                 raise
             fields = [_saturated(type_, value) for type_, value in zip(kind.fieldtypes, fields, strict=True)]
-            frame = kind(*fields).pack(self._protocol)  # type: ignore[arg-type]  # pymavlink has no types
+            message = kind(*fields)  # type: ignore[arg-type]  # pymavlink has no types
+            frame = message.pack(self._protocol, force_mavlink1=self.mavlink1)
+        if self.mavlink1:
+            frame = self._without_extensions(kind, frame)
         self._protocol.seq = (self._protocol.seq + 1) & 0xFF
         return bytes(frame)
+
+    @staticmethod
+    def _without_extensions(kind: type[mavlink.MAVLink_message], frame: bytes) -> bytes:
+        """Return a MAVLink 1 frame without the extension fields, which pymavlink encodes too."""
+        length = _base_length(kind.id)
+        body = bytes((length,)) + frame[2 : mavlink.HEADER_LEN_V1 + length]
+        checksum = mavlink.x25crc(body + bytes((kind.crc_extra,))).crc
+        return frame[:1] + body + struct.pack("<H", checksum)
 
     def decode(self, data: bytes) -> list[Message]:
         """Return the messages that these bytes complete."""
@@ -374,6 +388,15 @@ def _default_fields(name: str) -> Mapping[str, Value]:
         else:
             defaults[field] = 0
     return defaults
+
+
+@functools.cache
+def _base_length(message_id: int) -> int:
+    """Return the payload length of a message in MAVLink 1, which has no extension fields."""
+    # Imported only if a peer uses MAVLink 1, because the dialect needs 5 MB of memory.
+    from pymavlink.dialects.v10 import ardupilotmega as mavlink1  # noqa: PLC0415
+
+    return int(mavlink1.mavlink_map[message_id].unpacker.size)
 
 
 def _padded(value: Value, default: tuple[Scalar, ...]) -> tuple[Scalar, ...]:

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 from fractus_proto.v1 import types_pb2
-from fractus_runtime.mavlink_codec import Endpoint, Parser
+from fractus_runtime.mavlink_codec import Endpoint, Parser, message_id
 from fractus_services.gateway.session import Call, Session
 from gateway_session_world import ARMED, HOME, World
 from hypothesis import given
@@ -306,6 +306,32 @@ def test_application_with_heartbeats_is_silent_after_five_seconds() -> None:
     world.send("HEARTBEAT", type=6, autopilot=8)
     assert not world.session.silent(world.now + 4.9)
     assert world.session.silent(world.now + 5.1)
+
+
+def _first_bytes(frames: bytes) -> set[int]:
+    return {message.frame[0] for message in Parser().feed(frames)}
+
+
+def test_program_receives_mavlink_1_until_it_sends_mavlink_2() -> None:
+    world = World()
+    world.session.send_text(mavlink.MAV_SEVERITY_INFO, "before the first frame", world.now)
+    assert _first_bytes(world.session.take()) == {mavlink.PROTOCOL_MARKER_V2}
+    world.program.mavlink1 = True
+    world.send("HEARTBEAT", type=6)
+    world.command(mavlink.MAV_CMD_REQUEST_MESSAGE, mavlink.MAVLINK_MSG_ID_HOME_POSITION)
+    assert _first_bytes(world.session.take()) == {mavlink.PROTOCOL_MARKER_V1}
+    world.program.mavlink1 = False
+    world.send("PING")
+    assert _first_bytes(world.session.take()) == {mavlink.PROTOCOL_MARKER_V2}
+
+
+def test_message_that_mavlink_1_does_not_define_is_not_sent_to_its_programs() -> None:
+    world = World()
+    world.report("GIMBAL_DEVICE_ATTITUDE_STATUS")
+    world.program.mavlink1 = True
+    for name in ("GIMBAL_DEVICE_ATTITUDE_STATUS", "HOME_POSITION"):
+        world.command(mavlink.MAV_CMD_REQUEST_MESSAGE, message_id(name))
+    assert [message.name for message in world.sent()] == ["COMMAND_ACK", "HOME_POSITION", "COMMAND_ACK"]
 
 
 def test_message_for_another_component_is_ignored() -> None:

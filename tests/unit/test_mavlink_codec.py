@@ -23,6 +23,7 @@ from fractus_runtime.mavlink_codec import (
 from hypothesis import given
 from hypothesis import strategies as st
 from mavlink_frames import MESSAGE_CLASSES, MessageClass, frame_v1, frame_v2
+from pymavlink.dialects.v10 import ardupilotmega as v10
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 KEY = hashlib.sha256(b"secret").digest()
@@ -128,6 +129,21 @@ def test_mavlink_1_is_decoded() -> None:
     payload = struct.pack("<IBBBBB", 4, 6, 8, 0, 3, 3)
     (received,) = Parser().feed(frame_v1(mavlink.MAVLink_heartbeat_message, payload))
     assert (received.name, received.integer("custom_mode"), received.integer("type")) == ("HEARTBEAT", 4, 6)
+
+
+@pytest.mark.parametrize("kind", [kind for kind in MESSAGE_CLASSES if kind.id in v10.mavlink_map])
+def test_mavlink_1_frame_contains_no_extension_fields(kind: MessageClass) -> None:
+    endpoint = Endpoint(1, 1)
+    endpoint.mavlink1 = True
+    values = random_values(kind, random.Random(kind.id))
+    frame = endpoint.encode(kind.msgname, values)
+    receiver = v10.MAVLink(None)
+    decoded = receiver.decode(bytearray(frame))
+    assert decoded.get_type() == kind.msgname
+    assert len(frame) == 8 + v10.mavlink_map[kind.id].unpacker.size
+    (message,) = Parser().feed(frame)
+    base = v10.mavlink_map[kind.id].fieldnames
+    assert {name: message.values[name] for name in base} == {name: values[name] for name in base}
 
 
 @pytest.mark.parametrize("length", [0, 1, 8, 9, 20, 255])

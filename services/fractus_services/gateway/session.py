@@ -190,6 +190,7 @@ class Session:
         self._texts_at = -math.inf
         self._velocity = _VelocityRate()
         self._heartbeat_at = -math.inf
+        self._versions: set[int] = set()  # first bytes of the received frames
         self._list_requested = False
         self._busy_until = -math.inf
         self.refusals: list[Refusal] = []
@@ -209,6 +210,8 @@ class Session:
         for message in messages:
             self.frames += 1
             self._record(message.frame)
+            self._versions.add(message.frame[0])
+            self._channel.mavlink1 = self._versions == {mavlink.PROTOCOL_MARKER_V1}
             if not _addresses_vehicle(message):
                 self._count("consume")
                 continue

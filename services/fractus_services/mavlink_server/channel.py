@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from fractus_runtime.mavlink_codec import Endpoint, Message, Value
+from fractus_runtime.mavlink_codec import Endpoint, Message, Value, message_id
 
 # Maximum size of queued frames for a client that does not read. Frames beyond it are dropped, as on a radio link.
 OUTBOX_LIMIT = 256 * 1024
@@ -14,6 +14,7 @@ PARAMETERS_PER_TICK = 23
 # Tolerance for rounding: sums of intervals differ slightly from multiples of the step.
 TIME_SLACK_S = 1e-6
 IMMEDIATELY = -1e9
+MAX_MAVLINK1_ID = 255
 
 
 @dataclass(slots=True)
@@ -61,7 +62,9 @@ class Channel(Endpoint):
         return messages
 
     def send(self, name: str, values: Mapping[str, Value]) -> None:
-        """Encode and queue a message of this vehicle."""
+        """Encode and queue a message of this vehicle, unless the link uses MAVLink 1, which does not define the message."""
+        if self.mavlink1 and message_id(name) > MAX_MAVLINK1_ID:
+            return
         frame = self.encode(name, values)
         if self._tap is not None:
             self._tap(frame)

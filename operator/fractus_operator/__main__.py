@@ -99,6 +99,7 @@ async def run(settings: Settings, stop: asyncio.Event | None = None) -> None:
             (kinds.DRONE, flights.drone_changed),
         ):
             cache.add_listener(kind, listener)
+        cache.add_flight_rules_listener(flights.rules_changed)
         links = LinkEventRecorder(store, _now)
         parts: list[Coroutine[Any, Any, None]] = [
             *(informer.run() for informer in (*cache.informers, links.informer)),

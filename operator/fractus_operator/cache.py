@@ -144,6 +144,7 @@ class ClusterCache:
         self.torn_down: dict[Key, str] = {}
         self.rules_revision = 0
         self._listeners: dict[Kind, list[Callable[[Key], None]]] = {}
+        self._flight_rules_listeners: list[Callable[[Key], None]] = []
         self._grants: GroupedObjects[Grant] = GroupedObjects()
         self._known_grants: dict[Key, Grant] = {}
         self._pods: GroupedObjects[PodView] = GroupedObjects()
@@ -166,6 +167,10 @@ class ClusterCache:
     def add_listener(self, kind: Kind, listener: Callable[[Key], None]) -> None:
         """Call the listener with the key of every object of the kind that is created, changed or deleted."""
         self._listeners.setdefault(kind, []).append(listener)
+
+    def add_flight_rules_listener(self, listener: Callable[[Key], None]) -> None:
+        """Call the listener with the key of every FlightPlan that a changed policy or zone may concern."""
+        self._flight_rules_listeners.append(listener)
 
     # -- reading --
 
@@ -379,9 +384,25 @@ class ClusterCache:
 
     def _zone_changed(self, key: Key, old: Zone | Unreadable | None, new: Zone | Unreadable | None) -> None:
         self._spec_changed(kinds.ZONE, key, old, new)
+        self._restriction_changed([each for each in (old, new) if isinstance(each, Zone)], old, new)
 
     def _policy_changed(self, key: Key, old: Policy | Unreadable | None, new: Policy | Unreadable | None) -> None:
         self._spec_changed(kinds.POLICY, key, old, new)
+        selected = [policy.spec.selector.zones for policy in (old, new) if isinstance(policy, Policy)]
+        # A policy without zones applies everywhere.
+        if all(selected):
+            named = [self.zones.get(("", name)) for names in selected for name in names]
+            self._restriction_changed([zone for zone in named if isinstance(zone, Zone)], old, new)
+        else:
+            self._restriction_changed(None, old, new)
+
+    def _restriction_changed(self, zones: Sequence[Zone] | None, old: Any, new: Any) -> None:
+        """Report the flight plans that a changed policy or zone may concern. Zones of None concern all plans."""
+        if not self.flight_plans.synced.is_set() or (old is not None and new is not None and old.spec == new.spec):
+            return
+        for plan in self.flights.keys() if zones is None else self.flights.in_zones(zones):
+            for listener in self._flight_rules_listeners:
+                listener(plan)
 
     def _spec_changed(self, kind: Kind, key: Key, old: Any, new: Any) -> None:
         self._notify(kind, key)

@@ -20,6 +20,9 @@ from fractus_core.validation import check_application
 SOON_S = 300.0
 """Seconds before the window of a plan from which the present state and charge of drones matter."""
 
+POLICY_CONFLICT = "PolicyConflict"
+"""Reason of a rejection or an advisory: policies do not allow the route."""
+
 _MAX_REJECTED = 100
 """Maximum number of rejected drones in a status, so that it fits into a Kubernetes object."""
 
@@ -218,20 +221,27 @@ def _restrictions(
 def _policy_conflicts(
     application: Application, planned: DeploymentPlanSpec, inventory: Inventory, settings: Settings
 ) -> tuple[PlanFinding, ...]:
-    """Return the conflicts of the route with policies at the begin and at the end of the window.
+    """Return the conflicts of the route with policies at the begin, at the end, or in between in the window.
 
     Raises:
-        Unfit: The policies do not allow the route at both times, or conflicts are forbidden.
+        Unfit: The policies do not allow the route at the begin and at the end, or conflicts are forbidden.
     """
-    later = with_legality(application, planned, inventory, replace(settings, time_s=settings.until_s))
+    mission = planned.drone.mission if planned.drone is not None else None
+    assert settings.time_s is not None and settings.until_s is not None, "the window of a flight plan"
+    # The latest flight ends with the window.
+    last_s = max(settings.until_s - mission.duration * 60, settings.time_s) if mission is not None else settings.time_s
+    later = with_legality(application, planned, inventory, replace(settings, time_s=last_s))
     conflicts = [
         (when, checked.drone.policy_conflict)
-        for when, checked in (("begin", planned), ("end", later))
+        for when, checked in (("at the begin of", planned), ("at the end of", later))
         if checked.drone is not None and checked.drone.policy_conflict is not None
     ]
+    if not conflicts:
+        always = with_legality(application, planned, inventory, settings, throughout=True)
+        if always.drone is not None and always.drone.policy_conflict is not None:
+            conflicts = [("in a part of", always.drone.policy_conflict)]
     if len(conflicts) == 2 or (conflicts and settings.policy_conflicts == "forbid"):
-        raise Unfit("PolicyConflict", conflicts[0][1])
+        raise Unfit(POLICY_CONFLICT, conflicts[0][1])
     return tuple(
-        PlanFinding(reason="PolicyConflict", message=f"at the {when} of the window, {message}")
-        for when, message in conflicts
+        PlanFinding(reason=POLICY_CONFLICT, message=f"{when} the window, {message}") for when, message in conflicts
     )

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import math
+import random
 from collections.abc import Callable
 from dataclasses import replace
 from datetime import datetime
@@ -18,7 +20,7 @@ from fractus_operator import kinds
 from fractus_operator.cache import ClusterCache
 from fractus_operator.flight_matching import SOON_S
 from fractus_operator.flight_plan_index import reserved_flight
-from fractus_operator.flight_plan_steps import FLYING, STARTED, PlanSituation, PlanStep, plan_step
+from fractus_operator.flight_plan_steps import FLYING, RECHECK_S, STARTED, PlanSituation, PlanStep, plan_step
 from fractus_operator.flight_progress import FlownMission
 from fractus_operator.kinds import Body, Key
 from fractus_operator.labels import FINALIZER, LANDING_FINALIZER
@@ -58,11 +60,18 @@ class FlightPlanController:
         self._timers: dict[Key, asyncio.TimerHandle] = {}
         self._seen: set[str] = set()
         """Uids of plans whose Applications this process has observed."""
+        self._judge_at: dict[Key, float] = {}
+        """Monotonic time at which the policies of an accepted plan are judged again; infinite: when they change."""
 
     # -- changes of inputs --
 
     def changed(self, key: Key) -> None:
         """Handle a change of a plan, or of a plan that overlaps it."""
+        self.work_queue.add(key)
+
+    def rules_changed(self, key: Key) -> None:
+        """Handle a change of policies or zones at the place of a plan."""
+        self._judge_at[key] = 0.0
         self.work_queue.add(key)
 
     def application_changed(self, key: Key) -> None:
@@ -96,11 +105,17 @@ class FlightPlanController:
             timer.cancel()
         plan = self._cache.flight_plans.get(key)
         if plan is None or isinstance(plan, Unreadable):
+            self._judge_at.pop(key, None)
             return
         now = self._clock()
         if plan.spec.dry_run and await self._expire(plan, now):
             return
-        step = plan_step(self._situation(plan, now))
+        loop = asyncio.get_running_loop()
+        # Policies may have changed while no operator ran. Plans are judged again one by one, so that new plans need not wait.
+        spread_s = random.uniform(0, RECHECK_S)  # noqa: S311 (a time, not a secret)
+        judge_at_s = self._judge_at.setdefault(key, loop.time() + spread_s)
+        judge = judge_at_s <= loop.time()
+        step = plan_step(self._situation(plan, now, rules_changed=judge))
         reserved = reserved_flight(plan.model_copy(update={"status": step.status}))
         if reserved is not None:
             self._cache.flights.decide(key, reserved)
@@ -119,10 +134,12 @@ class FlightPlanController:
             await self._store.delete(kinds.APPLICATION, (key[0], application_name(plan.metadata.uid or "")))
         if step.status.state not in FLYING:
             await self._set_finalizer(plan, wanted=False)
-        loop = asyncio.get_running_loop()
-        self._timers[key] = loop.call_later(step.next_s, self.work_queue.add, key)
+        if judge and self._judge_at.get(key) == judge_at_s:
+            self._judge_at[key] = math.inf
+        wait_s = min(step.next_s, max(self._judge_at.get(key, math.inf) - loop.time(), 0.0))
+        self._timers[key] = loop.call_later(wait_s, self.work_queue.add, key)
 
-    def _situation(self, plan: FlightPlan, now: datetime) -> PlanSituation:
+    def _situation(self, plan: FlightPlan, now: datetime, *, rules_changed: bool) -> PlanSituation:
         now_s = now.timestamp()
         template = self._cache.templates.get(("", plan.spec.template))
         original = None
@@ -139,6 +156,7 @@ class FlightPlanController:
             self._mission(own),
             now_s,
             original,
+            rules_changed,
         )
 
     def _mission(self, plan: FlightPlan) -> FlownMission:

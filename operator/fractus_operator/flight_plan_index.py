@@ -7,13 +7,15 @@ decision considers it.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+import math
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from fractus_core.airspace import Airspace, OperationalIntent, Volume4D
 from fractus_core.airspace.lifecycle import RESERVING
 from fractus_core.airspace.plan_status import intent_of
-from fractus_core.api import FlightPlan, InvalidObject
+from fractus_core.airspace.volumes import MAX_TIME_S
+from fractus_core.api import FlightPlan, InvalidObject, Zone
 from fractus_core.planning.inventory import Reservation
 
 from fractus_operator.kinds import Key
@@ -141,6 +143,22 @@ class FlightPlanIndex:
     def overlapping(self, key: Key, volumes: Sequence[Volume4D]) -> list[Key]:
         """Return the keys of other plans that overlap volumes of a plan."""
         return [_key(other.name) for other in self.airspace.overlapping(volumes, without="/".join(key))]
+
+    def in_zones(self, zones: Iterable[Zone]) -> list[Key]:
+        """Return the keys of the plans whose ground area overlaps one of some zones at any time and altitude."""
+        try:
+            volumes = [
+                Volume4D.of_area(zone.spec.area, lower_m=-math.inf, upper_m=math.inf, begin_s=0.0, end_s=MAX_TIME_S)
+                for zone in zones
+            ]
+        except InvalidObject:
+            # An invalid or very large zone may concern every plan.
+            return list(self._present)
+        return [_key(other.name) for other in self.airspace.overlapping(volumes, without="")]
+
+    def keys(self) -> list[Key]:
+        """Return the keys of all plans with a reservation."""
+        return list(self._present)
 
     def on_drone(self, drone: str) -> Iterator[tuple[Key, ReservedFlight]]:
         """Iterate over the reservations of a drone."""

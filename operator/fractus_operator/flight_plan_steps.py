@@ -13,12 +13,19 @@ from fractus_core.airspace.plan_status import PRIORITIES, intent_of, plan_findin
 from fractus_core.airspace.volumes import utc
 from fractus_core.api import Application, ApplicationTemplate, FlightPlan, InvalidObject
 from fractus_core.api.conditions import ConditionUpdate
-from fractus_core.api.flight_plans import PARAMETERS_INVALID, FlightPlanStatus, PlanFinding, PlanState, ReservedVolume
+from fractus_core.api.flight_plans import (
+    PARAMETERS_INVALID,
+    FlightPlanStatus,
+    PlanFinding,
+    PlanRestriction,
+    PlanState,
+    ReservedVolume,
+)
 from fractus_core.api.plans import Alternative, Rejection
 from fractus_core.planning.flight_parameters import check_parameters
 from fractus_core.planning.inventory import Inventory, Settings
 
-from fractus_operator.flight_matching import SOON_S, Match, Unfit, application_of, match_flight
+from fractus_operator.flight_matching import POLICY_CONFLICT, SOON_S, Match, Unfit, application_of, match_flight
 from fractus_operator.flight_progress import FlownMission, flight_progress, off_nominal_volumes
 
 START_GRACE_S = 120.0
@@ -50,6 +57,7 @@ class PlanSituation:
         mission: The Application of the plan.
         now_s: Time in seconds since 1970 UTC.
         original: Plan whose change a dry run decides, if it exists. `mission` is then its Application.
+        rules_changed: True if policies or zones at the place of the plan have changed since they were judged.
     """
 
     plan: FlightPlan
@@ -60,6 +68,7 @@ class PlanSituation:
     mission: FlownMission
     now_s: float
     original: FlightPlan | None = None
+    rules_changed: bool = False
 
     @property
     def name(self) -> str:
@@ -247,8 +256,8 @@ def _follow_accepted(now: PlanSituation) -> PlanStep:
     if now.now_s > now.end_s:
         return _ended(now, "the window ended without a flight")
     soon = begin_s - SOON_S <= now.now_s
-    if soon or not now.mission.drone_exists:
-        return _rematch(now)
+    if soon or not now.mission.drone_exists or now.rules_changed:
+        return _rematch(now, soon=soon)
     return replace(_keep(now), next_s=_until_start_s(now))
 
 
@@ -273,22 +282,39 @@ def _refuse_change(now: PlanSituation, refusals: tuple[PlanFinding, ...]) -> Pla
     return PlanStep(status, _conditions(status, now), next_s=_until_start_s(now))
 
 
-def _rematch(now: PlanSituation) -> PlanStep:
-    """Check shortly before the flight that a drone is suitable. Select another drone if the reserved one is not."""
+def _rematch(now: PlanSituation, *, soon: bool) -> PlanStep:
+    """Check that the drone is suitable and the policies allow the flight. Select another drone if the reserved one is not.
+
+    Policies may change again before the flight, so a plan that they do not allow any more stays accepted until its start.
+    """
     try:
         match = _match(now)
     except Unfit as unfit:
+        if not soon and unfit.reason == POLICY_CONFLICT:
+            return _judged(now, (PlanFinding(reason=unfit.reason, message=unfit.message),), now.status.restrictions)
         if now.now_s > now.plan.spec.window.begin_s + START_GRACE_S and now.may_start:
             return _rejected(now, unfit)
         return _not_startable(now, unfit.reason, unfit.message, unfit.rejected)
     if match.drone == now.status.drone:
-        return replace(_keep(now), next_s=_until_start_s(now))
+        findings = match.advisories
+        if message := match.choices_problem:
+            findings += (PlanFinding(reason="ChoicesMissing", message=message),)
+        return _judged(now, findings, match.restrictions)
     intent = _intent(now, "Accepted", match.volumes)
     decision = decide(intent, intent_of(now.plan), now.airspace, now.now_s)
     if not decision.accepted:
         finding = decision.refusals[0]
         return _not_startable(now, finding.reason, finding.message)
     return _accepted(now, match, intent)
+
+
+def _judged(
+    now: PlanSituation, findings: tuple[PlanFinding, ...], restrictions: tuple[PlanRestriction, ...]
+) -> PlanStep:
+    """Keep an accepted plan with what the present policies say about it."""
+    status = now.status.model_copy(update={"advisories": findings, "restrictions": restrictions})
+    plan = now.plan.model_copy(update={"status": status})
+    return replace(_keep(replace(now, plan=plan)), next_s=_until_start_s(now))
 
 
 def _activate(now: PlanSituation) -> PlanStep:
@@ -498,6 +524,9 @@ def _conditions(status: FlightPlanStatus, now: PlanSituation | None = None) -> t
         updates.append(
             ConditionUpdate("ConflictArose", "True", conflicts[0].reason, conflicts[0].message, adverse=True)
         )
+    restricted = _policy_advisories(status)
+    if status.state == "Accepted" and restricted:
+        updates.append(ConditionUpdate("Restricted", "True", restricted[0].reason, restricted[0].message, adverse=True))
     if now is not None and now.mission.started:
         updates.append(
             ConditionUpdate(STARTED, "True", "ApplicationCreated", f"Application {status.application} flies")

@@ -23,6 +23,7 @@ from fractus_operator.labels import FINALIZER, LANDING_FINALIZER
 from fractus_operator.store import Conflict, KubeError, NotFound, Store
 from test_airspace_flights import located
 from test_flight_plan_steps import BEGIN_S, DAY_BEFORE_S, END_S, accepted
+from test_grants import FENCE, policy, zone
 from test_ordered_applications import flight, template
 from test_planning import at, inventory
 
@@ -138,6 +139,7 @@ class World:
         self.cache = ClusterCache(self.api)
         self.controller = FlightPlanController(self.api, self.cache, self.clock, Settings())
         self.cache.add_listener(kinds.APPLICATION, self.controller.application_changed)
+        self.cache.add_flight_rules_listener(self.controller.rules_changed)
         for informer in self.cache.informers:
             informer.synced.set()
         self.watch()
@@ -150,7 +152,7 @@ class World:
         watched = (
             (kinds.NODE, self.cache.hosts), (kinds.DRONE, self.cache.drones), (kinds.DEPOT, self.cache.depots),
             (kinds.APPLICATION_TEMPLATE, self.cache.templates), (kinds.FLIGHT_PLAN, self.cache.flight_plans),
-            (kinds.APPLICATION, self.cache.applications),
+            (kinds.APPLICATION, self.cache.applications), (kinds.ZONE, self.cache.zones), (kinds.POLICY, self.cache.policies),
         )  # fmt: skip
         for kind, informer in watched:
             bodies = {
@@ -418,6 +420,32 @@ async def test_completed_flight_ends_without_another_report() -> None:
     planned = DeploymentPlanSpec(application="flight-3e0a", flown=record)
     world.cache.plans.decide(FLIGHT, body["metadata"]["uid"], planned)
     assert (await world.step())["state"] == "Ended"
+
+
+def conditions(status: Body) -> dict[str, tuple[str, str]]:
+    return {each["type"]: (each["status"], each["reason"]) for each in status["conditions"]}
+
+
+@pytest.mark.parametrize("place", [(60, 70), (5000, 0)], ids=["on the route", "elsewhere"])
+async def test_restriction_published_after_the_acceptance_is_a_condition_of_the_plan(place: tuple[int, int]) -> None:
+    world = World()
+    await world.step()
+    queued: list[Key] = []
+    world.cache.add_flight_rules_listener(queued.append)
+    world.api.put(kinds.ZONE, zone("z", place, 20).to_dict())
+    world.api.put(kinds.POLICY, policy("keep-out", zones=["z"], **FENCE).to_dict())
+    world.watch()
+    near = place == (60, 70)
+    assert (PLAN in queued) == near
+    status = await world.step()
+    assert status["state"] == "Accepted"
+    assert conditions(status).get("Restricted") == (("True", "PolicyConflict") if near else None)
+    writes = len(world.api.writes)
+    await world.step()
+    assert len(world.api.writes) == writes, "the condition stays without another judgement"
+    del world.api.objects[kinds.POLICY.path("", "keep-out")]
+    world.watch()
+    assert "Restricted" not in {n for n, (value, _) in conditions(await world.step()).items() if value == "True"}
 
 
 async def test_deleted_plan_ends_its_flight() -> None:

@@ -6,7 +6,7 @@ from datetime import UTC, datetime
 import pytest
 from fractus_core.airspace import Airspace
 from fractus_core.airspace.plan_status import intent_of
-from fractus_core.api import FlightPlan, Policy
+from fractus_core.api import FlightPlan, Policy, Zone
 from fractus_core.api.geometry import Position
 from fractus_core.api.plans import MissionRecord
 from fractus_core.planning import Settings
@@ -16,6 +16,7 @@ from fractus_operator.flight_matching import SOON_S
 from fractus_operator.flight_plan_steps import START_GRACE_S, PlanSituation, plan_step
 from fractus_operator.flight_progress import FlownMission
 from test_airspace_flights import located
+from test_grants import FENCE, policy, zone
 from test_ordered_applications import flight, template
 from test_planning import at, inventory, manifest
 
@@ -135,6 +136,39 @@ def test_plan_of_unapproved_template_is_rejected():
     step = plan_step(situation(using=template(approved=2)))
     assert (step.status.state, step.status.refusals[0].reason) == ("Rejected", "Invalid")
     assert "not approved" in step.status.message
+
+
+def fenced(*active):
+    """Return an inventory whose zone on the route is active at some times of day."""
+    times = [{"start": start, "end": end} for start, end in active]
+    body = zone("z", (60, 70), 20).to_dict()
+    body["spec"]["schedule"] = times
+    zones = {"z": Zone.from_body(body)}
+    return inventory([DRONE], zones=zones, policies={"keep-out": policy("keep-out", zones=["z"], **FENCE)})
+
+
+@pytest.mark.parametrize(
+    ("active", "state", "when"),
+    [
+        ([("07:00", "09:00")], "Rejected", None),
+        ([("07:00", "08:01")], "Accepted", "at the begin of the window"),
+        ([("08:59", "10:00")], "Accepted", "at the end of the window"),
+        ([("08:30", "08:40")], "Accepted", "in a part of the window"),
+        ([("07:00", "07:59"), ("20:00", "21:00")], "Accepted", None),
+    ],
+)
+def test_restriction_of_the_next_day_is_judged_at_the_decision(active, state, when):
+    plan = flight(window={"start": "2027-01-15T08:00:00Z", "duration": 60})
+    step = plan_step(situation(plan, stock=fenced(*active)))
+    assert step.status.state == state, step.status.message
+    if state == "Rejected":
+        assert step.status.refusals[0].reason == "PolicyConflict"
+    elif when is None:
+        assert step.status.advisories == ()
+    else:
+        (advisory,) = step.status.advisories
+        assert advisory.message.startswith(when)
+        assert conditions(step)["Restricted"] == ("True", "PolicyConflict")
 
 
 def test_plan_that_overlaps_another_plan_is_rejected_with_its_name():

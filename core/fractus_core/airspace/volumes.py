@@ -37,7 +37,7 @@ about a millimetre.
 _ROUNDING_M = 1.0
 """Margin of `Volume4D.reach_m`, with which the search for neighbours includes volumes within the tolerance."""
 
-_MAX_TIME_S = 253_402_300_799.0
+MAX_TIME_S = 253_402_300_799.0
 """End of the year 9999, the last time that RFC 3339 can represent."""
 
 
@@ -126,7 +126,7 @@ class Volume4D:
             )
         if lower_m == math.inf or upper_m == -math.inf:
             raise InvalidObject("altitudes", "an infinite bound leaves no airspace; omit it or give a number of metres")
-        if not 0 <= begin_s <= end_s <= _MAX_TIME_S:
+        if not 0 <= begin_s <= end_s <= MAX_TIME_S:
             raise InvalidObject("time", "give a start after 1970 and an end that is not before the start")
         frame, center, reach_m = _sphere(outline)
         return cls(outline, lower_m, upper_m, begin_s, end_s, frame, center, reach_m)

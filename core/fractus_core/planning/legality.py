@@ -102,11 +102,20 @@ class MissionRoute:
 class RouteJudge:
     """Judges the route of an application for several drones. Drones with the same home and limits share the result."""
 
-    def __init__(self, application: Application, area: OperationArea, inventory: Inventory, settings: Settings) -> None:
+    def __init__(
+        self,
+        application: Application,
+        area: OperationArea,
+        inventory: Inventory,
+        settings: Settings,
+        *,
+        throughout: bool = False,
+    ) -> None:
         self._application = application
         self._area = area
         self._inventory = inventory
         self._settings = settings
+        self._throughout = throughout
         self._known: dict[tuple[object, ...], MissionRoute] = {}
         self._searches = MAX_SEARCHES
 
@@ -139,7 +148,10 @@ class RouteJudge:
             self._known[key] = MissionRoute((), mission.distance_m, mission.needed_min)
         elif key not in self._known:
             # The time of each leg is unknown, so a policy counts if it applies at any time of the mission.
-            during = UncertainTime(time_s + mission.needed_min * 60, time_s)
+            end_s = time_s + mission.needed_min * 60
+            if self._throughout and self._settings.until_s is not None:
+                end_s = max(end_s, self._settings.until_s)
+            during = UncertainTime(end_s, time_s)
             airframe = Airframe(retraces=True)
             cruise_mps = min(self._settings.cruise_speed_mps, airframe.highest_command_mps(mobility.max_speed))
             now = Situation(
@@ -168,9 +180,21 @@ class RouteJudge:
 
 
 def with_legality(
-    application: Application, plan: DeploymentPlanSpec, inventory: Inventory, settings: Settings
+    application: Application,
+    plan: DeploymentPlanSpec,
+    inventory: Inventory,
+    settings: Settings,
+    *,
+    throughout: bool = False,
 ) -> DeploymentPlanSpec:
     """Return a plan with the legality of its route under the current policies. Return the same object if nothing changed.
+
+    Args:
+        application: The application.
+        plan: Its plan.
+        inventory: Current inventory.
+        settings: Settings of planning. `time_s` is the start of the mission.
+        throughout: True to count a policy that applies at any time from `time_s` to `until_s`, because the mission may fly then.
 
     Raises:
         InvalidObject: The application names an unknown depot, or its geometry is invalid.
@@ -182,7 +206,7 @@ def with_legality(
     if choice is None or drone is None or area is None or home is None:
         return plan
     mission = MissionEstimator(application.spec, area, settings).estimate(home, drone)
-    route = RouteJudge(application, area, inventory, settings).route(drone, mission)
+    route = RouteJudge(application, area, inventory, settings, throughout=throughout).route(drone, mission)
     if route is None:
         return plan
     recorded = route.add_to(choice, route.conflict(choice.mission.available if choice.mission is not None else None))

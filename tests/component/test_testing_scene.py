@@ -185,6 +185,21 @@ def test_running_autopilot_needs_a_program(scene: Scene) -> None:
         drone.start_app()
 
 
+@pytest.mark.parametrize(
+    "connection", ["udp:127.0.0.1:14550", "127.0.0.1:5760", "tcp:127.0.0.1", "tcp:127.0.0.1:70000"]
+)
+def test_connection_other_than_tcp_is_refused_with_a_remedy(scene: Scene, connection: str) -> None:
+    drone = scene.vDrone("vDrone-1", connection=connection)
+    drone.set_pos(HOME)
+    drone.set_plan(FlightPlan(path=PATH))
+    drone.set_app("pilot.py")
+    with pytest.raises(
+        ExperimentError,
+        match=rf"vehicles\[0\]\.connection: must be tcp:HOST:PORT, not '{connection}'; .*MAVProxy or mavlink-router",
+    ):
+        drone.start_app()
+
+
 def test_invalid_fault_and_name_are_refused_with_their_field(scene: Scene) -> None:
     drone = scene.vDrone("v drone")
     drone.set_pos(HOME)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import math
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +15,7 @@ from fractus_core.api.model import InvalidObject, Model
 from fractus_core.api.names import Name
 from fractus_core.documents import BadDocument, parse_document
 from fractus_vehicle.earth import Place
-from pydantic import Field, ValidationError, model_validator
+from pydantic import AfterValidator, Field, ValidationError, model_validator
 
 from fractus_sim.experiment.checks import (
     ApplicationPhase,
@@ -34,6 +35,20 @@ from fractus_sim.experiment.timed_faults import LINK_OF_MODE, Fault, LinkLoss, N
 Mode = Literal["vehicles", "standalone", "cluster"]
 ParameterName = Annotated[str, Field(pattern=r"^[A-Z][A-Z0-9_]{0,15}$")]
 MAX_VEHICLES = 50
+MAX_PORT = 65535
+
+
+def _tcp_link(text: str) -> str:
+    match = re.fullmatch(r"tcp:[^:\s]+:(\d{1,5})", text)
+    if match is None or not 1 <= int(match[1]) <= MAX_PORT:
+        raise InvalidObject(
+            "",
+            f"must be tcp:HOST:PORT, not {text!r}; connect other links, such as UDP, through MAVProxy or mavlink-router",
+        )
+    return text
+
+
+TcpLink = Annotated[str, AfterValidator(_tcp_link)]
 
 
 class Wind(Model):
@@ -62,9 +77,8 @@ class VehicleEntry(Model):
     heading: float = Field(default=0, ge=0, lt=360, description="Degrees.")
     parameters: dict[ParameterName, float] = Field(default_factory=dict, description="Autopilot parameters.")
     ready_after: float = Field(default=5, ge=1, le=120, description="Seconds until the autopilot is ready to arm.")
-    connection: str | None = Field(
+    connection: TcpLink | None = Field(
         default=None,
-        pattern=r"^tcp:[^:\s]+:\d{1,5}$",
         description="tcp:HOST:PORT of a running autopilot, such as ArduPilot SITL (modes vehicles and standalone). The autopilot"
         " must accept several connections.",
     )

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, Literal, Self
 
 from fractus_core.api.model import InvalidObject, quantity
-from fractus_core.control.state import TaskKind
+from fractus_core.control.state import DRIVER_LOST_CODE, TaskKind
 from fractus_sim.errors import ExperimentError
 from fractus_sim.experiment.checks import Check, DataLevel
 from fractus_sim.experiment.definition import NamedZone
@@ -168,8 +168,8 @@ class Results:
         """Return the status of the programs that a drone runs.
 
         Returns:
-            `aborted` if the platform took the drone and ended the mission, `failed` if a program ended with an error,
-            `running` while a program runs, else `success`.
+            `aborted` if the platform took the drone and ended the mission, `failed` if a program ended with an error, also if
+            the platform then brought the drone home, `running` while a program runs, else `success`.
 
         Raises:
             ExperimentError: No program of the drone was started.
@@ -180,7 +180,8 @@ class Results:
         codes = [code for program, code in record.programs.items() if self._runs_on(record, program, name)]
         if not codes and phase is None:
             raise ExperimentError(f"{drone} runs no program; call set_app() and start_app() first")
-        if any(_ends_mission(entry) for entry in record.entries.get(name, ())):
+        endings = {str(entry.get("code")) for entry in record.entries.get(name, ()) if _ends_mission(entry)}
+        if endings and not (any(codes) and endings == {DRIVER_LOST_CODE}):
             return ABORTED
         if phase is not None:
             status = SUCCESS if phase == "Completed" else FAILED

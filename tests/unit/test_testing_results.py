@@ -131,6 +131,13 @@ def test_requests_contain_permitted_and_refused_calls() -> None:
         ({"p": 0, "q": None}, (), RUNNING),
         ({"p": 1}, (entry("x", "returnToLaunch", kind="takeover"),), ABORTED),
         ({"p": 1}, (entry("x", "landAt", kind="takeover"),), ABORTED),
+        ({"p": 1}, (entry("DriverLost", "returnToLaunch", kind="takeover"),), FAILED),
+        ({"p": 0}, (entry("DriverLost", "returnToLaunch", kind="takeover"),), ABORTED),
+        (
+            {"p": 1},
+            (entry("DriverLost", "returnToLaunch", kind="takeover"), entry("x", "land", kind="takeover")),
+            ABORTED,
+        ),
         ({"p": 0}, (entry("x", "hover", kind="takeover"),), SUCCESS),
     ],
 )

@@ -119,7 +119,7 @@ class VirtualDrone:
         self.faults: list[dict[str, Any]] = []
         self.parameters: dict[str, float] = {}
         self.world: World | None = None
-        self.logs: tuple[str, ...] = ()
+        self.logs: tuple[str, ...] = (app,)
         self._scene = scene
 
     def set_pos(self, home: tuple[float, float, float]) -> None:
@@ -182,7 +182,7 @@ class VirtualDrone:
         self.parameters |= parameters
 
     def set_logs(self, *logs: str) -> None:
-        """Select the logs whose last lines a failed test shows: app, runtime, autopilot. All logs are always written.
+        """Select the logs whose last lines a failed test shows: app (the default), runtime, autopilot. All are always written.
 
         Raises:
             ExperimentError: A log is unknown.

@@ -73,7 +73,8 @@ def until(
         number = reached
         if not 1 <= number <= len(drone.waypoints):
             raise ExperimentError(
-                f"until(reached={number}): the flight plan of {drone.name} has {len(drone.waypoints)} waypoints"
+                f"until(reached={number}): the flight plan of {drone.name} has {len(drone.waypoints)} waypoints; specify the"
+                " waypoints as `path` of its FlightPlan, also with a `region`, or wait for an altitude or a time"
             )
         return Trigger(
             f"{drone.name} reaches waypoint {number}",

@@ -15,6 +15,7 @@ from prometheus_client import Metric
 from fractus_management import (
     drone_routes,
     event_routes,
+    permission_routes,
     plan_routes,
     restriction_routes,
     template_routes,
@@ -37,6 +38,7 @@ ROUTERS = (
     plan_routes.router,
     event_routes.router,
     restriction_routes.router,
+    permission_routes.router,
 )
 """Routers below /v1. Each resource has a module with its router."""
 

@@ -11,9 +11,18 @@ from pathlib import Path
 import chart as fractus_chart
 import pytest
 from control_plane import ControlPlane, programs, wait_for
-from management_server import ManagementServer, User, user_token
+from management_server import ManagementServer, User, restriction, user_token
 from mobility_rig import Rig
 from operator_world import FRACTUS, OperatorProcess, World, approved_template, fresh_namespace
+
+AUTHORITY_ROLES = (
+    "fractus-policy-editor",
+    "fractus-zone-editor",
+    "fractus-flightplan-viewer",
+    "fractus-drone-viewer",
+    "fractus-grant-viewer",
+    "fractus-applicationtemplate-viewer",
+)
 
 # Background jobs of a shell ignore SIGINT, and nohup ignores SIGHUP. Programs that tests start would also ignore them.
 for number in (signal.SIGINT, signal.SIGHUP):
@@ -144,6 +153,18 @@ def pilot(
     for item in world.api.list(f"{FRACTUS}/flightplans"):
         world.api.delete(f"{FRACTUS}/namespaces/{item['metadata']['namespace']}/flightplans/{item['metadata']['name']}")
     wait_for(lambda: not world.api.list(f"{FRACTUS}/flightplans"), "the plans to be deleted")
+
+
+@pytest.fixture
+def authority(pilot: User, world: World, management: ManagementServer, namespace: str) -> Iterator[User]:
+    """A user who may publish restrictions, and read what they affect."""
+    user = User(management, user_token(world, namespace, "publisher", (), AUTHORITY_ROLES), namespace)
+    wait_for(lambda: user("POST", "/v1/restrictions:impact", restriction()).status == 200, "the roles of the authority")
+    wait_for(lambda: user("DELETE", "/v1/restrictions/none", If_Match="*").status == 404, "the roles of the authority")
+    yield user
+    for kind in ("policies", "zones"):
+        for item in world.api.list(f"{FRACTUS}/{kind}"):
+            world.api.delete(f"{FRACTUS}/{kind}/{item['metadata']['name']}")
 
 
 @pytest.fixture

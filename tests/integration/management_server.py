@@ -167,6 +167,12 @@ def submitted(user: User, **more: Any) -> Reply:
     return reply
 
 
+def restriction(name: str = "fair", north_m: float = 40, **policy: Any) -> Body:
+    corners = [at(north_m + dx, 40 + dy) for dx, dy in ((0, 0), (0, 20), (20, 20), (20, 0))]
+    zone = {"area": {"polygon": {"exterior": corners}}, "description": "Summer fair"}
+    return {"name": name, "zone": zone, "policy": {"type": "GeofenceControl", "kind": "exclusion", **policy}}
+
+
 def problem(reply: Reply, status: int) -> list[Body]:
     """Return the reasons of an error response."""
     assert reply.status == status, reply

@@ -3,40 +3,17 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
 from typing import Any
 
-import pytest
 from control_plane import wait_for
-from management_server import ManagementServer, User, problem, submitted, user_token
-from operator_world import FRACTUS, World, at, fractus_object, traffic
+from management_server import ManagementServer, User, problem, restriction, submitted, user_token
+from operator_world import FRACTUS, World, fractus_object, traffic
 
 Body = dict[str, Any]
-
-ROLES = ("fractus-policy-editor", "fractus-zone-editor")
-READER = ("fractus-flightplan-viewer", "fractus-drone-viewer", "fractus-grant-viewer")
-
-
-def restriction(name: str = "fair", north_m: float = 40, **policy: Any) -> Body:
-    corners = [at(north_m + dx, 40 + dy) for dx, dy in ((0, 0), (0, 20), (20, 20), (20, 0))]
-    zone = {"area": {"polygon": {"exterior": corners}}, "description": "Summer fair"}
-    return {"name": name, "zone": zone, "policy": {"type": "GeofenceControl", "kind": "exclusion", **policy}}
 
 
 def zones(world: World) -> list[Body]:
     return world.api.list(f"{FRACTUS}/zones")
-
-
-@pytest.fixture
-def authority(pilot: User, world: World, management: ManagementServer, namespace: str) -> Iterator[User]:
-    """A user who may publish restrictions, and read what they affect."""
-    user = User(management, user_token(world, namespace, "publisher", (), (*ROLES, *READER)), namespace)
-    wait_for(lambda: user("POST", "/v1/restrictions:impact", restriction()).status == 200, "the roles of the authority")
-    wait_for(lambda: user("DELETE", "/v1/restrictions/none", If_Match="*").status == 404, "the roles of the authority")
-    yield user
-    for kind in ("policies", "zones"):
-        for item in world.api.list(f"{FRACTUS}/{kind}"):
-            world.api.delete(f"{FRACTUS}/{kind}/{item['metadata']['name']}")
 
 
 def test_restriction_is_published_as_policy_and_zone(authority: User, world: World) -> None:
@@ -211,3 +188,17 @@ def test_impact_lists_flights_in_the_air(authority: User, world: World, namespac
         world.drone_status("drone-1", "inactive")
         world.api.delete(f"{FRACTUS}/namespaces/{namespace}/applications/traffic")
         wait_for(lambda: not world.grants(namespace), "the Grants to be deleted")
+
+
+def test_permissions_follow_from_roles(authority: User, pilot: User) -> None:
+    assert authority("GET", "/v1/permissions").body == {"publishRestrictions": True, "prioritize": False}
+    assert pilot("GET", "/v1/permissions").body == {"publishRestrictions": False, "prioritize": False}
+
+
+def test_permission_to_prioritize_belongs_to_a_namespace(
+    pilot: User, world: World, management: ManagementServer, namespace: str
+) -> None:
+    user = User(management, user_token(world, namespace, "medic", ("fractus-flightplan-prioritizer",), ()), namespace)
+    wait_for(lambda: user("GET", "/v1/permissions").body["prioritize"], "the role of the user")
+    elsewhere = User(management, user.token, "default")
+    assert elsewhere("GET", "/v1/permissions").body == {"publishRestrictions": False, "prioritize": False}

@@ -10,7 +10,7 @@ import pytest
 from axe_playwright_python.sync_playwright import Axe
 from browser import CHROMIUM, SOFTWARE_GL, TIMEOUT_MS, launched
 from control_plane import wait_for
-from management_server import Body, ManagementServer, User, plan, submitted
+from management_server import Body, ManagementServer, User, plan, restriction, submitted
 from operator_world import FRACTUS, LAT, LON, World, approved_region_template, approved_template, at, fractus_object
 from playwright.sync_api import Browser, Page, Playwright, Route, expect, sync_playwright
 
@@ -375,3 +375,109 @@ def test_plans_page_forgets_the_plan_of_a_user_who_signs_out(page: Page, pilot: 
     page.get_by_role("button", name="Sign out").click()
     expect(page.locator("#route tr")).to_have_count(0)
     expect(page.get_by_label("Token")).to_be_focused()
+
+
+def open_restrictions(page: Page, user: User) -> None:
+    sign_in(page, user)
+    page.get_by_role("button", name="Restrictions", exact=True).press("Enter")
+
+
+def test_plans_page_leads_an_authority_from_an_area_to_a_published_restriction(
+    page: Page, pilot: User, authority: User
+) -> None:
+    affected = submitted(pilot, in_s=600).body["metadata"]["name"]
+    open_restrictions(page, authority)
+    publish = page.get_by_role("button", name="Publish the restriction")
+    page.get_by_label("Name", exact=True).fill("summer-fair")
+    page.get_by_label("Message to users").fill("Summer fair")
+    center = at(50, 50)
+    page.get_by_label("Latitude of the centre").fill(str(center["lat"]))
+    page.get_by_label("Longitude of the centre").fill(str(center["lon"]))
+    page.get_by_label("Radius").fill("15")
+    page.get_by_label("Up to (m)").fill("120")
+    page.get_by_label("End (UTC)").fill("2099-01-01T00:00:00")
+    expect(publish).to_be_disabled()
+    page.get_by_role("button", name="Show the impact").press("Enter")
+    expect(page.locator("#impact-result")).to_contain_text("1 plan and 0 flights", timeout=TIMEOUT_MS)
+    expect(page.locator("#impact-findings")).to_contain_text(affected)
+    result = Axe().run(page)
+    assert result.violations_count == 0, result.generate_report()
+    publish.press("Enter")
+    expect(page.locator("#restrictions")).to_contain_text("In force", timeout=TIMEOUT_MS)
+    (stored,) = authority("GET", "/v1/restrictions").body["items"]
+    zone = stored["zone"]
+    assert zone["description"] == "Summer fair"
+    assert zone["area"]["circle"] == {"center": {"lat": center["lat"], "lon": center["lon"]}, "radius": 15}
+    assert zone["altitude"] == {"upper": 120, "reference": "home"}
+    assert stored["policy"].items() >= {
+        "type": "GeofenceControl", "kind": "exclusion", "action": "returnToLaunch", "validUntil": "2099-01-01T00:00:00Z",
+    }.items()  # fmt: skip
+    result = Axe().run(page)
+    assert result.violations_count == 0, result.generate_report()
+    page.get_by_role("button", name="End now summer-fair").click()
+    expect(page.locator("#restrictions")).to_contain_text("Ended", timeout=TIMEOUT_MS)
+    page.get_by_role("button", name="Delete summer-fair").click()
+    expect(page.locator("#restrictions")).to_contain_text("No restrictions are published.", timeout=TIMEOUT_MS)
+    assert authority("GET", "/v1/restrictions").body["items"] == []
+
+
+def test_plans_page_imports_the_polygon_of_a_restriction(page: Page, authority: User) -> None:
+    open_restrictions(page, authority)
+    corners = [at(10, 10), at(40, 10), at(40, 40)]
+    ring = [[corner["lon"], corner["lat"]] for corner in [*corners, corners[0]]]
+    content = json.dumps({"type": "Polygon", "coordinates": [ring]})
+    file = {"name": "area", "mimeType": "application/json", "buffer": content.encode()}
+    page.get_by_label("GeoJSON of a polygon").set_input_files(file)
+    expect(page.locator("#area tr")).to_have_count(3)
+    page.get_by_label("Name", exact=True).fill("slow")
+    page.get_by_label("Rule").select_option("Speed limit")
+    page.get_by_label("At most").fill("3")
+    page.get_by_role("button", name="Show the impact").click()
+    page.get_by_role("button", name="Publish the restriction").click()
+    expect(page.locator("#restrictions")).to_contain_text("speed at most 3 m/s", timeout=TIMEOUT_MS)
+    (stored,) = authority("GET", "/v1/restrictions").body["items"]
+    assert stored["zone"]["area"]["polygon"]["exterior"] == corners
+    assert stored["policy"].items() >= {"kind": "speed", "upperLimit": 3, "action": "enforce"}.items()
+
+
+def test_plans_page_changes_a_restriction_only_in_the_version_that_the_user_has_seen(
+    page: Page, authority: User
+) -> None:
+    selected = {"applications": {"names": ["other"]}}
+    created = authority("POST", "/v1/restrictions", restriction(priority=7, selector=selected)).body["policy"]
+    open_restrictions(page, authority)
+    page.get_by_role("button", name="Change fair").click()
+    expect(page.get_by_role("heading", name="Change fair")).to_be_visible()
+    page.get_by_label("Message to users").fill("Winter fair")
+    authority("PATCH", "/v1/restrictions/fair", {"zone": {"description": "Spring fair"}}, If_Match="*")
+    page.get_by_role("button", name="Show the impact").click()
+    change = page.get_by_role("button", name="Change the restriction", exact=True)
+    change.click()
+    difference = 'zone.description is now "Spring fair", and "Winter fair" in your version'
+    expect(page.locator("#restriction-problem")).to_contain_text(difference, timeout=TIMEOUT_MS)
+    assert authority("GET", "/v1/restrictions/fair").body["zone"]["description"] == "Spring fair"
+    change.click()
+    expect(page.locator("#restrictions")).to_contain_text("Winter fair", timeout=TIMEOUT_MS)
+    stored = authority("GET", "/v1/restrictions/fair").body["policy"]
+    assert (stored["priority"], stored["selector"]) == (7, created["selector"])
+
+
+def test_plans_page_does_not_delete_a_restriction_that_another_user_has_changed(page: Page, authority: User) -> None:
+    authority("POST", "/v1/restrictions", restriction())
+    open_restrictions(page, authority)
+    delete = page.get_by_role("button", name="Delete fair")
+    expect(delete).to_be_visible()
+    page.route("**/v1/restrictions?*", lambda route: route.abort())  # The list is not read again.
+    authority("PATCH", "/v1/restrictions/fair", {"zone": {"description": "Spring fair"}}, If_Match="*")
+    delete.click()
+    expect(page.locator("#restrictions-problem")).to_contain_text("Nothing was done.", timeout=TIMEOUT_MS)
+    assert authority("GET", "/v1/restrictions/fair").status == 200
+
+
+def test_plans_page_says_why_a_user_cannot_publish_restrictions(page: Page, pilot: User) -> None:
+    open_restrictions(page, pilot)
+    expect(page.locator("#publish-permission")).to_contain_text("fractus-policy-editor and fractus-zone-editor")
+    expect(page.locator("#restrictions")).to_contain_text("fractus-policy-viewer and fractus-zone-viewer")
+    expect(page.get_by_role("button", name="Publish the restriction")).to_be_hidden()
+    result = Axe().run(page)
+    assert result.violations_count == 0, result.generate_report()

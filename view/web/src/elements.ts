@@ -15,3 +15,11 @@ export function byId<T extends HTMLElement>(id: string): T {
 export function setText(target: HTMLElement, text: string): void {
   if (target.textContent !== text) target.textContent = text;
 }
+
+/** Returns the problem of the first invalid input of a form as a sentence, or an empty text. */
+export function invalidInput(form: HTMLFormElement): string {
+  const invalid = form.querySelector<HTMLInputElement>(":invalid:not(fieldset)");
+  if (invalid === null) return "";
+  const label = invalid.getAttribute("aria-label") ?? invalid.labels?.[0]?.textContent ?? invalid.name;
+  return `${label}: ${invalid.validationMessage}`;
+}

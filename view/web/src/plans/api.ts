@@ -19,6 +19,8 @@ export class Problem extends Error {
 export interface Reply<T> {
   status: number;
   body: T;
+  /** Version of the object, for If-Match. Empty if the response has none. */
+  etag: string;
 }
 
 interface Page<T> {
@@ -44,7 +46,8 @@ export class Api {
     const content = body === undefined ? {} : { body: JSON.stringify(body) };
     const type = body === undefined ? {} : { "Content-Type": "application/json" };
     const response = await this.fetch(path, { method, headers: { ...type, ...headers }, ...content, signal: signal ?? null });
-    return { status: response.status, body: (response.status === 204 ? undefined : await response.json()) as T };
+    const received = (response.status === 204 ? undefined : await response.json()) as T;
+    return { status: response.status, body: received, etag: response.headers.get("ETag") ?? "" };
   }
 
   /** Returns all pages of a list. */

@@ -1,6 +1,7 @@
 // Decision on a plan: reasons, drones, volumes, and the choices of repair actions.
 
 import { byId, element } from "../elements";
+import { timeOf } from "./times";
 import type { FlightPlanStatus, PlanFinding, PlanRestriction, PolicyAction } from "./types";
 
 /** Radio groups for the policies that have several repair actions. */
@@ -90,9 +91,4 @@ function findingItem({ message, plan }: PlanFinding, select: (plan: string) => v
     item.append(" ", button);
   }
   return item;
-}
-
-/** Returns a time of the API as it is shown, in UTC. */
-export function timeOf(time: string): string {
-  return `${new Date(time).toISOString().slice(0, 19).replace("T", " ")} UTC`;
 }

@@ -10,9 +10,11 @@ import { showFindings } from "./decision";
 import { differences } from "./differences";
 import { PlanForm } from "./plan_form";
 import { PlanList, stateOf } from "./plan_list";
+import { MapClicks } from "./map_clicks";
 import type { PlanMap } from "./plan_map";
+import { Restrictions } from "./restrictions";
 import { pointFeature, routeFeatures, specFeatures, volumeFeatures } from "./shapes";
-import type { ApplicationTemplate, Drone, FlightPlan, FlightPlanSpec, FlightPlanStatus } from "./types";
+import type { ApplicationTemplate, Drone, FlightPlan, FlightPlanSpec, FlightPlanStatus, Permissions, Point } from "./types";
 
 const CHECK_DELAY_MS = 500;
 const CHECK_RETRY_MS = 5_000;
@@ -24,6 +26,7 @@ let api: Api | undefined;
 let plans: FlightPlan[] = [];
 let drones: Drone[] = [];
 let map: PlanMap | undefined;
+let view: "flights" | "restrictions" = "flights";
 /** Time since which the server does not respond, in Unix milliseconds. */
 let lost: number | undefined;
 /** Plan that the form changes, in the version that the user has seen. Undefined: the form submits a new plan. */
@@ -41,6 +44,7 @@ let checking = new AbortController();
 let following = new AbortController();
 let followed = "";
 
+const clicks = new MapClicks();
 const submit = byId<HTMLButtonElement>("submit");
 const form = new PlanForm(edited, () => map?.fit(routeOfForm()));
 const list = new PlanList({
@@ -55,6 +59,13 @@ const list = new PlanList({
   },
 });
 
+const restrictions = new Restrictions({
+  api: () => api,
+  map: () => map,
+  clicks,
+  explain: (error) => (isExpired(error) ? undefined : sentence(error)),
+});
+
 // -- sign-in --
 
 async function signIn(token: string, namespace: string): Promise<void> {
@@ -67,6 +78,9 @@ async function signIn(token: string, namespace: string): Promise<void> {
     plans = await api.list<FlightPlan>("/plans");
     const templates = await api.list<ApplicationTemplate>("/apps");
     drones = await optionalDrones(api);
+    await restrictions.load(api);
+    const permissions = (await api.send<Permissions>("GET", "/permissions")).body;
+    restrictions.permit(permissions.publishRestrictions);
     form.offer(templates, drones.map(({ metadata }) => metadata.name));
   } catch (error) {
     signOut(sentence(error));
@@ -102,17 +116,34 @@ function signOut(reason = ""): void {
   form.release();
   showPlans();
   showDrones();
-  map?.set("exclusion", []);
+  map?.set("selected", []);
   sessionStorage.removeItem("token");
   byId<HTMLInputElement>("token").value = "";
   showSignedIn(false);
+  restrictions.clear();
   showProblem("sign-in-problem", reason);
   byId("token").focus();
 }
 
 function showSignedIn(signedIn: boolean): void {
   byId("sign-in-section").hidden = signedIn;
-  for (const id of ["plan-section", "plans-section", "sign-out"]) byId(id).hidden = !signedIn;
+  for (const id of ["views", "restrictions-section", "sign-out"]) byId(id).hidden = !signedIn;
+  for (const id of ["plan-section", "plans-section"]) byId(id).hidden = !signedIn || view !== "flights";
+  byId("publish-section").hidden = !signedIn || view !== "restrictions";
+}
+
+function showView(shown: typeof view): void {
+  view = shown;
+  clicks.cancel();
+  for (const name of ["flights", "restrictions"]) byId(`view-${name}`).setAttribute("aria-pressed", String(name === view));
+  showSignedIn(true);
+  showRoute();
+  showRestrictions();
+}
+
+/** Shows the restrictions during the entered flight, or all of them beside the form of a restriction. */
+function showRestrictions(): void {
+  restrictions.setWindow(view === "flights" ? form.window : undefined);
 }
 
 // -- check and submission --
@@ -125,6 +156,7 @@ function edited(): void {
   unchecked = "";
   key = randomKey();
   showRoute();
+  showRestrictions();
   // A check of a change would conflict with the reservation of the plan itself.
   if (changed === undefined) decision = undefined;
   if (changed === undefined && form.problem === "") checkTimer = window.setTimeout(() => void check(), CHECK_DELAY_MS);
@@ -158,7 +190,7 @@ function decide(status: FlightPlanStatus): void {
   map?.set("operationArea", volumeFeatures(status.volumes ?? []));
   const others = [...(status.refusals ?? []), ...(status.advisories ?? [])].map(({ plan }) => plan);
   const conflicting = plans.filter((plan) => others.includes(nameOf(plan)));
-  map?.set("exclusion", conflicting.flatMap((plan) => volumeFeatures(plan.status?.volumes ?? [])));
+  map?.set("selected", conflicting.flatMap((plan) => volumeFeatures(plan.status?.volumes ?? [])));
 }
 
 /** Returns why the plan cannot be submitted, or an empty text. */
@@ -286,6 +318,7 @@ async function refresh(): Promise<void> {
     const present = await client.list<FlightPlan>("/plans");
     if (client !== api) return;
     plans = present;
+    await restrictions.load(client);
   } catch (error) {
     if (!isExpired(error)) lost ??= Date.now();
   }
@@ -351,14 +384,14 @@ function showPlan(name: string): void {
   }
   if (map === undefined) return;
   const features = [...specFeatures(plan.spec), ...volumeFeatures(plan.status?.volumes ?? [])];
-  map.set("exclusion", features);
+  map.set("selected", features);
   map.fit(features);
 }
 
 // -- map and connection --
 
 function showRoute(): void {
-  map?.set("path", routeOfForm());
+  map?.set("path", view === "flights" ? routeOfForm() : []);
 }
 
 function routeOfForm(): GeoJSON.Feature[] {
@@ -370,12 +403,18 @@ function showDrones(): void {
   map?.set("depot", positions.map(pointFeature));
 }
 
+function clicked(point: Point): void {
+  if (api === undefined || clicks.deliver(point)) return;
+  if (view === "flights") form.route.add(point);
+  else restrictions.addPoint(point);
+}
+
 async function openMap(): Promise<void> {
   const style = getComputedStyle(document.documentElement);
   const colours = (name: string): string => style.getPropertyValue(`--${name}`).trim();
   try {
     const { PlanMap } = await import("./plan_map");
-    map = new PlanMap(byId("map"), colours, (point) => form.route.add(point));
+    map = new PlanMap(byId("map"), colours, clicked);
     const opened = map;
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => opened.paint(colours));
   } catch (error) {
@@ -389,6 +428,7 @@ async function openMap(): Promise<void> {
   showRoute();
   showDrones();
   showPlans();
+  restrictions.draw();
 }
 
 function showConnection(): void {
@@ -436,6 +476,8 @@ byId("plan").addEventListener("submit", (event) => {
   event.preventDefault();
   void submitPlan();
 });
+byId("view-flights").addEventListener("click", () => showView("flights"));
+byId("view-restrictions").addEventListener("click", () => showView("restrictions"));
 byId("keep").addEventListener("click", endChange);
 setInterval(() => void refresh(), REFRESH_MS);
 setInterval(showConnection, 250);

@@ -1,10 +1,11 @@
 // Form of a plan: reads and shows a FlightPlanSpec.
 
-import { byId } from "../elements";
+import { byId, invalidInput } from "../elements";
 import { Choices } from "./decision";
 import { ParameterForm } from "./parameters";
 import { Route } from "./route";
 import { importedPoints } from "./route_import";
+import { apiTime, inputTime } from "./times";
 import type { ApplicationTemplate, FlightPlanSpec } from "./types";
 
 const MIN_CORNERS = 3;
@@ -28,9 +29,9 @@ export class PlanForm {
 
   /** `changed` is called after each change of the entered values, and `imported` after the import of a file. */
   constructor(changed: () => void, private readonly imported: () => void) {
-    this.route = new Route(changed);
+    this.route = new Route("route", changed);
     this.choices = new Choices(byId("choices"));
-    this.start.value = local(Date.now() + DEFAULT_DELAY_MS);
+    this.start.value = inputTime(Date.now() + DEFAULT_DELAY_MS);
     this.form.addEventListener("input", changed);
     this.template.addEventListener("input", () => this.showTemplate({}));
     byId("import").addEventListener("change", (event) => void this.import(event.target as HTMLInputElement));
@@ -52,7 +53,7 @@ export class PlanForm {
     this.base = spec;
     this.template.value = spec.template;
     this.showTemplate(spec.parameters ?? {});
-    this.start.value = local(Date.parse(spec.window.start));
+    this.start.value = inputTime(Date.parse(spec.window.start));
     this.duration.value = String(spec.window.duration);
     if (typeof spec.stay === "number") this.stay.value = String(spec.stay);
     if (spec.drone && ![...this.drone.options].some(({ value }) => value === spec.drone)) this.drone.append(new Option(spec.drone, spec.drone));
@@ -74,10 +75,14 @@ export class PlanForm {
     const { route } = this;
     if (route.points.length === 0) return route.isRegion ? "Add the corners of the region." : "Add a waypoint.";
     if (route.isRegion && route.points.length < MIN_CORNERS) return "A region needs at least three corners.";
-    const invalid = this.form.querySelector<HTMLInputElement>(":invalid:not(fieldset)");
-    if (invalid === null) return "";
-    const label = invalid.getAttribute("aria-label") ?? invalid.labels?.[0]?.textContent ?? invalid.name;
-    return `${label}: ${invalid.validationMessage}`;
+    return invalidInput(this.form);
+  }
+
+  /** The entered window in Unix milliseconds. Undefined if it is invalid. */
+  get window(): [number, number] | undefined {
+    const begin = Date.parse(`${this.start.value}Z`);
+    const end = begin + this.duration.valueAsNumber * 60_000;
+    return Number.isFinite(end) ? [begin, end] : undefined;
   }
 
   /** The entered specification, if it has no problem. */
@@ -93,7 +98,7 @@ export class PlanForm {
       ...place,
       template: this.template.value,
       parameters: this.parameters.values(),
-      window: { start: `${new Date(`${this.start.value}Z`).toISOString().slice(0, 19)}Z`, duration: this.duration.valueAsNumber },
+      window: { start: apiTime(this.start.value), duration: this.duration.valueAsNumber },
       policyActions: this.choices.actions,
       autoActivate: this.automatic.checked,
       ...(this.drone.value ? { drone: this.drone.value } : {}),
@@ -133,9 +138,4 @@ export class PlanForm {
     // The same file can be selected again after a correction.
     input.value = "";
   }
-}
-
-/** Returns a time as the value of an input of the type datetime-local, in UTC. */
-function local(time: number): string {
-  return new Date(time).toISOString().slice(0, 19);
 }

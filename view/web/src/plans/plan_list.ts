@@ -1,7 +1,7 @@
 // List of plans with their actions.
 
 import { byId, element } from "../elements";
-import { timeOf } from "./decision";
+import { timeOf } from "./times";
 import type { FlightPlan } from "./types";
 
 const IN_FLIGHT = new Set(["Activated", "Nonconforming", "Contingent"]);

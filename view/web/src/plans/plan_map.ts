@@ -1,4 +1,4 @@
-// Map of a plan: route, volumes, other plans and drones. A click adds a point to the route.
+// Map of a plan: route, volumes, restrictions, other plans and drones. A click adds a point to the route or area.
 
 import { type GeoJSONSource, Map as MapLibre, NavigationControl, ScaleControl, type StyleSpecification, setWorkerUrl } from "maplibre-gl";
 import "maplibre-gl/dist/maplibre-gl.css";
@@ -10,10 +10,11 @@ import type { Point } from "./types";
 setWorkerUrl(new URL(workerUrl, window.location.href).href);
 
 const FIT = { padding: 60, maxZoom: 18, animate: false };
-/** Layers of the map in drawing order. Their names are those of colours of the style sheet. */
-const LAYERS = ["corridor", "operationArea", "exclusion", "path", "depot"] as const;
-/** Volumes of other plans have dashed outlines, so that colours are not needed to tell them apart. */
-const DASHES: Partial<Record<Layer, [number, number]>> = { corridor: [3, 2], exclusion: [1, 1] };
+/** Layers of the map in drawing order. Their names are those of colours of the style sheet, unless `COLOURS` contains another one. */
+const LAYERS = ["methods", "limit", "pictures", "exclusion", "corridor", "operationArea", "selected", "area", "path", "depot", "landing"] as const;
+const COLOURS: Partial<Record<Layer, string>> = { selected: "link", area: "accent", landing: "accent" };
+/** Outlines differ in their dashes too, so that colours are not needed to tell them apart. */
+const DASHES: Partial<Record<Layer, [number, number]>> = { methods: [2, 2], limit: [4, 1.5], pictures: [1, 1.5], corridor: [3, 2], selected: [1, 1] };
 const FILL_OPACITY = 0.15;
 
 export type Layer = (typeof LAYERS)[number];
@@ -35,7 +36,7 @@ export class PlanMap {
       fadeDuration: 0,
       maxPitch: 0,
       dragRotate: false,
-      locale: { "Map.Title": "Map of the plan. The table contains the same points" },
+      locale: { "Map.Title": "Map of the plan. The tables and lists contain the same data" },
     });
     this.map.addControl(new NavigationControl({ showCompass: false }), "top-right");
     this.map.addControl(new ScaleControl({}), "bottom-left");
@@ -81,7 +82,7 @@ function style(colours: Colours): StyleSpecification {
   const source: StyleSpecification["sources"][string] = { type: "geojson", data: { type: "FeatureCollection", features: [] } };
   const layers: StyleSpecification["layers"] = [{ id: "background", type: "background", paint: { "background-color": colours("map") } }];
   for (const name of LAYERS) {
-    const colour = colours(name);
+    const colour = colours(COLOURS[name] ?? name);
     layers.push({ id: `${name}-fill`, type: "fill", source: name, filter: ["==", "$type", "Polygon"], paint: { "fill-color": colour, "fill-opacity": FILL_OPACITY } });
     const dashes = DASHES[name] === undefined ? {} : { "line-dasharray": DASHES[name] };
     layers.push({ id: `${name}-line`, type: "line", source: name, filter: ["!=", "$type", "Point"], paint: { "line-color": colour, "line-width": 2, ...dashes } });

@@ -1,4 +1,4 @@
-// Table of the points of a path or region. It is equivalent to drawing on the map.
+// Table of the points of a path or area. It is equivalent to drawing on the map.
 
 import { byId, element } from "../elements";
 import type { Position } from "./types";
@@ -21,15 +21,20 @@ const COLUMNS: Column[] = [
 
 export class Route {
   points: Position[] = [];
-  /** True for a region, whose corners have no altitude. */
+  /** True for an area, whose points have no altitude. */
   isRegion = false;
 
-  constructor(private readonly changed: () => void) {
-    byId("add-point").addEventListener("click", () => {
+  /** The ids of the elements begin with `id`. */
+  constructor(
+    private readonly id: string,
+    private readonly changed: () => void,
+    private readonly areaTitle = "Corners of the region",
+  ) {
+    byId(`${id}-add`).addEventListener("click", () => {
       this.add({ lat: NaN, lon: NaN });
       this.focus(this.points.length - 1);
     });
-    byId("clear-route").addEventListener("click", () => this.set([], this.isRegion));
+    byId(`${id}-clear`).addEventListener("click", () => this.set([], this.isRegion));
   }
 
   /** Replaces all points. */
@@ -51,12 +56,12 @@ export class Route {
   }
 
   private show(): void {
-    byId("route-title").textContent = this.isRegion ? "Corners of the region" : "Waypoints";
+    byId(`${this.id}-title`).textContent = this.isRegion ? this.areaTitle : "Waypoints";
     const head = element("tr");
     const names = ["Point", ...this.columns.map(({ label, name }) => (name === "alt" ? "Altitude (m)" : `${label} (°)`)), "Remove"];
     head.append(...names.map((name) => element("th", "", name)));
-    byId("route-head").replaceChildren(head);
-    byId("route").replaceChildren(...this.points.map((point, index) => this.createRow(point, index)));
+    byId(`${this.id}-head`).replaceChildren(head);
+    byId(this.id).replaceChildren(...this.points.map((point, index) => this.createRow(point, index)));
   }
 
   private createRow(point: Position, index: number): HTMLTableRowElement {
@@ -92,6 +97,6 @@ export class Route {
   }
 
   private focus(index: number): void {
-    (byId("route").querySelectorAll("tr")[index]?.querySelector("input") ?? byId("add-point")).focus();
+    (byId(this.id).querySelectorAll("tr")[index]?.querySelector("input") ?? byId(`${this.id}-add`)).focus();
   }
 }

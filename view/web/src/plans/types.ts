@@ -143,3 +143,82 @@ export interface Drone {
   metadata: Metadata;
   status?: DroneStatus | null;
 }
+
+export interface AltitudeBand {
+  lower?: number | null;
+  upper?: number | null;
+  reference?: string;
+}
+
+export interface ActiveTime {
+  days?: string[];
+  start?: string | null;
+  end?: string | null;
+}
+
+export interface ZoneSpec {
+  description?: string;
+  area: Area;
+  altitude?: AltitudeBand | null;
+  schedule?: ActiveTime[];
+}
+
+export interface PolicySpec {
+  type: string;
+  kind: string;
+  action?: string | null;
+  choices?: string[];
+  methods?: string[];
+  lowerLimit?: number | null;
+  upperLimit?: number | null;
+  altitudeReference?: string;
+  landAt?: Point | null;
+  faces?: string | null;
+  fallback?: string | null;
+  priority?: number;
+  validFrom?: string | null;
+  validUntil?: string | null;
+}
+
+export interface ReadyStatus {
+  conditions?: Condition[];
+}
+
+export interface NewRestriction {
+  name: string;
+  zone: ZoneSpec;
+  policy: PolicySpec;
+}
+
+export interface Restriction {
+  name: string;
+  zone?: ZoneSpec | null;
+  policy: PolicySpec;
+  status?: ReadyStatus | null;
+}
+
+export interface AffectedPlan {
+  namespace: string;
+  name: string;
+  state: string;
+  drone?: string | null;
+  begin: string;
+  end: string;
+}
+
+export interface AffectedFlight {
+  namespace: string;
+  application: string;
+  drone: string;
+}
+
+export interface Impact {
+  plans: AffectedPlan[];
+  flights: AffectedFlight[];
+  unreadable: string[];
+}
+
+export interface Permissions {
+  publishRestrictions: boolean;
+  prioritize: boolean;
+}

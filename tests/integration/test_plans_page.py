@@ -10,7 +10,7 @@ import pytest
 from axe_playwright_python.sync_playwright import Axe
 from browser import CHROMIUM, SOFTWARE_GL, TIMEOUT_MS, launched
 from control_plane import wait_for
-from management_server import Body, ManagementServer, User, plan, restriction, submitted
+from management_server import Body, ManagementServer, User, plan, restriction, submitted, user_token
 from operator_world import FRACTUS, LAT, LON, World, approved_region_template, approved_template, at, fractus_object
 from playwright.sync_api import Browser, Page, Playwright, Route, expect, sync_playwright
 
@@ -197,12 +197,107 @@ def test_plans_page_requires_an_action_for_each_policy_with_choices(page: Page, 
     expect_decision(page, "Select an action for school.")
     submit = page.get_by_role("button", name="Submit the plan")
     expect(submit).to_be_disabled()
-    page.get_by_label("land", exact=True).check()
+    page.get_by_role("radio", name="land: ").check()
     expect_decision(page, "Accepted")
     submit.click()
     expect(page.locator("#plans > li")).to_contain_text("Accepted", timeout=TIMEOUT_MS)
     (stored,) = pilot("GET", "/v1/plans").body["items"]
     assert stored["spec"]["policyActions"] == [{"policy": "school", "action": "land"}]
+
+
+def test_plans_page_requires_a_landing_place_for_an_abort(page: Page, pilot: User, world: World) -> None:
+    square = [{"lat": 39.4 + north, "lon": 22.97 + east} for north, east in ((0, 0), (0, 0.001), (0.001, 0.001))]
+    world.put(fractus_object("Zone", "yard", {"area": {"polygon": {"exterior": square}}}))
+    spec = {"type": "GeofenceControl", "kind": "exclusion", "selector": {"zones": ["yard"]}}
+    world.put(fractus_object("Policy", "school", spec | {"action": "hover", "choices": ["abort"]}))
+    sign_in(page, pilot)
+    enter_point(page, 1, 50, 50, 20)
+    expect_decision(page, "Select an action for school.")
+    page.get_by_role("radio", name="abort: ").check()
+    expect_decision(page, "Land at")
+    submit = page.get_by_role("button", name="Submit the plan")
+    expect(submit).to_be_disabled()
+    place = page.get_by_role("group", name="Landing place for school")
+    place.get_by_label("Land at").select_option("another place")
+    expect(submit).to_be_disabled()
+    page.wait_for_selector("#map[data-map=ready]")
+    place.get_by_role("button", name="Select on the map").press("Enter")
+    page.locator("#map canvas").click()
+    expect(page.locator("#route tr")).to_have_count(1)
+    latitude = float(place.get_by_label("Latitude").input_value())
+    longitude = float(place.get_by_label("Longitude").input_value())
+    result = Axe().run(page)
+    assert result.violations_count == 0, result.generate_report()
+    expect_decision(page, "Accepted")
+    submit.click()
+    expect(page.locator("#plans > li")).to_contain_text("Accepted", timeout=TIMEOUT_MS)
+    (stored,) = pilot("GET", "/v1/plans").body["items"]
+    (action,) = stored["spec"]["policyActions"]
+    assert action == {"policy": "school", "action": "abort", "landAt": {"lat": latitude, "lon": longitude}}
+
+
+def test_plans_page_keeps_the_landing_place_after_lost_contact(page: Page, pilot: User) -> None:
+    sign_in(page, pilot)
+    enter_point(page, 1, 50, 50, 20)
+    page.get_by_role("radio", name="abort, and land").check()
+    place = page.get_by_role("group", name="Landing place after lost contact")
+    place.get_by_label("Land at").select_option("another place")
+    place.get_by_label("Latitude").fill(str(LAT))
+    place.get_by_label("Longitude").fill(str(LON))
+    expect_decision(page, "Accepted")
+    page.get_by_role("button", name="Submit the plan").click()
+    expect(page.locator("#plans > li")).to_contain_text("Accepted", timeout=TIMEOUT_MS)
+    (stored,) = pilot("GET", "/v1/plans").body["items"]
+    assert stored["spec"]["contactLost"]["landAt"] == {"lat": LAT, "lon": LON}
+    name = stored["metadata"]["name"]
+    page.get_by_role("button", name=f"Change {name}").click()
+    expect(place.get_by_label("Latitude")).to_have_value(str(LAT))
+
+
+def test_plans_page_offers_higher_priorities_only_to_users_who_may_select_them(
+    page: Page, pilot: User, world: World, namespace: str
+) -> None:
+    sign_in(page, pilot)
+    expect(page.locator("#priority-help")).to_contain_text("fractus-flightplan-prioritizer")
+    expect(page.get_by_label("Priority").locator("option", has_text="emergency")).to_be_disabled()
+    user_token(world, namespace, "pilot", ("fractus-flightplan-prioritizer",), ())
+    wait_for(lambda: pilot("GET", "/v1/permissions").body["prioritize"], "the role of the pilot")
+    page.reload()
+    enter_point(page, 1, 50, 50, 20)
+    page.get_by_label("Priority").select_option("emergency")
+    expect_decision(page, "Accepted")
+    page.get_by_role("button", name="Submit the plan").click()
+    expect(page.locator("#plans > li")).to_contain_text("Accepted", timeout=TIMEOUT_MS)
+    (stored,) = pilot("GET", "/v1/plans").body["items"]
+    assert stored["spec"]["priorityClass"] == "emergency"
+
+
+def test_plans_page_lists_the_restrictions_during_the_flight(
+    page: Page, pilot: User, authority: User, world: World, namespace: str
+) -> None:
+    authority("POST", "/v1/restrictions", restriction("present"))
+    authority("POST", "/v1/restrictions", restriction("later", validFrom="2098-01-01T00:00:00Z"))
+    user_token(world, namespace, "pilot", (), ("fractus-policy-viewer", "fractus-zone-viewer"))
+    wait_for(lambda: pilot("GET", "/v1/restrictions").status == 200, "the roles of the pilot")
+    sign_in(page, pilot)
+    listed = page.locator("#restrictions > li")
+    expect(listed).to_have_count(1, timeout=TIMEOUT_MS)
+    expect(listed).to_contain_text("present")
+    expect(page.get_by_role("button", name="Delete present")).to_have_count(0)
+    page.get_by_label("Start (UTC)").fill("2098-06-01T10:00:00")
+    expect(listed).to_have_count(2)
+
+
+def test_plans_page_checks_a_change_without_a_conflict_with_the_plan_itself(page: Page, pilot: User) -> None:
+    name = submitted(pilot).body["metadata"]["name"]
+    sign_in(page, pilot)
+    page.get_by_role("button", name=f"Change {name}").click()
+    with page.expect_response("**/v1/plans/*:check?*") as checked:
+        page.get_by_label("Duration in minutes").fill("20")
+    assert checked.value.json()["status"]["state"] == "Accepted"
+    expect_decision(page, f"You change {name}. Accepted")
+    page.get_by_label("Start (UTC)").fill("2098-01-01T00:00:00")
+    expect_decision(page, f"You change {name}. Rejected")
 
 
 def test_plans_page_shows_parameters_of_the_template(page: Page, pilot: User, world: World) -> None:

@@ -1,39 +1,52 @@
 // Decision on a plan: reasons, drones, volumes, and the choices of repair actions.
 
 import { byId, element } from "../elements";
+import { LandingPlace } from "./landing_place";
+import type { MapClicks } from "./map_clicks";
+import { actionName } from "./restriction_text";
 import { timeOf } from "./times";
-import type { FlightPlanStatus, PlanFinding, PlanRestriction, PolicyAction } from "./types";
+import type { FlightPlanStatus, PlanFinding, PlanRestriction, Point, PolicyAction } from "./types";
 
-/** Radio groups for the policies that have several repair actions. */
+/** Radio groups for the policies that have several repair actions, with the landing place of an abort. */
 export class Choices {
-  private readonly selected = new Map<string, string>();
+  private readonly selected = new Map<string, PolicyAction>();
+  private readonly places = new Map<string, LandingPlace>();
   private policies: PlanRestriction[] = [];
   private shown = "";
 
-  constructor(private readonly parent: HTMLElement) {}
+  constructor(
+    private readonly parent: HTMLElement,
+    private readonly clicks: MapClicks,
+  ) {}
 
   /** Shows the policies of a decision. The same policies are not shown again, so that the focus stays. */
   show(restrictions: PlanRestriction[]): void {
     this.policies = restrictions.filter(({ choices }) => (choices ?? []).length > 1);
     const names = new Set(this.policies.map(({ policy }) => policy));
     for (const policy of this.selected.keys()) if (!names.has(policy)) this.selected.delete(policy);
-    for (const { policy, chosen } of this.policies) if (chosen && !this.selected.has(policy)) this.selected.set(policy, chosen);
+    for (const { policy, chosen } of this.policies) if (chosen && !this.selected.has(policy)) this.selected.set(policy, { policy, action: chosen });
     const key = JSON.stringify(this.policies.map(({ policy, choices }) => [policy, choices]));
     if (key === this.shown) return;
     this.shown = key;
+    this.places.clear();
     this.parent.replaceChildren(...this.policies.map((restriction) => this.createGroup(restriction)));
   }
 
   /** Replaces all selections. */
   select(actions: PolicyAction[]): void {
     this.selected.clear();
-    for (const { policy, action } of actions) this.selected.set(policy, action);
+    for (const action of actions) this.selected.set(action.policy, action);
     this.shown = "";
   }
 
   /** Selected actions of the shown policies. */
   get actions(): PolicyAction[] {
-    return [...this.selected].map(([policy, action]) => ({ policy, action }));
+    return [...this.selected.values()].map((selected) => {
+      const place = this.places.get(selected.policy);
+      if (place === undefined) return selected;
+      const { policy, action } = selected;
+      return action === "abort" && place.place !== undefined ? { policy, action, landAt: place.place } : { policy, action };
+    });
   }
 
   /** Policies without a selected action. */
@@ -41,18 +54,37 @@ export class Choices {
     return this.policies.map(({ policy }) => policy).filter((policy) => !this.selected.has(policy));
   }
 
-  private createGroup({ policy, choices }: PlanRestriction): HTMLFieldSetElement {
+  /** Selected landing places. */
+  get landingPlaces(): Point[] {
+    return [...this.places.values()].flatMap(({ entered }) => entered);
+  }
+
+  private createGroup({ policy, choices = [] }: PlanRestriction): HTMLFieldSetElement {
     const group = element("fieldset");
     group.append(element("legend", "", `If the flight violates the policy ${policy}`));
-    for (const choice of choices ?? []) {
+    const before = this.selected.get(policy);
+    const place = choices.includes("abort") ? this.createPlace(policy, before) : undefined;
+    for (const choice of choices) {
       const radio = element("input");
-      Object.assign(radio, { type: "radio", name: `choice-${policy}`, value: choice, checked: this.selected.get(policy) === choice });
-      radio.addEventListener("input", () => this.selected.set(policy, choice));
+      Object.assign(radio, { type: "radio", name: `choice-${policy}`, value: choice, checked: before?.action === choice });
+      radio.addEventListener("input", () => {
+        this.selected.set(policy, { policy, action: choice });
+        place?.show(choice === "abort");
+      });
       const label = element("label");
-      label.append(radio, choice);
+      label.append(radio, choice === actionName(choice) ? choice : `${choice}: ${actionName(choice)}`);
       group.append(label);
     }
+    if (place !== undefined) group.append(place.field);
     return group;
+  }
+
+  private createPlace(policy: string, selected: PolicyAction | undefined): LandingPlace {
+    const place = new LandingPlace(`land-at-${policy}`, `for ${policy}`, "the place of the policy, or home", this.clicks);
+    if (selected?.action === "abort") place.place = selected.landAt;
+    place.show(selected?.action === "abort");
+    this.places.set(policy, place);
+    return place;
   }
 }
 

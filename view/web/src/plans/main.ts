@@ -46,7 +46,7 @@ let followed = "";
 
 const clicks = new MapClicks();
 const submit = byId<HTMLButtonElement>("submit");
-const form = new PlanForm(edited, () => map?.fit(routeOfForm()));
+const form = new PlanForm(clicks, edited, () => map?.fit(routeOfForm()));
 const list = new PlanList({
   follow,
   start: (plan) => void act(plan, (client) => sendSeen(client, plan, "POST", ":activate")),
@@ -81,6 +81,7 @@ async function signIn(token: string, namespace: string): Promise<void> {
     await restrictions.load(api);
     const permissions = (await api.send<Permissions>("GET", "/permissions")).body;
     restrictions.permit(permissions.publishRestrictions);
+    form.permitPriority(permissions.prioritize);
     form.offer(templates, drones.map(({ metadata }) => metadata.name));
   } catch (error) {
     signOut(sentence(error));
@@ -107,9 +108,8 @@ async function optionalDrones(client: Api): Promise<Drone[]> {
 
 function signOut(reason = ""): void {
   api = undefined;
-  checking.abort();
+  stopChecking();
   following.abort();
-  clearTimeout(checkTimer);
   plans = [];
   drones = [];
   changed = undefined;
@@ -150,17 +150,20 @@ function showRestrictions(): void {
 
 /** Called after each change of the form: checks the plan when the user pauses. */
 function edited(): void {
-  clearTimeout(checkTimer);
-  checking.abort();
+  stopChecking();
   submitted = false;
   unchecked = "";
   key = randomKey();
   showRoute();
   showRestrictions();
-  // A check of a change would conflict with the reservation of the plan itself.
   if (changed === undefined) decision = undefined;
-  if (changed === undefined && form.problem === "") checkTimer = window.setTimeout(() => void check(), CHECK_DELAY_MS);
+  if (form.problem === "") checkTimer = window.setTimeout(() => void check(), CHECK_DELAY_MS);
   showDecision();
+}
+
+function stopChecking(): void {
+  clearTimeout(checkTimer);
+  checking.abort();
 }
 
 async function check(): Promise<void> {
@@ -169,7 +172,7 @@ async function check(): Promise<void> {
   const { signal } = checking;
   const spec = form.spec;
   try {
-    const { body } = await api.send<FlightPlan>("POST", "/plans:check", spec, {}, signal);
+    const { body } = await api.send<FlightPlan>("POST", changed === undefined ? "/plans:check" : pathOf(changed, ":check"), spec, {}, signal);
     if (signal.aborted) return;
     decide(body.status ?? {});
     // The policies have changed, and with them the selected actions.
@@ -234,6 +237,7 @@ async function submitPlan(): Promise<void> {
       changed = undefined;
       form.release();
       submitted = true;
+      stopChecking();
       decide(plan.status ?? {});
       byId("plans-title").focus();
     } else if (target !== undefined && changed === target) {
@@ -392,6 +396,7 @@ function showPlan(name: string): void {
 
 function showRoute(): void {
   map?.set("path", view === "flights" ? routeOfForm() : []);
+  map?.set("landing", view === "flights" ? form.landingPlaces.map(pointFeature) : []);
 }
 
 function routeOfForm(): GeoJSON.Feature[] {

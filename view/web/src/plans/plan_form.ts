@@ -2,11 +2,13 @@
 
 import { byId, invalidInput } from "../elements";
 import { Choices } from "./decision";
+import { LandingPlace } from "./landing_place";
+import type { MapClicks } from "./map_clicks";
 import { ParameterForm } from "./parameters";
 import { Route } from "./route";
 import { importedPoints } from "./route_import";
 import { apiTime, inputTime } from "./times";
-import type { ApplicationTemplate, FlightPlanSpec } from "./types";
+import type { ApplicationTemplate, FlightPlanSpec, Point } from "./types";
 
 const MIN_CORNERS = 3;
 /** Time until the default start. */
@@ -23,14 +25,23 @@ export class PlanForm {
   private readonly stay = byId<HTMLInputElement>("stay");
   private readonly drone = byId<HTMLSelectElement>("drone");
   private readonly automatic = byId<HTMLInputElement>("automatic");
+  private readonly priority = byId<HTMLSelectElement>("priority");
+  private readonly contactPlace: LandingPlace;
   private templates: ApplicationTemplate[] = [];
   /** Specification whose other fields are kept. */
   private base: Partial<FlightPlanSpec> = {};
 
   /** `changed` is called after each change of the entered values, and `imported` after the import of a file. */
-  constructor(changed: () => void, private readonly imported: () => void) {
+  constructor(
+    clicks: MapClicks,
+    changed: () => void,
+    private readonly imported: () => void,
+  ) {
     this.route = new Route("route", changed);
-    this.choices = new Choices(byId("choices"));
+    this.choices = new Choices(byId("choices"), clicks);
+    this.contactPlace = new LandingPlace("contact-land-at", "after lost contact", "home", clicks);
+    byId("contact-lost").append(this.contactPlace.field);
+    byId("contact-lost").addEventListener("input", () => this.contactPlace.show(this.contact === "abort"));
     this.start.value = inputTime(Date.now() + DEFAULT_DELAY_MS);
     this.form.addEventListener("input", changed);
     this.template.addEventListener("input", () => this.showTemplate({}));
@@ -43,6 +54,19 @@ export class PlanForm {
     this.template.replaceChildren(...this.templates.map(({ metadata }) => new Option(metadata.name, metadata.name)));
     this.drone.replaceChildren(new Option("any suitable drone", ""), ...drones.map((name) => new Option(name, name)));
     this.showTemplate({});
+  }
+
+  /** Shows which priority classes the user may select. */
+  permitPriority(permitted: boolean): void {
+    for (const option of this.priority.options) option.disabled = option.value !== "normal" && !permitted;
+    byId("priority-help").textContent = permitted
+      ? "A plan may overlap plans of a lower class."
+      : "Other classes need the role fractus-flightplan-prioritizer, which an administrator can give you.";
+  }
+
+  /** Selected landing places. */
+  get landingPlaces(): Point[] {
+    return [...this.choices.landingPlaces, ...this.contactPlace.entered];
   }
 
   /** Shows a specification. Throws an Error with a sentence if the form cannot represent it. */
@@ -59,7 +83,10 @@ export class PlanForm {
     if (spec.drone && ![...this.drone.options].some(({ value }) => value === spec.drone)) this.drone.append(new Option(spec.drone, spec.drone));
     this.drone.value = spec.drone ?? "";
     this.automatic.checked = spec.autoActivate ?? false;
+    this.priority.value = spec.priorityClass ?? "normal";
     this.contact = spec.contactLost?.action ?? "";
+    if (this.contact === "abort") this.contactPlace.place = spec.contactLost?.landAt;
+    this.contactPlace.show(this.contact === "abort");
     this.choices.select(spec.policyActions ?? []);
     this.route.set(polygon ? polygon.exterior : (spec.waypoints ?? []), polygon != null);
   }
@@ -92,13 +119,16 @@ export class PlanForm {
     const place = route.isRegion
       ? { region: { polygon: { exterior: route.points } }, stay: this.stay.valueAsNumber }
       : { waypoints: route.points };
-    const reaction = contactLost?.action === this.contact ? contactLost : { action: this.contact };
+    const { landAt: _landAt, ...kept } = contactLost?.action === this.contact ? contactLost : {};
+    const landAt = this.contact === "abort" ? this.contactPlace.place : undefined;
+    const reaction = { ...kept, action: this.contact, ...(landAt ? { landAt } : {}) };
     return {
       ...base,
       ...place,
       template: this.template.value,
       parameters: this.parameters.values(),
       window: { start: apiTime(this.start.value), duration: this.duration.valueAsNumber },
+      priorityClass: this.priority.value,
       policyActions: this.choices.actions,
       autoActivate: this.automatic.checked,
       ...(this.drone.value ? { drone: this.drone.value } : {}),

@@ -13,7 +13,7 @@ export const ACTIONS: Record<string, string> = {
   ignore: "refuse the request",
   adjust: "correct the request",
   hover: "stop and hover",
-  land: "land there",
+  land: "land where the drone is",
   returnToLaunch: "fly home",
   abort: "withdraw all rights, and land at a place",
   revoke: "withdraw all rights, and fly home",

@@ -49,10 +49,12 @@ export interface FlightWindow {
 export interface PolicyAction {
   policy: string;
   action: string;
+  landAt?: Point | null;
 }
 
 export interface ContactLoss {
   action?: string;
+  landAt?: Point | null;
 }
 
 export interface FlightPlanSpec {
@@ -63,6 +65,7 @@ export interface FlightPlanSpec {
   stay?: number | null;
   window: FlightWindow;
   drone?: string | null;
+  priorityClass?: string;
   policyActions?: PolicyAction[];
   contactLost?: ContactLoss | null;
   use?: string;

@@ -21,7 +21,6 @@ AUTHORITY_ROLES = (
     "fractus-flightplan-viewer",
     "fractus-drone-viewer",
     "fractus-grant-viewer",
-    "fractus-applicationtemplate-viewer",
 )
 
 # Background jobs of a shell ignore SIGINT, and nohup ignores SIGHUP. Programs that tests start would also ignore them.

@@ -518,6 +518,7 @@ def test_plans_page_leads_an_authority_from_an_area_to_a_published_restriction(
 
 def test_plans_page_imports_the_polygon_of_a_restriction(page: Page, authority: User) -> None:
     open_restrictions(page, authority)
+    expect_decision(page, "fractus-applicationtemplate-viewer")
     corners = [at(10, 10), at(40, 10), at(40, 40)]
     ring = [[corner["lon"], corner["lat"]] for corner in [*corners, corners[0]]]
     content = json.dumps({"type": "Polygon", "coordinates": [ring]})

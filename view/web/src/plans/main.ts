@@ -76,8 +76,8 @@ async function signIn(token: string, namespace: string): Promise<void> {
   });
   try {
     plans = await api.list<FlightPlan>("/plans");
-    const templates = await api.list<ApplicationTemplate>("/apps");
-    drones = await optionalDrones(api);
+    const templates = await readable<ApplicationTemplate>(api, "/apps");
+    drones = (await readable<Drone>(api, "/drones")) ?? [];
     await restrictions.load(api);
     const permissions = (await api.send<Permissions>("GET", "/permissions")).body;
     restrictions.permit(permissions.publishRestrictions);
@@ -96,12 +96,12 @@ async function signIn(token: string, namespace: string): Promise<void> {
   showDrones();
 }
 
-/** Returns the drones, or none if the user may not read them. */
-async function optionalDrones(client: Api): Promise<Drone[]> {
+/** Returns a list, or undefined if the user may not read it. */
+async function readable<T>(client: Api, path: string): Promise<T[] | undefined> {
   try {
-    return await client.list<Drone>("/drones");
+    return await client.list<T>(path);
   } catch (error) {
-    if (error instanceof Problem && error.status === 403) return [];
+    if (error instanceof Problem && error.status === 403) return undefined;
     throw error;
   }
 }

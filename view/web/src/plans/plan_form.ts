@@ -11,6 +11,8 @@ import { apiTime, inputTime } from "./times";
 import type { ApplicationTemplate, FlightPlanSpec, Point } from "./types";
 
 const MIN_CORNERS = 3;
+const NOT_APPROVED = "No application is approved. An authority must approve one.";
+const UNREADABLE = "You may not read applications. An administrator can give you the role fractus-applicationtemplate-viewer.";
 /** Time until the default start. */
 const DEFAULT_DELAY_MS = 10 * 60_000;
 
@@ -28,6 +30,8 @@ export class PlanForm {
   private readonly priority = byId<HTMLSelectElement>("priority");
   private readonly contactPlace: LandingPlace;
   private templates: ApplicationTemplate[] = [];
+  /** Reason why no application can be selected. */
+  private noTemplate = NOT_APPROVED;
   /** Specification whose other fields are kept. */
   private base: Partial<FlightPlanSpec> = {};
 
@@ -48,9 +52,10 @@ export class PlanForm {
     byId("import").addEventListener("change", (event) => void this.import(event.target as HTMLInputElement));
   }
 
-  /** Shows the applications and drones among which the user selects. Only approved applications are shown. */
-  offer(templates: ApplicationTemplate[], drones: string[]): void {
-    this.templates = templates.filter(({ status }) => status?.conditions?.some(({ type, status: value }) => type === "Ready" && value === "True"));
+  /** Shows the approved applications and the drones among which the user selects. Undefined: the user may not read applications. */
+  offer(templates: ApplicationTemplate[] | undefined, drones: string[]): void {
+    this.noTemplate = templates === undefined ? UNREADABLE : NOT_APPROVED;
+    this.templates = (templates ?? []).filter(({ status }) => status?.conditions?.some(({ type, status: value }) => type === "Ready" && value === "True"));
     this.template.replaceChildren(...this.templates.map(({ metadata }) => new Option(metadata.name, metadata.name)));
     this.drone.replaceChildren(new Option("any suitable drone", ""), ...drones.map((name) => new Option(name, name)));
     this.showTemplate({});
@@ -98,7 +103,7 @@ export class PlanForm {
 
   /** Returns the first problem of the entered values as a sentence, or an empty text. */
   get problem(): string {
-    if (this.templates.length === 0) return "No application is approved. An authority must approve one.";
+    if (this.templates.length === 0) return this.noTemplate;
     const { route } = this;
     if (route.points.length === 0) return route.isRegion ? "Add the corners of the region." : "Add a waypoint.";
     if (route.isRegion && route.points.length < MIN_CORNERS) return "A region needs at least three corners.";

@@ -70,8 +70,9 @@ export class Restrictions {
     this.show();
   }
 
-  /** Reads the restrictions. */
+  /** Reads the restrictions, unless the user may not read them. */
   async load(client: Api): Promise<void> {
+    if (!this.readable) return;
     try {
       const items = await client.list<Restriction>("/restrictions");
       if (client !== this.page.api()) return;
@@ -94,6 +95,7 @@ export class Restrictions {
   /** Forgets all data of the user. */
   clear(): void {
     this.items = [];
+    this.readable = true;
     this.release();
     this.show();
   }

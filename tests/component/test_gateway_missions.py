@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import asyncio
+import math
 import os
 import time
 from pathlib import Path
+from typing import Any
 
 import sky_drone
 from closed_loop import Sky
 from fractus_core.api.names import ComponentIdentity
 from fractus_core.control import OutcomeKind
 from gateway_world import ACCEPTED, DENIED, GUIDED, Flight, flying, item, mavlink_spec, waypoint
-from mobility_world import zone
+from mobility_world import FRAME, zone
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 AUTO = mavlink.COPTER_MODE_AUTO
@@ -96,6 +98,31 @@ def test_leg_through_a_forbidden_zone_is_refused(tmp_path: Path) -> None:
         jump = [TAKEOFF, waypoint(0, 20), waypoint(40, 0), waypoint(40, 80), waypoint(0, 80), item(177, 2, -1)]
         assert await program.upload(*jump) == mavlink.MAV_MISSION_DENIED
         assert "Mission: item 2: " in program.texts
+        await program.close()
+
+    fly(flight, tmp_path)
+
+
+def test_circle_is_judged_over_its_whole_path_and_flown(tmp_path: Path) -> None:
+    def circle(y: float) -> dict[str, Any]:
+        return {**waypoint(0, y, command=mavlink.MAV_CMD_NAV_LOITER_TURNS), "param1": 1.0, "param3": 15.0}
+
+    async def flight(world):
+        program, _ = await ready(world, zone("pool", "ignore", -5, 40, 5, 50))
+        # Centre and nearest point are legal, but the circle passes through the zone.
+        assert await program.upload(TAKEOFF, circle(28), HOME) == mavlink.MAV_MISSION_DENIED
+        assert "Mission: item 2: " in program.texts
+        assert await program.upload(TAKEOFF, circle(20), HOME) == mavlink.MAV_MISSION_ACCEPTED, program.texts
+        begun = len(program.received)
+        await start(program)
+        await program.until(lambda: program.reached[-1:] == [2], 300.0)
+        reports = [m for m in program.received[begun:] if m.name == "GLOBAL_POSITION_INT"]
+        points = [FRAME.xy(m.integer("lat") / 1e7, m.integer("lon") / 1e7) for m in reports]
+        bearings = {
+            round(math.degrees(math.atan2(x, y - 20)) / 45) % 8 for x, y in points if math.hypot(x, y - 20) > 14
+        }
+        assert bearings == set(range(8))
+        assert max(math.hypot(x, y - 20) for x, y in points if y > 10) < 16.5
         await program.close()
 
     fly(flight, tmp_path)

@@ -58,6 +58,15 @@ async def test_items_are_flown_in_order_until_a_landing() -> None:
     assert mission.current == 3
 
 
+async def test_condition_delay_waits_before_the_next_item() -> None:
+    delay = Item(mavlink.MAV_CMD_CONDITION_DELAY, param1=0.6)
+    _, _, methods = await _fly(WAYPOINT, delay, WAYPOINT, time_s=0.5)
+    assert methods == ["Goto"]
+    _, reports, methods = await _fly(WAYPOINT, delay, WAYPOINT)
+    assert methods == ["Goto", "Goto"]
+    assert reports.reached == [1, 2, 3]
+
+
 async def test_jump_is_repeated_as_often_as_it_says() -> None:
     jump = Item(mavlink.MAV_CMD_DO_JUMP, param1=1, param2=2)
     mission, reports, methods = await _fly(WAYPOINT, jump, WAYPOINT)

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
+from itertools import pairwise
+from typing import Any
 
 import pytest
+from fractus_core.geo import LocalFrame
 from fractus_proto.v1 import types_pb2
 from fractus_services.gateway.mission_route import MAX_STEPS, ItemRefused, Place, check_item, requests_of, route_of
 from fractus_services.gateway.translate import Request, Untranslatable
@@ -30,25 +34,32 @@ def _route(*items: Item, on_ground: bool = False) -> list[tuple[int, Request]]:
     return route_of(mission, 1, HERE, on_ground=on_ground)
 
 
+def _requests(item: Item, at: Place) -> tuple[list[Request], Place]:
+    """Return the calls of an item, and the place to which they lead."""
+    mission = Mission()
+    mission.store.items = [HOME, item]
+    return requests_of(mission, 1, at)
+
+
 def _place(request: Request) -> tuple[float, float, int]:
     target = request.message.target
     return round(target.latitude_deg, 6), target.altitude_m, target.altitude_reference
 
 
 def test_waypoint_without_place_or_altitude_keeps_them() -> None:
-    (request,), at = requests_of(Item(mavlink.MAV_CMD_NAV_WAYPOINT, z=20.0), HERE)
+    (request,), at = _requests(Item(mavlink.MAV_CMD_NAV_WAYPOINT, z=20.0), HERE)
     assert _place(request) == (39.36, 20.0, types_pb2.ALTITUDE_REFERENCE_HOME)
-    (request,), _ = requests_of(_waypoint(39.37, 0.0), at)
+    (request,), _ = _requests(_waypoint(39.37, 0.0), at)
     assert _place(request) == (39.37, 20.0, types_pb2.ALTITUDE_REFERENCE_HOME)
 
 
 def test_altitude_above_sea_level_is_passed_on() -> None:
-    (request,), _ = requests_of(_waypoint(39.37, 50.0, frame=mavlink.MAV_FRAME_GLOBAL), HERE)
+    (request,), _ = _requests(_waypoint(39.37, 50.0, frame=mavlink.MAV_FRAME_GLOBAL), HERE)
     assert _place(request) == (39.37, 50.0, types_pb2.ALTITUDE_REFERENCE_AMSL)
 
 
 def test_landing_with_a_place_flies_there_at_the_present_altitude() -> None:
-    requests, _ = requests_of(Item(mavlink.MAV_CMD_NAV_LAND, x=393_700_000, y=229_500_000), HERE)
+    requests, _ = _requests(Item(mavlink.MAV_CMD_NAV_LAND, x=393_700_000, y=229_500_000), HERE)
     assert [request.method for request in requests] == ["Goto", "Land"]
     assert _place(requests[0]) == (39.37, 7.0, types_pb2.ALTITUDE_REFERENCE_HOME)
 
@@ -75,6 +86,82 @@ def test_jump_is_judged_twice(times: int) -> None:
 def test_jump_without_repetition_is_not_judged() -> None:
     route = _route(_waypoint(39.37), _waypoint(39.38), _jump(1, 0), _waypoint(39.39))
     assert [number for number, _ in route] == [1, 2, 4]
+
+
+def _circle(turns: float, radius_m: float = 0.0, **changes: Any) -> Item:
+    values = {"x": 393_700_000, "y": 229_500_000, "z": 15.0, **changes}
+    return Item(mavlink.MAV_CMD_NAV_LOITER_TURNS, param1=turns, param3=radius_m, **values)
+
+
+def _corners(requests: list[Request]) -> list[tuple[float, float]]:
+    """Return distance in metres and bearing in degrees from the centre of `_circle` to each target."""
+    frame = LocalFrame(39.37, 22.95)
+    points = [frame.xy(r.message.target.latitude_deg, r.message.target.longitude_deg) for r in requests]
+    return [(math.hypot(*point), math.degrees(math.atan2(*point)) % 360.0) for point in points]
+
+
+@pytest.mark.parametrize(("radius_m", "turn_deg"), [(30.0, 22.5), (-30.0, -22.5)])
+def test_circle_is_flown_as_legs_between_its_points_from_the_nearest_one_on(radius_m: float, turn_deg: float) -> None:
+    requests, at = _requests(_circle(1, radius_m), Place(39.36, 22.95, 7.0))
+    corners = _corners(requests)
+    assert [distance for distance, _ in corners] == pytest.approx([30.0] * 17)
+    assert corners[0][1] == pytest.approx(180.0), "the drone is south of the centre"
+    turns = [(second - first) % 360.0 for (_, first), (_, second) in pairwise(corners)]
+    assert turns == pytest.approx([turn_deg % 360.0] * 16, abs=0.1)
+    assert {request.message.target.altitude_m for request in requests} == {15.0}
+    assert (at.lat, at.lon) == pytest.approx((requests[0].message.target.latitude_deg, 22.95))
+
+
+@pytest.mark.parametrize(("turns", "legs"), [(0.0, 1), (0.5, 9), (1.0, 17), (3.0, 49)])
+def test_circle_is_repeated_as_often_as_its_item_says(turns: float, legs: int) -> None:
+    requests, _ = _requests(_circle(turns), HERE)
+    assert len(requests) == legs
+    assert _corners(requests)[0][0] == pytest.approx(10.0)
+
+
+def test_one_turn_of_a_circle_is_judged() -> None:
+    assert len(_route(_circle(255, 20.0))) == 17
+    assert len(_route(_circle(0.25, 20.0))) == 5
+
+
+def test_route_with_too_many_circles_is_refused() -> None:
+    assert len(_route(*[_circle(1)] * 58)) == 58 * 17
+    with pytest.raises(Untranslatable, match=f"more than {MAX_STEPS} legs"):
+        _route(*[_circle(1)] * 59)
+
+
+def test_condition_yaw_is_the_heading_of_the_next_leg() -> None:
+    yaw = Item(mavlink.MAV_CMD_CONDITION_YAW, param1=-90.0)
+    first, second, third = (
+        request.message for _, request in _route(_waypoint(39.37), yaw, _waypoint(39.38), _waypoint(39.39))
+    )
+    assert not first.HasField("yaw_deg")
+    assert second.yaw_deg == 270.0
+    assert not third.HasField("yaw_deg")
+
+
+def test_condition_distance_divides_the_next_leg() -> None:
+    near = Item(mavlink.MAV_CMD_CONDITION_DISTANCE, param1=50.0)
+    camera = Item(mavlink.MAV_CMD_DO_MOUNT_CONTROL, param1=-90.0, z=2.0)
+    route = _route(_waypoint(39.37, 10.0), near, camera, _waypoint(39.371, 20.0))
+    assert [request.method for _, request in route] == ["Goto", "Goto", "PointGimbal", "Goto"]
+    target = route[1][1].message.target
+    east, north = LocalFrame(39.371, 22.95).xy(target.latitude_deg, target.longitude_deg)
+    assert (east, north) == pytest.approx((0.0, -50.0), abs=0.1)
+    assert target.altitude_m == pytest.approx(20.0 - 10.0 * 50.0 / 111.0, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    "items",
+    [
+        [Item(mavlink.MAV_CMD_CONDITION_DISTANCE, param1=500.0), _waypoint(39.371)],
+        [Item(mavlink.MAV_CMD_CONDITION_DISTANCE, param1=5.0), Item(mavlink.MAV_CMD_NAV_RETURN_TO_LAUNCH)],
+        [Item(mavlink.MAV_CMD_CONDITION_DISTANCE, param1=5.0)],
+    ],
+)
+def test_condition_distance_without_a_distant_waypoint_has_no_effect(items: list[Item]) -> None:
+    route = _route(_waypoint(39.37), *items)
+    assert len(route) == len(items)
 
 
 def test_route_with_too_many_steps_is_refused() -> None:
@@ -135,6 +222,10 @@ def test_speed_and_camera_items_become_calls() -> None:
             mavlink.MAV_MISSION_UNSUPPORTED_FRAME,
         ),
         (Item(mavlink.MAV_CMD_DO_CHANGE_SPEED, param1=2.0, param2=3.0), mavlink.MAV_MISSION_INVALID_PARAM1),
+        (Item(mavlink.MAV_CMD_CONDITION_YAW, param1=10.0, param4=1.0), mavlink.MAV_MISSION_INVALID_PARAM4),
+        (_circle(1, frame=mavlink.MAV_FRAME_GLOBAL_TERRAIN_ALT), mavlink.MAV_MISSION_UNSUPPORTED_FRAME),
+        (Item(mavlink.MAV_CMD_DO_SET_ROI_LOCATION), mavlink.MAV_MISSION_UNSUPPORTED),
+        (Item(mavlink.MAV_CMD_IMAGE_START_CAPTURE), mavlink.MAV_MISSION_UNSUPPORTED),
         (Item(mavlink.MAV_CMD_DO_MOUNT_CONTROL, z=0.0), mavlink.MAV_MISSION_INVALID_PARAM7),
     ],
 )

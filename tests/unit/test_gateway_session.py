@@ -105,6 +105,29 @@ def test_guided_mission_item_becomes_goto_and_is_acknowledged() -> None:
     assert any("inside zone pool" in m.text("text") for m in replies if m.name == "STATUSTEXT")
 
 
+@pytest.mark.parametrize(
+    ("command", "reason"),
+    [
+        (mavlink.MAV_CMD_IMAGE_START_CAPTURE, "use the camera service"),
+        (mavlink.MAV_CMD_IMAGE_STOP_CAPTURE, "use the camera service"),
+        (mavlink.MAV_CMD_DO_DIGICAM_CONTROL, "use the camera service"),
+        (mavlink.MAV_CMD_REQUEST_CAMERA_INFORMATION, "use the camera service"),
+        (mavlink.MAV_CMD_DO_SET_ROI_LOCATION, "DO_GIMBAL_MANAGER_PITCHYAW"),
+        (mavlink.MAV_CMD_DO_SET_ROI_NONE, "DO_GIMBAL_MANAGER_PITCHYAW"),
+        (mavlink.MAV_CMD_NAV_LOITER_TURNS, "mission items only"),
+        (mavlink.MAV_CMD_CONDITION_DELAY, "mission items only"),
+    ],
+)
+def test_command_without_support_is_answered_with_its_replacement(command: int, reason: str) -> None:
+    world = World()
+    assert world.command(command) == []
+    sent = world.sent()
+    (ack,) = [message for message in sent if message.name == "COMMAND_ACK"]
+    assert ack.integer("result") == mavlink.MAV_RESULT_UNSUPPORTED
+    assert reason in "".join(message.text("text") for message in sent if message.name == "STATUSTEXT")
+    assert world.session.take_refusals()
+
+
 @pytest.mark.parametrize("magic", [21196.0, 2989.0])
 def test_forced_arming_is_denied_and_reported(magic: float) -> None:
     world = World()

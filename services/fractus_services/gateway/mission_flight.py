@@ -11,6 +11,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from fractus_services.gateway.mission_route import Place, lands, requests_of
 from fractus_services.gateway.translate import Request
+from fractus_services.mavlink_server.mission_items import Item
 from fractus_services.mavlink_server.stored_mission import ARRIVALS, Mission, hold_s, title
 
 ITEM_PAUSE_S = 0.1
@@ -60,17 +61,24 @@ async def fly_mission(
             mission.current = number
             reports.report_current()
         report(f"Mission: {number} {title(item)}")
-        requests, at = requests_of(item, at)
+        requests, at = requests_of(mission, number, at)
         for request in requests:
             await perform(request)
         # The pause keeps a loop of items without a motion from blocking the gateway.
-        await _hold(max(hold_s(item), ITEM_PAUSE_S) if item.navigates else ITEM_PAUSE_S)
+        await _hold(max(_duration_s(item), ITEM_PAUSE_S))
         if item.command in ARRIVALS:
             report(f"Reached command #{number}")
         reports.report_reached(number)
         number = None if lands(item) else mission.next_after(number, report)
     mission.complete = True
     reports.report_current()
+
+
+def _duration_s(item: Item) -> float:
+    """Return how long an item lasts after its motion is complete, in seconds."""
+    if item.command == mavlink.MAV_CMD_CONDITION_DELAY:
+        return item.param1
+    return hold_s(item) if item.navigates else 0.0
 
 
 async def _hold(time_s: float) -> None:

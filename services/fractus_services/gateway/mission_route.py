@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
+from fractus_core.geo import LocalFrame
 from fractus_proto.v1 import mobility_pb2, types_pb2
 from fractus_runtime.mavlink_codec import enum_name
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -15,13 +17,19 @@ from fractus_services.mavlink_server.mission_items import LANDINGS, PLACED, TAKE
 from fractus_services.mavlink_server.stored_mission import Mission
 
 MAX_STEPS = 1000
-"""Maximum number of items of a route, with repetitions and jumps.
+"""Maximum number of items of a route, with repetitions and jumps, and maximum number of its calls.
 
 The request to the mobility service has a limited size, and other instances wait while a route is determined.
 """
 
 JUDGED_REPETITIONS = 2
 """Number of repetitions of a jump that are judged. Further repetitions fly the same legs as the second repetition."""
+
+LEGS_PER_TURN = 16
+"""Number of straight legs that replace a circle. They are at most 2 % of the radius inside of it."""
+
+DEFAULT_RADIUS_M = 10.0
+"""Radius of a circle whose item contains none."""
 
 _LEGS = frozenset(
     {
@@ -33,21 +41,30 @@ _LEGS = frozenset(
     }
 )
 _JUMPS = frozenset({mavlink.MAV_CMD_DO_JUMP, mavlink.MAV_CMD_DO_JUMP_TAG})
+_CONDITIONS = frozenset(
+    {mavlink.MAV_CMD_CONDITION_DELAY, mavlink.MAV_CMD_CONDITION_DISTANCE, mavlink.MAV_CMD_CONDITION_YAW}
+)
 _WITHOUT_CALL = _JUMPS | {mavlink.MAV_CMD_JUMP_TAG, mavlink.MAV_CMD_DO_LAND_START, mavlink.MAV_CMD_NAV_DELAY}
 _ENDS = LANDINGS | {mavlink.MAV_CMD_NAV_RETURN_TO_LAUNCH}
 _GIMBAL = frozenset({mavlink.MAV_CMD_DO_MOUNT_CONTROL, mavlink.MAV_CMD_DO_GIMBAL_MANAGER_PITCHYAW})
-AVAILABLE = _LEGS | TAKEOFFS | _ENDS | _WITHOUT_CALL | _GIMBAL | {mavlink.MAV_CMD_DO_CHANGE_SPEED}
+_OTHERS = frozenset({mavlink.MAV_CMD_NAV_LOITER_TURNS, mavlink.MAV_CMD_DO_CHANGE_SPEED})
+AVAILABLE = _LEGS | TAKEOFFS | _ENDS | _WITHOUT_CALL | _CONDITIONS | _GIMBAL | _OTHERS
 """Commands that a mission may contain."""
 
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """A place in degrees, and metres above the altitude reference."""
+    """A place in degrees, and metres above the altitude reference.
+
+    Attributes:
+        yaw_deg: Heading of the next leg, clockwise from true north; None for the heading behaviour of the autopilot.
+    """
 
     lat: float
     lon: float
     altitude_m: float
     reference: int = types_pb2.ALTITUDE_REFERENCE_HOME
+    yaw_deg: float | None = None
 
 
 class ItemRefused(Exception):
@@ -70,7 +87,8 @@ def check_item(item: Item) -> None:
     """
     name = enum_name("MAV_CMD", item.command)
     if item.command not in AVAILABLE:
-        raise ItemRefused(mavlink.MAV_MISSION_UNSUPPORTED, f"{name} is not available in missions of programs")
+        reason = translate.UNSUPPORTED.get(name, f"{name} is not available in missions of programs")
+        raise ItemRefused(mavlink.MAV_MISSION_UNSUPPORTED, reason)
     if item.command in PLACED and item.frame in TERRAIN_FRAMES:
         reason = f"{name}: altitudes above terrain are not supported; use MAV_FRAME_GLOBAL_RELATIVE_ALT"
         raise ItemRefused(mavlink.MAV_MISSION_UNSUPPORTED_FRAME, reason)
@@ -80,6 +98,9 @@ def check_item(item: Item) -> None:
     speed_types = {mavlink.SPEED_TYPE_AIRSPEED, mavlink.SPEED_TYPE_GROUNDSPEED}
     if item.command == mavlink.MAV_CMD_DO_CHANGE_SPEED and item.param1 not in speed_types:
         raise ItemRefused(mavlink.MAV_MISSION_INVALID_PARAM1, "only the ground speed can be changed")
+    if item.command == mavlink.MAV_CMD_CONDITION_YAW and item.param4 != 0.0:
+        reason = "CONDITION_YAW: a relative angle is not supported; set param4 to 0"
+        raise ItemRefused(mavlink.MAV_MISSION_INVALID_PARAM4, reason)
     targeting = mavlink.MAV_MOUNT_MODE_MAVLINK_TARGETING
     if item.command == mavlink.MAV_CMD_DO_MOUNT_CONTROL and item.z != targeting:
         reason = "only MAV_MOUNT_MODE_MAVLINK_TARGETING is supported"
@@ -91,25 +112,43 @@ def lands(item: Item) -> bool:
     return item.command in _ENDS
 
 
-def requests_of(item: Item, at: Place) -> tuple[list[Request], Place]:
+def requests_of(mission: Mission, number: int, at: Place) -> tuple[list[Request], Place]:
     """Return the calls that fly an item, and the place to which they lead.
 
     Args:
-        item: Item that `check_item` accepts.
+        mission: Mission. Its state does not change, except for `jumps_passed`.
+        number: Number of an item that `check_item` accepts.
         at: Place at which the item begins. It replaces missing coordinates and a missing altitude of the item.
     """
-    if item.command in _LEGS:
-        at = _target(item, at)
-        return [_goto(at)], at
-    if item.command in LANDINGS and item.has_place:
+    item = mission.items[number]
+    if item.command == mavlink.MAV_CMD_CONDITION_YAW:
+        return [], replace(at, yaw_deg=item.param1 % 360.0)
+    if item.command == mavlink.MAV_CMD_CONDITION_DISTANCE:
+        places = _approach(mission, number, at)
+    elif item.command == mavlink.MAV_CMD_NAV_LOITER_TURNS:
+        places = _circle(item, at)
+    elif item.command in _LEGS:
+        places = [_target(item, at)]
+    elif item.command in LANDINGS and item.has_place:
         # The drone flies to the place at its present altitude, and lands there.
-        at = replace(at, lat=item.x / 1e7, lon=item.y / 1e7)
-        return [_goto(at), _automatic(translate.land())], at
+        places = [replace(at, lat=item.x / 1e7, lon=item.y / 1e7)]
+    else:
+        requests, at = _requests_without_leg(item, at)
+        return requests, replace(at, yaw_deg=None) if item.navigates else at
+    requests = [_goto(place) for place in places]
+    if item.command in LANDINGS:
+        requests.append(_automatic(translate.land()))
+    at = places[-1] if places else at
+    return requests, replace(at, yaw_deg=None) if item.navigates else at
+
+
+def _requests_without_leg(item: Item, at: Place) -> tuple[list[Request], Place]:
+    """Return the call of an item that flies no leg, and the place to which it leads."""
     request: Request | None = None
     match item.command:
         case mavlink.MAV_CMD_NAV_TAKEOFF | mavlink.MAV_CMD_NAV_VTOL_TAKEOFF:
             request = _automatic(Request("Takeoff", mobility_pb2.TakeoffRequest(altitude_m=item.z)))
-            at = Place(at.lat, at.lon, item.z)
+            at = replace(at, altitude_m=item.z, reference=types_pb2.ALTITUDE_REFERENCE_HOME)
         case mavlink.MAV_CMD_NAV_LAND | mavlink.MAV_CMD_NAV_VTOL_LAND:
             request = _automatic(translate.land())
         case mavlink.MAV_CMD_NAV_RETURN_TO_LAUNCH:
@@ -146,13 +185,17 @@ def route_of(mission: Mission, first: int, at: Place, *, on_ground: bool) -> lis
         if steps + probe.jumps_passed > MAX_STEPS:
             raise Untranslatable(f"the mission has more than {MAX_STEPS} steps; use fewer items or jumps")
         item = probe.items[number]
-        requests, at = requests_of(item, at)
+        requests, at = requests_of(probe, number, at)
         if on_ground and item.navigates and item.command != mavlink.MAV_CMD_NAV_DELAY:
             on_ground = False
             if item.command not in TAKEOFFS and at.reference == types_pb2.ALTITUDE_REFERENCE_HOME:
                 takeoff = Request("Takeoff", mobility_pb2.TakeoffRequest(altitude_m=at.altitude_m))
                 requests = [takeoff, *requests]
         route += [(number, request) for request in requests]
+        if len(route) > MAX_STEPS:
+            raise Untranslatable(
+                f"the mission has more than {MAX_STEPS} legs and other calls; use fewer items or circles"
+            )
         if lands(item):
             return route
         number = probe.next_after(number)
@@ -167,11 +210,47 @@ def _target(item: Item, at: Place) -> Place:
         return replace(at, lat=lat, lon=lon)
     absolute = item.frame in ABSOLUTE_FRAMES
     reference = types_pb2.ALTITUDE_REFERENCE_AMSL if absolute else types_pb2.ALTITUDE_REFERENCE_HOME
-    return Place(lat, lon, item.z, reference)
+    return replace(at, lat=lat, lon=lon, altitude_m=item.z, reference=reference)
+
+
+def _circle(item: Item, at: Place) -> list[Place]:
+    """Return the corners of the legs that replace a circle. The first one is the nearest point of the circle, as on ArduCopter."""
+    centre = _target(item, at)
+    radius_m = abs(item.param3) or DEFAULT_RADIUS_M
+    frame = LocalFrame(centre.lat, centre.lon)
+    east, north = frame.xy(at.lat, at.lon)
+    begin = math.atan2(east, north)
+    step = math.copysign(math.tau / LEGS_PER_TURN, item.param3)
+    corners: list[Place] = []
+    for number in range(round(item.param1 * LEGS_PER_TURN) + 1):
+        angle = begin + number * step
+        lat, lon = frame.latlon(radius_m * math.sin(angle), radius_m * math.cos(angle))
+        corners.append(replace(centre, lat=lat, lon=lon))
+    return corners
+
+
+def _approach(mission: Mission, number: int, at: Place) -> list[Place]:
+    """Return the place at the distance of a CONDITION_DISTANCE before the next waypoint; none if the drone is nearer."""
+    following = mission.peek_after(number)
+    if following is None or mission.items[following].command not in _LEGS:
+        return []
+    end = _target(mission.items[following], at)
+    frame = LocalFrame(end.lat, end.lon)
+    east, north = frame.xy(at.lat, at.lon)
+    distance_m = math.hypot(east, north)
+    rest_m = max(mission.items[number].param1, 0.0)
+    if distance_m <= rest_m:
+        return []
+    share = rest_m / distance_m
+    lat, lon = frame.latlon(east * share, north * share)
+    place = replace(end, lat=lat, lon=lon)
+    if at.reference == end.reference:
+        place = replace(place, altitude_m=end.altitude_m + (at.altitude_m - end.altitude_m) * share)
+    return [place]
 
 
 def _goto(place: Place) -> Request:
-    return _automatic(translate.goto(place.lat, place.lon, place.altitude_m, place.reference))
+    return _automatic(translate.goto(place.lat, place.lon, place.altitude_m, place.reference, place.yaw_deg))
 
 
 def _automatic(request: Request) -> Request:
@@ -179,7 +258,9 @@ def _automatic(request: Request) -> Request:
 
 
 def _limited(item: Item) -> Item:
-    """Return an item with a limited number of repetitions of a jump."""
+    """Return an item with a limited number of repetitions of a jump. Each turn of a circle flies the same legs."""
+    if item.command == mavlink.MAV_CMD_NAV_LOITER_TURNS:
+        return replace(item, param1=min(item.param1, 1.0))
     if item.command not in _JUMPS:
         return item
     endless = item.param2 < 0.0

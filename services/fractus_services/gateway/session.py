@@ -287,6 +287,8 @@ class Session:
             self._acknowledge(source, fields.number, mavlink.MAV_RESULT_IN_PROGRESS)
             return []
         try:
+            if name in translate.UNSUPPORTED:
+                raise Untranslatable(translate.UNSUPPORTED[name], mavlink.MAV_RESULT_UNSUPPORTED)
             if decision == "refuse":
                 raise Untranslatable("programs may not send this command")
             if name == "DO_SET_MODE":

@@ -42,6 +42,35 @@ class Untranslatable(Exception):
         self.result = result
 
 
+_CAMERA = "the camera is not available over MAVLink; use the camera service with the SDK"
+_ROI = "a region of interest is not supported; point the camera with DO_GIMBAL_MANAGER_PITCHYAW"
+
+UNSUPPORTED: Mapping[str, str] = {
+    "NAV_LOITER_TURNS": "circles are flown as mission items only, as on ArduCopter",
+    "CONDITION_DELAY": "conditions are mission items only, as on ArduCopter",
+    "CONDITION_DISTANCE": "conditions are mission items only, as on ArduCopter",
+    **dict.fromkeys(
+        (
+            "DO_CONTROL_VIDEO", "DO_DIGICAM_CONFIGURE", "DO_DIGICAM_CONTROL", "DO_SET_CAM_TRIGG_DIST",
+            "DO_SET_CAM_TRIGG_INTERVAL", "REQUEST_CAMERA_INFORMATION", "REQUEST_CAMERA_SETTINGS",
+            "REQUEST_CAMERA_CAPTURE_STATUS", "RESET_CAMERA_SETTINGS", "SET_CAMERA_MODE", "SET_CAMERA_ZOOM",
+            "SET_CAMERA_FOCUS", "SET_CAMERA_SOURCE", "IMAGE_START_CAPTURE", "IMAGE_STOP_CAPTURE",
+            "REQUEST_CAMERA_IMAGE_CAPTURE", "CAMERA_TRACK_POINT", "CAMERA_TRACK_RECTANGLE", "CAMERA_STOP_TRACKING",
+            "VIDEO_START_CAPTURE", "VIDEO_STOP_CAPTURE", "VIDEO_START_STREAMING", "VIDEO_STOP_STREAMING",
+            "REQUEST_VIDEO_STREAM_INFORMATION", "REQUEST_VIDEO_STREAM_STATUS",
+        ),
+        _CAMERA,
+    ),
+    **dict.fromkeys(
+        (
+            "NAV_ROI", "DO_SET_ROI", "DO_SET_ROI_LOCATION", "DO_SET_ROI_NONE", "DO_SET_ROI_SYSID",
+            "DO_SET_ROI_WPNEXT_OFFSET",
+        ),
+        _ROI,
+    ),
+}  # fmt: skip
+"""Commands that the gateway does not support, with the sentence for the program. Their result is UNSUPPORTED."""
+
 FLY_MISSION = "FlyMission"
 CHECK_MISSION = "CheckMission"
 """Requests that the gateway carries out by several calls: fly the stored mission, and judge an uploaded mission."""

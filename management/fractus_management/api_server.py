@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from http import HTTPStatus
 from typing import Annotated
 
@@ -57,12 +57,14 @@ class Caller:
         client: Sends requests to the API server with the caller's token.
         settings: Settings of the API.
         limits: Limits of requests and streams.
+        token: The caller's bearer token.
         token_hash: Identifies the token in limits.
     """
 
     client: Client
     settings: Settings
     limits: RequestLimits
+    token: str = field(repr=False)
     token_hash: bytes
 
     async def user(self) -> str:
@@ -100,9 +102,10 @@ async def _caller(
         message = "send the header Authorization: Bearer TOKEN with a token of the cluster, as of kubectl create token"
         raise refused(HTTPStatus.UNAUTHORIZED, "Unauthorized", message)
     state = request.app.state
-    token_hash = hashlib.sha256(credentials.credentials.encode()).digest()
+    token = credentials.credentials
+    token_hash = hashlib.sha256(token.encode()).digest()
     state.limits.admit(token_hash)
-    return Caller(state.client.on_behalf_of(credentials.credentials), state.settings, state.limits, token_hash)
+    return Caller(state.client.on_behalf_of(token), state.settings, state.limits, token, token_hash)
 
 
 CallerOf = Annotated[Caller, Depends(_caller)]

@@ -17,6 +17,7 @@ from fractus_management import (
     event_routes,
     permission_routes,
     plan_routes,
+    record_routes,
     restriction_routes,
     template_routes,
     thesis_routes,
@@ -37,6 +38,7 @@ ROUTERS = (
     template_routes.router,
     plan_routes.router,
     event_routes.router,
+    record_routes.router,
     restriction_routes.router,
     permission_routes.router,
 )
@@ -96,4 +98,4 @@ def create_app(settings: Settings, client: Client | None = None) -> FastAPI:
 def collect(app: FastAPI) -> Iterator[Metric]:
     """Yield the metrics of the API."""
     yield from app.state.requests.collect()
-    yield gauge("fractus_api_streams", "Open event streams.", app.state.limits.streams)
+    yield gauge("fractus_api_streams", "Open event streams and transfers of pictures.", app.state.limits.streams)

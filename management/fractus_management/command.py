@@ -75,6 +75,12 @@ def _address(_context: click.Context, _option: click.Parameter, value: str) -> t
     type=click.Path(path_type=Path, exists=True, dir_okay=False),
     help="CA certificate of --server.",
 )
+@click.option(
+    "--node-ca",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="CA certificate of the drones (ConfigMap fractus-ca), to read records of flights. Default: no records.",
+)
 @click.option("--context", help="Context of the kubeconfig. Default: its current context.")
 @click.option(
     "--kubeconfig",
@@ -108,6 +114,7 @@ def serve(
     listen: tuple[str, int],
     server: str,
     ca: Path | None,
+    node_ca: Path | None,
     context: str | None,
     kubeconfig: Path | None,
     namespace: str,
@@ -133,7 +140,7 @@ def serve(
     except TooFewOpenFiles as error:
         raise click.ClickException(str(error)) from None
     testing = AutomatedTesting(template, geoid) if template is not None else None
-    settings = Settings(namespace, requests_per_s=requests_per_second, automated_testing=testing)
+    settings = Settings(namespace, requests_per_s=requests_per_second, automated_testing=testing, node_ca=node_ca)
     asyncio.run(_serve(listen, settings, _access(server, ca, context, kubeconfig), metrics))
 
 

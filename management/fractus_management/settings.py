@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 DEFAULT_NAMESPACE = "default"
 DEFAULT_REQUESTS_PER_S = 20.0
@@ -35,6 +36,7 @@ class Settings:
         max_streams_of_token: Maximum number of open event streams of a token.
         keepalive_s: Seconds without an event after which a stream sends a comment.
         automated_testing: Settings of the adapter for InterUSS' automated testing. None: the adapter is not served.
+        node_ca: File of the CA that issues the certificates of drones. None: records of flights cannot be read.
     """
 
     namespace: str = DEFAULT_NAMESPACE
@@ -46,6 +48,7 @@ class Settings:
     max_streams_of_token: int = 16
     keepalive_s: float = 15.0
     automated_testing: AutomatedTesting | None = None
+    node_ca: Path | None = None
 
     @property
     def burst(self) -> float:

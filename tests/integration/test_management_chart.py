@@ -41,8 +41,7 @@ def test_management_has_no_permissions_and_no_token() -> None:
     subjects = [subject["name"] for binding in bindings for subject in binding["subjects"]]
     assert account["metadata"]["name"] not in subjects
     assert pod()["automountServiceAccountToken"] is False
-    (volume,) = pod()["volumes"]
-    assert volume["configMap"]["name"] == "kube-root-ca.crt"
+    assert [volume["configMap"]["name"] for volume in pod()["volumes"]] == ["kube-root-ca.crt", "fractus-ca"]
 
 
 def test_management_runs_without_privileges() -> None:
@@ -55,9 +54,11 @@ def test_management_runs_without_privileges() -> None:
 
 def test_management_arguments_are_options_of_the_command(monkeypatch: pytest.MonkeyPatch, tmp_path: Any) -> None:
     (container,) = pod()["containers"]
-    (mount,) = container["volumeMounts"]
-    arguments = [each.replace(mount["mountPath"], str(tmp_path)) for each in container["args"]]
-    (tmp_path / "ca.crt").write_text("")
+    arguments = container["args"]
+    for mount in container["volumeMounts"]:
+        arguments = [each.replace(mount["mountPath"], str(tmp_path / mount["name"])) for each in arguments]
+        (tmp_path / mount["name"]).mkdir()
+        (tmp_path / mount["name"] / "ca.crt").write_text("")
     served: list[Any] = []
 
     async def serve(*received: Any) -> None:
@@ -71,6 +72,28 @@ def test_management_arguments_are_options_of_the_command(monkeypatch: pytest.Mon
     ports = {port["name"]: port["containerPort"] for port in container["ports"]}
     assert (listen, metrics) == (("0.0.0.0", ports["http"]), f":{ports['metrics']}")
     assert (settings.namespace, settings.requests_per_s) == ("default", 20)
+    assert settings.node_ca == tmp_path / "nodes" / "ca.crt"
+
+
+def agent_environment(*arguments: str) -> dict[str, str]:
+    """Return the variables of the agent that the chart renders."""
+    (agent,) = [
+        body
+        for body in fractus_chart.render(*arguments)
+        if (body["kind"], body["metadata"]["name"]) == ("DaemonSet", "fractus-agent")
+    ]
+    (container,) = agent["spec"]["template"]["spec"]["containers"]
+    return {variable["name"]: variable.get("value", "") for variable in container["env"]}
+
+
+def test_agents_serve_records_for_the_management_api_only() -> None:
+    assert "FRACTUS_RECORDS" not in agent_environment()
+    assert agent_environment(ENABLED)["FRACTUS_RECORDS"] == "$(FRACTUS_NODE_ADDRESS):46816"
+    assert "FRACTUS_RECORDS" not in agent_environment(ENABLED, "--set=management.records.enabled=false")
+    (container,) = management_objects(ENABLED, "--set=management.records.enabled=false")["Deployment"]["spec"][
+        "template"
+    ]["spec"]["containers"]
+    assert not any(argument.startswith("--node-ca") for argument in container["args"])
 
 
 def test_network_policy_limits_senders_of_requests_and_not_of_metrics() -> None:

@@ -19,8 +19,8 @@ from fractus_runtime.mcap_tail import DamagedFile, RecordedMessage, Tail
 from fractus_agent.records.audit_records import InvalidContinue, Page
 from fractus_agent.records.planned_flight import PlannedFlight
 
-MAX_RECORD_BYTES = 12_000_000
-"""Maximum size of a record that is read: a picture of 9 MB. Larger pictures are not returned."""
+MAX_RECORD_BYTES = 8_000_000
+"""Maximum size of a record that is read: a picture of 6 MB, for which the agent needs 45 MB. Larger pictures are not returned."""
 
 _SEGMENT = re.compile(r"(?P<number>[0-9]{6,9})-(?P<time>[0-9]{8}T[0-9]{6}Z)\.mcap")
 _ID = re.compile(r"([0-9]{1,9})-([0-9]{1,12})-([0-9]{1,9})")

@@ -124,6 +124,8 @@ def test_plans_page_leads_from_a_token_to_an_accepted_plan(page: Page, pilot: Us
     assert len(stored["spec"]["waypoints"]) == 2
     expect(item).to_contain_text(stored["metadata"]["name"])
     expect(submit).to_be_disabled()
+    item.get_by_role("button", name="Start").click()
+    expect(item).to_contain_text("may take off from", timeout=TIMEOUT_MS)
     # The stream of the followed plan reports the change.
     item.get_by_role("button", name="End").click()
     expect(item).to_contain_text("Ended", timeout=TIMEOUT_MS)
@@ -577,3 +579,27 @@ def test_plans_page_says_why_a_user_cannot_publish_restrictions(page: Page, pilo
     expect(page.get_by_role("button", name="Publish the restriction")).to_be_hidden()
     result = Axe().run(page)
     assert result.violations_count == 0, result.generate_report()
+
+
+def test_plans_page_submits_a_plan_and_shows_restrictions_without_webgl(
+    page: Page, pilot: User, authority: User, world: World, namespace: str
+) -> None:
+    authority("POST", "/v1/restrictions", restriction())
+    user_token(world, namespace, "pilot", (), ("fractus-policy-viewer", "fractus-zone-viewer"))
+    wait_for(lambda: pilot("GET", "/v1/restrictions").status == 200, "the roles of the pilot")
+    page.add_init_script("HTMLCanvasElement.prototype.getContext = () => null")
+    page.reload()
+    expect(page.locator("#no-map")).to_contain_text("no WebGL")
+    sign_in(page, pilot)
+    expect(page.locator("#restrictions")).to_contain_text("no flights", timeout=TIMEOUT_MS)
+    enter_point(page, 1, -50, -50, 20)
+    page.get_by_role("radio", name="abort, and land").check()
+    place = page.get_by_role("group", name="Landing place after lost contact")
+    place.get_by_label("Land at").select_option("another place")
+    expect(place.get_by_role("button", name="Select on the map")).to_be_hidden()
+    place.get_by_label("Land at").select_option("home")
+    expect_decision(page, "Accepted")
+    result = Axe().run(page)
+    assert result.violations_count == 0, result.generate_report()
+    page.get_by_role("button", name="Submit the plan").press("Enter")
+    expect(page.locator("#plans > li")).to_contain_text("Accepted", timeout=TIMEOUT_MS)

@@ -423,10 +423,11 @@ async function openMap(): Promise<void> {
     const opened = map;
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => opened.paint(colours));
   } catch (error) {
+    document.body.classList.add("without-map");
     byId("map").hidden = true;
     byId("legend").hidden = true;
     byId("no-map").hidden = false;
-    byId("no-map").textContent = "This browser has no WebGL, which the map requires. Use the table of coordinates.";
+    byId("no-map").textContent = "This browser has no WebGL, which the map requires. Enter coordinates instead.";
     console.info("cannot show the map:", error);
     return;
   }

@@ -61,6 +61,8 @@ export class PlanList {
     head.append(element("span", "name", metadata.name), element("span", "badge", state), element("span", "facts", status?.drone ?? ""));
     const window = `${spec.template}, ${timeOf(spec.window.start)}, ${spec.window.duration} minutes`;
     item.append(head, element("p", "facts", window));
+    const started = spec.use === "InUse" || spec.autoActivate;
+    if (state === "Accepted" && started) item.append(element("p", "facts", `may take off from ${timeOf(spec.window.start)}`));
     const failed = (status?.conditions ?? []).filter(({ type, status: value }) => (type === "ChangeRefused" || type === "ConflictArose") && value === "True");
     for (const message of [status?.message, ...failed.map((condition) => condition.message)]) if (message) item.append(element("p", "facts", message));
     const buttons = element("p", "head");

@@ -59,7 +59,7 @@ export class Route {
     byId(`${this.id}-title`).textContent = this.isRegion ? this.areaTitle : "Waypoints";
     const head = element("tr");
     const names = ["Point", ...this.columns.map(({ label, name }) => (name === "alt" ? "Altitude (m)" : `${label} (°)`)), "Remove"];
-    head.append(...names.map((name) => element("th", "", name)));
+    head.append(...names.map((name) => element("th", name.startsWith("Altitude") ? "altitude" : "", name)));
     byId(`${this.id}-head`).replaceChildren(head);
     byId(this.id).replaceChildren(...this.points.map((point, index) => this.createRow(point, index)));
   }

@@ -6,7 +6,8 @@ import type { ActiveTime, AltitudeBand, PolicySpec, Restriction } from "./types"
 /** Classes of restrictions. Their names are those of colours of the style sheet. */
 export type RestrictionClass = "exclusion" | "pictures" | "limit" | "methods";
 
-const REFERENCES: Record<string, string> = { home: "above home", amsl: "above sea level", terrain: "above the ground" };
+/** Altitude references. */
+export const REFERENCES: Record<string, string> = { home: "above home", amsl: "above sea level", terrain: "above the ground" };
 
 /** Meanings of repair actions. */
 export const ACTIONS: Record<string, string> = {

@@ -1,10 +1,10 @@
 // Table of the points of a path or area. It is equivalent to drawing on the map.
 
 import { byId, element } from "../elements";
+import { REFERENCES } from "./restriction_text";
 import type { Position } from "./types";
 
 const DEFAULT_ALTITUDE_M = 20;
-const REFERENCES: Record<string, string> = { home: "above home", amsl: "above sea level", terrain: "above the ground" };
 
 interface Column {
   name: "lat" | "lon" | "alt";

@@ -16,10 +16,10 @@ log = logging.getLogger("data-store")
 
 
 class DataStore:
-    """Results in a file.
+    """Stores results in a file.
 
     Args:
-        path: The file. Its results are kept.
+        path: The file. Results that it already contains are kept.
     """
 
     def __init__(self, path: Path) -> None:

@@ -256,7 +256,10 @@ def claim(spec: ClusterSpec, state: StateDirectory, kubernetes: str, report: Rep
 
 
 def apply_volumes(api: BlockingClient, nodes: Sequence[Node]) -> None:
-    """Create the volumes of nodes, empty those whose claim was deleted, and delete those of removed nodes."""
+    """Create the volumes of all nodes.
+
+    A volume whose claim was deleted is emptied and can be claimed again. Volumes of removed nodes are deleted.
+    """
     api.apply(*manifests.storage_class())
     by_name = {node.name: node for node in nodes}
     for volume in api.list("/api/v1/persistentvolumes"):

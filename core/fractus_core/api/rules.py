@@ -51,7 +51,12 @@ def rule(cel: str, message: str) -> Callable[[Callable[[M], Violation]], Any]:
 
 
 def referenced_by(kind: str, referrers: str) -> Any:
-    """Return the rule that the name of an object fits into the fields of the kinds that refer to the object."""
+    """Return the rule that an object has a name that other kinds can refer to: a DNS label of at most 63 characters.
+
+    Args:
+        kind: Kind of the object.
+        referrers: Kinds that refer to the object, as a part of the error message.
+    """
     article = "an" if kind[0] in "AEIOU" else "a"
 
     @rule(

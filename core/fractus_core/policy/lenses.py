@@ -37,7 +37,9 @@ def bounding_lens(camera: CameraFeatures | None) -> Lens | None:
 
 
 def _half_view(lens: CameraLens | None, half: float, aspect: float) -> tuple[float, float] | None:
-    """Return the tangents of the half views that contain every ray of a picture, or None if no such view exists.
+    """Return the tangents of half the horizontal and vertical angle of view that contain every ray of a picture.
+
+    Return None if a ray may be 90 degrees or more from the axis, or if the lens model does not describe the whole picture.
 
     Args:
         lens: Description of the lens, or None.

@@ -118,7 +118,7 @@ class OwnerFence:
     Attributes:
         parameters: Fence parameters that the vehicle has.
         items: Polygons and circles.
-        raised: Parameters of the mission's fence once it is raised.
+        raised: Fence parameters during the mission. Empty before the mission's fence is raised.
         mission_items: Items of the mission's fence, including active items of the owner. None for a fence that an older release
             raised.
     """

@@ -10,6 +10,9 @@ from typing import Any
 
 import chart
 import pytest
+from fractus_agent.records.audit_records import CAMERA_LOG, MOBILITY_LOG, read_track, read_verdicts
+from fractus_agent.records.picture_records import read_picture, read_pictures
+from fractus_agent.records.planned_flight import PlannedFlight
 from fractus_agent.registration.diagnostics import read_recording_problems
 from fractus_core.api.names import component_identity
 from fractus_proto.v1 import camera_pb2, camera_pb2_grpc
@@ -110,6 +113,38 @@ async def test_recording_has_flight_and_pictures_and_survives_kill(rig: Rig) -> 
     }
     callers = {message["caller"] for message in taken[f"/{NODE}/decisions fractus.Decision"]}
     assert component_identity("default", "app", "AerialViewer", "app-aerial-viewer") in callers
+
+
+async def test_agent_finds_records_of_a_flight_in_the_files_of_the_services(rig: Rig) -> None:
+    pictures = rig.directory / "recordings" / "camera"
+    rig.write_grant(grant(altitude_limit(5, 15)))
+    rig.write_grant(passenger_grant(services=[{"service": "camera", "methods": ["CaptureImage"]}]))
+    rig.start_service()
+    rig.start_vehicle()
+    address = rig.start_camera("--recordings", str(pictures))
+    driver = Driver(rig)
+    await driver.up(10.0)
+    await driver.goto(5, 0, 20.0)
+    stub = camera_pb2_grpc.CameraServiceStub(rig.channel(PASSENGER, address=address))
+    await stub.CaptureImage(camera_pb2.CaptureImageRequest(), timeout=60, wait_for_ready=True)
+    rig.kill("camera", signal.SIGTERM)
+    flight = PlannedFlight("default", "app", 0.0, float("inf"))
+    audit = rig.directory / "audit"
+    audit.mkdir()
+    (audit / MOBILITY_LOG).symlink_to(rig.audit)
+    (audit / CAMERA_LOG).symlink_to(rig.directory / "camera.jsonl")
+    track = read_track(audit, flight, 10_000, "").items
+    assert max(point.alt or 0.0 for point in track) == pytest.approx(15.0, abs=2.0)
+    assert "Navigator" in {point.controller for point in track}
+    verdicts = read_verdicts(audit, flight, 10_000, "").items
+    assert {"AltitudeAboveLimit"} <= {verdict.code for verdict in verdicts}
+    assert {"Navigator", "AerialViewer"} <= {verdict.component for verdict in verdicts}
+    (picture,) = read_pictures(pictures, flight, 10, "").items
+    assert (read_picture(pictures, flight, picture.id) or b"").startswith(b"\xff\xd8")
+    other = PlannedFlight("default", "other", 0.0, float("inf"))
+    assert read_verdicts(audit, other, 10, "").items == []
+    assert read_track(audit, other, 10, "").items == []
+    assert read_pictures(pictures, other, 10, "").items == []
 
 
 async def test_recording_failure_does_not_prevent_flight(rig: Rig) -> None:

@@ -329,6 +329,47 @@ def _completed(cluster: ClusterReader, plan: Body) -> bool:
     )
 
 
+@flights.command()
+@click.argument("template")
+@click.option("--yes", is_flag=True, help="Approve without a question.")
+@click.option("--note", default="", help="Remark of the authority.")
+@kubeconfig_option
+def approve(template: str, yes: bool, note: str, config: str | None) -> None:
+    """Approve the present generation of the ApplicationTemplate TEMPLATE, after a question that shows its content.
+
+    A template that is changed later must be approved again.
+    """
+    path = f"{GROUP}/applicationtemplates/{template}"
+    with open_client(config) as client:
+        body = client.get(path)
+        if body is None:
+            raise click.ClickException(f"there is no ApplicationTemplate {template}")
+        generation = body["metadata"]["generation"]
+        click.echo("\n".join(map(printable, _template_lines(body["spec"]))))
+        if not yes:
+            click.confirm(f"Approve generation {generation} of {template}?", abort=True)
+        review = {"apiVersion": "authentication.k8s.io/v1", "kind": "SelfSubjectReview"}
+        user = client.call("POST", "/apis/authentication.k8s.io/v1/selfsubjectreviews", review)
+        approval = {
+            "generation": generation,
+            "by": user["status"]["userInfo"]["username"],
+            "at": f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%SZ}",
+            "note": note,
+        }
+        client.merge(f"{path}/status", {"status": {"approval": approval}})
+    click.echo(f"generation {generation} of {template} is approved by {approval['by']}")
+
+
+def _template_lines(spec: Body) -> Iterator[str]:
+    """Yield what an authority approves: altitudes, and image and methods of each component."""
+    altitudes = spec["altitudes"]
+    yield f"altitudes: {altitudes.get('lower', 0):g} to {altitudes['upper']:g} m"
+    for component in spec["template"]["components"]:
+        yield f"{component['name']} ({component['placement']}): {component['container']['image']}"
+        for service in component.get("services") or ():
+            yield f"  {service['service']}: {', '.join(service['methods'])}"
+
+
 # -- requests --
 
 

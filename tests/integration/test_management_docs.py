@@ -17,6 +17,7 @@ def test_documented_walkthrough_orders_and_ends_a_flight(
     script = "\n".join(line for line in lines if "--no-buffer" not in line)
     assert "API=http://127.0.0.1:8660\n" in script
     script = script.replace("http://127.0.0.1:8660", management.url)
+    script = script.replace("50.864239", "39.36105").replace("4.679068", "22.93128")
     try:
         output = Shell(tmp_path, world.plane).type(f"set -eu\n{script}")
     finally:

@@ -11,6 +11,7 @@ from fractus_cli import main
 from operator_world import FRACTUS, OperatorProcess, World, approved_template, fractus_object
 from test_operator_flight_plans import started, status
 
+TEMPLATE = f"{FRACTUS}/applicationtemplates/survey"
 PLACE = "39.361,22.9313,20"
 
 
@@ -72,3 +73,25 @@ def test_ordered_flight_is_chosen_started_watched_and_ended(
     run("end", "third")
     assert status(world, namespace, "third")["state"] == "Ended"
     assert run("watch", "third")[0] == 2
+
+
+def test_authority_approves_present_generation_of_a_template(
+    control_plane: ControlPlane, world: World, operator: OperatorProcess, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def approve(template: str) -> int:
+        capsys.readouterr()
+        return main.run(["flights", "approve", template, "--yes", "--kubeconfig", str(control_plane.kubeconfig)])
+
+    approved_template(world)
+    world.api.merge(f"{TEMPLATE}/status", {"status": {"approval": None}})
+    world.api.merge(TEMPLATE, {"spec": {"altitudes": {"upper": 55}}})
+    assert approve("survey") == 0
+    output = capsys.readouterr().out
+    assert "altitudes: 0 to 55 m" in output
+    assert "registry.test/component@sha256:" in output
+    template = world.api.get(TEMPLATE)
+    assert template is not None
+    assert template["status"]["approval"]["generation"] == template["metadata"]["generation"]
+    assert template["status"]["approval"]["by"] in output
+    assert approve("unknown") != 0
+    assert "there is no ApplicationTemplate unknown" in capsys.readouterr().err

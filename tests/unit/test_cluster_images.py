@@ -55,6 +55,14 @@ def test_same_program_gives_the_same_image(layout: Layout, tmp_path: Path) -> No
     assert layout.add_program(NAME, tmp_path / "tool").digest != before.digest
 
 
+def test_archive_names_image_by_tag_and_by_digest(layout: Layout) -> None:
+    digest = layout.image(NAME).digest
+    with archive_of(layout, set()) as archive:
+        index = json.load(archive.extractfile("index.json") or io.BytesIO())
+    names = [entry["annotations"]["io.containerd.image.name"] for entry in index["manifests"]]
+    assert names == [NAME, f"localhost/test/tool@{digest}"]
+
+
 def test_archive_omits_layers_of_the_receiver(layout: Layout) -> None:
     digests = layout.digests(layout.image(NAME))
     with archive_of(layout, set()) as whole:

@@ -10,6 +10,7 @@ from fractus_runtime.files import write_file
 from fractus_cluster.cluster import print_report
 from fractus_cluster.images.bill import image_bill
 from fractus_cluster.images.build import TARGETS, build_images, find_source
+from fractus_cluster.images.store import ImageStore
 
 
 @click.group()
@@ -39,3 +40,10 @@ def build(targets: tuple[str, ...], source: Path | None, tag: str, force: bool, 
         if sbom is not None:
             write_file(sbom / f"{target}.cdx.json", image_bill(image).encode(), 0o644, durable=False)
         click.echo(image)
+
+
+@images.command("list")
+def list_images() -> None:
+    """Print the images that clusters of this machine have, by digest, as templates of flights name them."""
+    for image in ImageStore.default(report=print_report).layout.images().values():
+        click.echo(image.pinned_name)

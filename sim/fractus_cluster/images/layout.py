@@ -43,6 +43,11 @@ class Image:
     size_bytes: int
     media_type: str
 
+    @property
+    def pinned_name(self) -> str:
+        """Name with the digest in place of the tag, as approved templates of flights use it."""
+        return f"{self.name.rpartition(':')[0]}@{self.digest}"
+
 
 @dataclass(frozen=True, slots=True)
 class Layout:
@@ -136,7 +141,7 @@ class Layout:
         self._write_index([*others, entry])
 
     def write_archive(self, images: Iterable[Image], *, without: Collection[str], out: IO[bytes]) -> None:
-        """Write an archive that `ctr images import` reads.
+        """Write an archive that `ctr images import` reads. Each image gets its name and its `pinned_name`.
 
         Args:
             images: Images to write.
@@ -147,10 +152,11 @@ class Layout:
         digests = {digest: None for image in images for digest in self.digests(image) if digest not in without}
         manifests = []
         for image in images:
-            entry = _descriptor(image.media_type, image.digest, image.size_bytes)
-            entry["annotations"] = {_NAME_ANNOTATION: image.name, _REF_ANNOTATION: image.name.rpartition(":")[2]}
-            entry["platform"] = {"architecture": _architecture(), "os": "linux"}
-            manifests.append(entry)
+            for name in (image.name, image.pinned_name):
+                entry = _descriptor(image.media_type, image.digest, image.size_bytes)
+                entry["annotations"] = {_NAME_ANNOTATION: name, _REF_ANNOTATION: name.rpartition(":")[2]}
+                entry["platform"] = {"architecture": _architecture(), "os": "linux"}
+                manifests.append(entry)
         index = {"schemaVersion": 2, "mediaType": _INDEX_TYPE, "manifests": manifests}
         with tarfile.open(fileobj=out, mode="w|", format=tarfile.GNU_FORMAT) as archive:
             _add_bytes(archive, "oci-layout", b'{"imageLayoutVersion": "1.0.0"}')

@@ -92,7 +92,9 @@ class ImageStore:
         with self._locked():
             sandbox = self._sandbox(pause)
             contents = [sandbox, *images]
-            digest = hashlib.sha256("\n".join(sorted(f"{i.name} {i.digest}" for i in contents)).encode()).hexdigest()
+            digest = hashlib.sha256(
+                "\n".join(sorted(f"{i.name} {i.pinned_name}" for i in contents)).encode()
+            ).hexdigest()
             template = Template(self.path / "templates" / digest[:16])
             template.create(self.layout, contents, report=self.report)
             return template

@@ -153,7 +153,7 @@ def _die_with_parent() -> None:
 
 
 def _import(layout: Layout, images: Sequence[Image], ctr: list[str], scratch: Path) -> None:
-    names = {image.name for image in images}
+    names = {name for image in images for name in (image.name, image.pinned_name)}
     present = set(run([*ctr, "images", "list", "--quiet"]).stdout.split())
     content = set(run([*ctr, "content", "list", "--quiet"]).stdout.split())
     manifests = {image.digest for image in images}
@@ -161,7 +161,7 @@ def _import(layout: Layout, images: Sequence[Image], ctr: list[str], scratch: Pa
     with archive.open("wb") as out:
         layout.write_archive(images, without=content - manifests, out=out)
     run([*ctr, "images", "import", str(archive)], timeout_s=_IMPORT_TIMEOUT_S)
-    for image in images:
-        run([*ctr, "images", "label", image.name, _MANAGED], timeout_s=30)
+    for name in sorted(names):
+        run([*ctr, "images", "label", name, _MANAGED], timeout_s=30)
     if present - names:
         run([*ctr, "images", "remove", "--sync", *sorted(present - names)], timeout_s=_IMPORT_TIMEOUT_S)

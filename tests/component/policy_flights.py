@@ -29,6 +29,7 @@ from fractus_core.policy.decision_types import (
 )
 from fractus_core.policy.engine import judge
 from fractus_core.policy.monitoring import monitor
+from fractus_core.policy.return_route import return_bounds
 from fractus_services.mobility.mavlink.mavlink_autopilot import is_turning
 from numpy.typing import NDArray
 from policy_world import HOME, METHODS, NOW, commanded_mps, compiled, policy, ring
@@ -113,9 +114,11 @@ class Scene:
 
     def airframe(self, rng: np.random.Generator) -> Airframe:
         """Return a random vehicle. Its return altitude respects the limits, as the service ensures before arming."""
+        at_home = Situation(time_s=self.time_s, lat=HOME.lat, lon=HOME.lon, altitude_m=0.0, home=HOME)
+        ceiling_m = math.floor(return_bounds(at_home, self.grant).height_m * 100) / 100
         return Airframe(
             accel_mps2=float(rng.choice(ACCELS)), climb_accel_mps2=float(rng.choice(CLIMB_ACCELS)),
-            jerk_mps3=float(rng.choice(JERKS)), return_altitude_m=min(float(rng.choice(RETURNS_M)), self.heights[1]),
+            jerk_mps3=float(rng.choice(JERKS)), return_altitude_m=min(float(rng.choice(RETURNS_M)), ceiling_m),
             retraces=bool(rng.random() < 0.5),
         )  # fmt: skip
 

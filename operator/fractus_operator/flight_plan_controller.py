@@ -34,6 +34,10 @@ log = logging.getLogger(__name__)
 DRY_RUN_S = 60.0
 """Seconds for which a dry run is kept."""
 
+LATER_S = 3600.0
+"""Seconds until the window of an accepted plan from which other plans come first. It is much longer than the steps of 10,000
+plans, so no plan starts late."""
+
 
 class FlightPlanController:
     """Decides FlightPlans one after another, creates and deletes their Applications, and follows their flights.
@@ -67,12 +71,12 @@ class FlightPlanController:
 
     def changed(self, key: Key) -> None:
         """Handle a change of a plan, or of a plan that overlaps it."""
-        self.work_queue.add(key)
+        self._queue(key)
 
     def rules_changed(self, key: Key) -> None:
         """Handle a change of policies or zones at the place of a plan."""
         self._judge_at[key] = 0.0
-        self.work_queue.add(key)
+        self._queue(key)
 
     def application_changed(self, key: Key) -> None:
         """Handle a change of an Application or of its DeploymentPlan."""
@@ -91,6 +95,19 @@ class FlightPlanController:
         for plan, reserved in self._cache.flights.on_drone(key[1]):
             if missing or reserved.intent.state in FLYING or reserved.begin_s - SOON_S <= now_s:
                 self.work_queue.add(plan)
+
+    def _queue(self, key: Key) -> None:
+        self.work_queue.add(key, can_wait=self._can_wait(key))
+
+    def _can_wait(self, key: Key) -> bool:
+        """Return True if other plans come first: a plan is decided, is unchanged, and flies later or not at all."""
+        plan = self._cache.flight_plans.get(key)
+        if not isinstance(plan, FlightPlan) or plan.status is None or plan.spec.use == "Closed":
+            return False
+        if plan.metadata.deletion_timestamp is not None or plan.status.observed_generation != plan.metadata.generation:
+            return False
+        later = plan.spec.window.begin_s - LATER_S > self._clock().timestamp()
+        return plan.status.state in {"Rejected", "Ended"} or (plan.status.state == "Accepted" and later)
 
     # -- steps --
 
@@ -115,6 +132,21 @@ class FlightPlanController:
         spread_s = random.uniform(0, RECHECK_S)  # noqa: S311 (a time, not a secret)
         judge_at_s = self._judge_at.setdefault(key, loop.time() + spread_s)
         judge = judge_at_s <= loop.time()
+        if judge:
+            # Before the first await, so that a change during the writes is judged by the next step.
+            self._judge_at[key] = math.inf
+        try:
+            await self._carry_out(key, plan, now, judge=judge)
+        except BaseException:
+            self._judge_at[key] = min(judge_at_s, self._judge_at.get(key, math.inf))
+            raise
+
+    async def _carry_out(self, key: Key, plan: FlightPlan, now: datetime, *, judge: bool) -> None:
+        """Take the next step of a plan, and start the timer of the step after it.
+
+        Raises:
+            KubeError: The API server refused a write, or could not be reached.
+        """
         step = plan_step(self._situation(plan, now, rules_changed=judge))
         reserved = reserved_flight(plan.model_copy(update={"status": step.status}))
         if reserved is not None:
@@ -134,10 +166,11 @@ class FlightPlanController:
             await self._store.delete(kinds.APPLICATION, (key[0], application_name(plan.metadata.uid or "")))
         if step.status.state not in FLYING:
             await self._set_finalizer(plan, wanted=False)
-        if judge and self._judge_at.get(key) == judge_at_s:
-            self._judge_at[key] = math.inf
+        loop = asyncio.get_running_loop()
         wait_s = min(step.next_s, max(self._judge_at.get(key, math.inf) - loop.time(), 0.0))
-        self._timers[key] = loop.call_later(wait_s, self.work_queue.add, key)
+        if plan.spec.dry_run:
+            wait_s = min(wait_s, DRY_RUN_S)
+        self._timers[key] = loop.call_later(wait_s, self._queue, key)
 
     def _situation(self, plan: FlightPlan, now: datetime, *, rules_changed: bool) -> PlanSituation:
         now_s = now.timestamp()

@@ -91,7 +91,8 @@ class FlightPlanIndex:
         self._observed: dict[Key, ReservedFlight] = {}
         self._decided: dict[Key, ReservedFlight] = {}
         self._present: dict[Key, ReservedFlight] = {}
-        self._by_drone: dict[str, set[Key]] = {}
+        self._by_drone: dict[str, dict[Key, tuple[str, Reservation]]] = {}
+        """Uid and reservation of each plan, by drone."""
         self._keys: dict[tuple[str, str], Key] = {}
         """Keys of plans by namespace and uid."""
         self._uids: dict[Key, str] = {}
@@ -169,6 +170,14 @@ class FlightPlanIndex:
         """Return the reservations by drone, without those of the plan with a uid. The result is valid until the next change."""
         return Reservations(self, without)
 
+    def reservations_of(self, drone: str, without: str | None) -> list[Reservation]:
+        """Return the reservations of a drone, without those of the plan with a uid.
+
+        Raises:
+            KeyError: No flight plan has reserved the drone.
+        """
+        return [reservation for uid, reservation in self._by_drone[drone].values() if uid != without]
+
     def reserved_drones(self) -> Collection[str]:
         """Return the names of the reserved drones."""
         return self._by_drone.keys()
@@ -185,12 +194,13 @@ class FlightPlanIndex:
             return
         name = "/".join(key)
         if old is not None:
-            self._by_drone[old.drone].discard(key)
+            del self._by_drone[old.drone][key]
             if not self._by_drone[old.drone]:
                 del self._by_drone[old.drone]
             self.airspace.remove(name)
         if new is not None:
-            self._by_drone.setdefault(new.drone, set()).add(key)
+            reservation = Reservation(name, new.begin_s, new.end_s)
+            self._by_drone.setdefault(new.drone, {})[key] = new.uid, reservation
             self.airspace.put(new.intent)
         volumes = [volume for each in (old, new) if each is not None for volume in each.intent.all_volumes]
         self._on_change(key, volumes)
@@ -209,13 +219,7 @@ class Reservations(Mapping[str, Sequence[Reservation]]):
         Raises:
             KeyError: No flight plan has reserved the drone.
         """
-        if drone not in self._index.reserved_drones():
-            raise KeyError(drone)
-        return [
-            Reservation("/".join(key), reserved.begin_s, reserved.end_s)
-            for key, reserved in self._index.on_drone(drone)
-            if reserved.uid != self._without
-        ]
+        return self._index.reservations_of(drone, self._without)
 
     def __iter__(self) -> Iterator[str]:
         """Iterate over the names of the reserved drones."""

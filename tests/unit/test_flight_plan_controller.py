@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import copy
 import itertools
@@ -446,6 +447,56 @@ async def test_restriction_published_after_the_acceptance_is_a_condition_of_the_
     del world.api.objects[kinds.POLICY.path("", "keep-out")]
     world.watch()
     assert "Restricted" not in {n for n, (value, _) in conditions(await world.step()).items() if value == "True"}
+
+
+async def test_policy_that_changes_during_the_write_of_a_judgement_is_judged_next() -> None:
+    world = World()
+    await world.step()
+    world.api.put(kinds.ZONE, zone("z", (60, 70), 20).to_dict())
+    world.api.put(kinds.POLICY, policy("keep-out", zones=["z"], **FENCE).to_dict())
+    world.watch()
+    write = world.api._write
+
+    def write_while_the_policy_is_deleted(*arguments: Any) -> Any:
+        world.api._write = write  # type: ignore[method-assign]
+        world.api.objects.pop(kinds.POLICY.path("", "keep-out"))
+        world.watch()
+        return write(*arguments)
+
+    world.api._write = write_while_the_policy_is_deleted  # type: ignore[method-assign]
+    status = await world.step()
+    assert conditions(status)["Restricted"] == ("True", "PolicyConflict")
+    assert "Restricted" not in {n for n, (value, _) in conditions(await world.step()).items() if value == "True"}
+
+
+async def test_new_plan_is_decided_before_accepted_plans_are_judged_again() -> None:
+    names = [f"p{number}" for number in range(3)]
+    world = World(*(plan_named(name, f"u-{name}") for name in names), drones=[located(f"d{i}") for i in range(3)])
+    for name in names:
+        await world.step(("team", name))
+        world.controller.rules_changed(("team", name))
+    world.api.put(kinds.FLIGHT_PLAN, plan_named("new", "u-new").to_dict())
+    world.watch()
+    world.controller.changed(("team", "new"))
+    decided = []
+
+    async def reconcile(key: Key) -> None:
+        decided.append(key[1])
+
+    world.controller.work_queue._reconcile = reconcile
+    task = asyncio.create_task(world.controller.work_queue.run())
+    async with asyncio.timeout(5):
+        while len(decided) < 3:
+            await asyncio.sleep(0)
+    task.cancel()
+    assert decided[0] == "new"
+
+
+async def test_dry_run_is_deleted_after_a_minute_without_another_change() -> None:
+    world = World(flight(dryRun=True))
+    await world.step()
+    loop = asyncio.get_running_loop()
+    assert world.controller._timers[PLAN].when() - loop.time() <= 60
 
 
 async def test_deleted_plan_ends_its_flight() -> None:

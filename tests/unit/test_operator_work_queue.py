@@ -52,6 +52,45 @@ async def test_key_is_reconciled_once_for_many_changes() -> None:
     assert reconciled == [("", "a"), ("", "last")]
 
 
+async def test_keys_that_can_wait_neither_delay_other_keys_nor_block_the_event_loop() -> None:
+    reconciled: list[Key] = []
+
+    async def reconcile(key: Key) -> None:
+        reconciled.append(key)
+
+    work_queue = WorkQueue("test", reconcile)
+    for number in range(100):
+        work_queue.add(("", f"later-{number}"), can_wait=True)
+    task = asyncio.create_task(work_queue.run())
+    while len(reconciled) < 10:
+        await asyncio.sleep(0)
+    work_queue.add(("", "later-99"))
+    work_queue.add(("", "new"))
+    before = len(reconciled)
+    assert before < 50
+    async with asyncio.timeout(5):
+        while ("", "new") not in reconciled:
+            await asyncio.sleep(0)
+    assert reconciled[before:] == [("", "later-99"), ("", "new")]
+    task.cancel()
+
+
+async def test_event_loop_runs_between_attempts_that_do_not_wait() -> None:
+    reconciled: list[Key] = []
+
+    async def reconcile(key: Key) -> None:
+        reconciled.append(key)
+
+    work_queue = WorkQueue("test", reconcile)
+    for number in range(100):
+        work_queue.add(("", str(number)))
+    task = asyncio.create_task(work_queue.run())
+    await asyncio.sleep(0)
+    await asyncio.sleep(0)
+    assert len(reconciled) < 100
+    task.cancel()
+
+
 async def test_change_during_reconcile_is_not_lost() -> None:
     reconciled: list[int] = []
     done = asyncio.Event()

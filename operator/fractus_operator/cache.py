@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -23,6 +23,7 @@ from fractus_core.api import (
 from fractus_core.api.names import NODE_SIGNER
 from fractus_core.api.plans import DeploymentPlanSpec
 from fractus_core.planning.candidates import readiness
+from fractus_core.planning.grant_compiler import PERMITTING_KINDS
 from fractus_core.planning.inventory import Flight, Host, Inventory
 from fractus_core.planning.spatial_index import NodeLocations
 
@@ -345,6 +346,7 @@ class ClusterCache:
             self._locations.upsert_drone(new)
         if _rules_differ(old, new):
             self._rules_changed()
+            self._report_flights([plan for plan, _ in self.flights.on_drone(key[1])])
         elif old is not None and new is not None and _planning_inputs(old) != _planning_inputs(new):
             # A takeoff needs no wake-up: the drone is not released, and the part of its flight that others can share
             # shrinks.
@@ -384,25 +386,35 @@ class ClusterCache:
 
     def _zone_changed(self, key: Key, old: Zone | Unreadable | None, new: Zone | Unreadable | None) -> None:
         self._spec_changed(kinds.ZONE, key, old, new)
-        self._restriction_changed([each for each in (old, new) if isinstance(each, Zone)], old, new)
+        zones = [each for each in (old, new) if isinstance(each, Zone)]
+        policies = [each for each in self.policies.values() if _names_zone(each, key[1])]
+        # A policy with a missing zone is invalid at all places.
+        changed = isinstance(old, Zone) and isinstance(new, Zone)
+        local = all(map(_is_local, policies)) if changed else not policies and bool(zones)
+        self._restriction_changed(zones if local else None, old, new)
 
     def _policy_changed(self, key: Key, old: Policy | Unreadable | None, new: Policy | Unreadable | None) -> None:
         self._spec_changed(kinds.POLICY, key, old, new)
-        selected = [policy.spec.selector.zones for policy in (old, new) if isinstance(policy, Policy)]
-        # A policy without zones applies everywhere.
-        if all(selected):
-            named = [self.zones.get(("", name)) for names in selected for name in names]
+        versions = [each for each in (old, new) if each is not None]
+        if all(map(_is_local, versions)):
+            names = [name for each in versions if isinstance(each, Policy) for name in each.spec.selector.zones]
+            named = [self.zones.get(("", name)) for name in names]
             self._restriction_changed([zone for zone in named if isinstance(zone, Zone)], old, new)
         else:
             self._restriction_changed(None, old, new)
 
     def _restriction_changed(self, zones: Sequence[Zone] | None, old: Any, new: Any) -> None:
         """Report the flight plans that a changed policy or zone may concern. Zones of None concern all plans."""
-        if not self.flight_plans.synced.is_set() or (old is not None and new is not None and old.spec == new.spec):
+        if old is not None and new is not None and type(old) is type(new) and old.spec == new.spec:
             return
-        for plan in self.flights.keys() if zones is None else self.flights.in_zones(zones):
-            for listener in self._flight_rules_listeners:
-                listener(plan)
+        self._report_flights(self.flights.keys() if zones is None else self.flights.in_zones(zones))
+
+    def _report_flights(self, plans: Iterable[Key]) -> None:
+        # During the first list every plan is judged anyway.
+        if self.flight_plans.synced.is_set():
+            for plan in plans:
+                for listener in self._flight_rules_listeners:
+                    listener(plan)
 
     def _spec_changed(self, kind: Kind, key: Key, old: Any, new: Any) -> None:
         self._notify(kind, key)
@@ -475,6 +487,20 @@ class ClusterCache:
     def _notify(self, kind: Kind, key: Key) -> None:
         for listener in self._listeners.get(kind, ()):
             listener(key)
+
+
+def _is_local(policy: Policy | Unreadable) -> bool:
+    """Return True if a policy concerns only flights in its zones.
+
+    An inclusion concerns flights outside of its zones, and the user selects an action also for zones far from the route.
+    """
+    if isinstance(policy, Unreadable):
+        return False
+    return bool(policy.spec.selector.zones) and policy.spec.kind not in PERMITTING_KINDS and not policy.spec.choices
+
+
+def _names_zone(policy: Policy | Unreadable, zone: str) -> bool:
+    return isinstance(policy, Unreadable) or zone in policy.spec.selector.zones
 
 
 def _host_inputs(host: Host | None) -> tuple[object, ...] | None:

@@ -290,11 +290,12 @@ def _rematch(now: PlanSituation, *, soon: bool) -> PlanStep:
     try:
         match = _match(now)
     except Unfit as unfit:
-        if not soon and unfit.reason == POLICY_CONFLICT:
+        if soon or not now.mission.drone_exists:
+            return _without_drone(now, unfit)
+        if unfit.reason == POLICY_CONFLICT:
             return _judged(now, (PlanFinding(reason=unfit.reason, message=unfit.message),), now.status.restrictions)
-        if now.now_s > now.plan.spec.window.begin_s + START_GRACE_S and now.may_start:
-            return _rejected(now, unfit)
-        return _not_startable(now, unfit.reason, unfit.message, unfit.rejected)
+        # The drone and the template may change again before the flight.
+        return replace(_keep(now), next_s=_until_start_s(now))
     if match.drone == now.status.drone:
         findings = match.advisories
         if message := match.choices_problem:
@@ -306,6 +307,13 @@ def _rematch(now: PlanSituation, *, soon: bool) -> PlanStep:
         finding = decision.refusals[0]
         return _not_startable(now, finding.reason, finding.message)
     return _accepted(now, match, intent)
+
+
+def _without_drone(now: PlanSituation, unfit: Unfit) -> PlanStep:
+    """Report why an accepted plan cannot start. Reject the plan if it should have started."""
+    if now.now_s > now.plan.spec.window.begin_s + START_GRACE_S and now.may_start:
+        return _rejected(now, unfit)
+    return _not_startable(now, unfit.reason, unfit.message, unfit.rejected)
 
 
 def _judged(

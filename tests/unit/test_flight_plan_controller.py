@@ -449,6 +449,58 @@ async def test_restriction_published_after_the_acceptance_is_a_condition_of_the_
     assert "Restricted" not in {n for n, (value, _) in conditions(await world.step()).items() if value == "True"}
 
 
+FAR = (5000, 0)
+CHOICE = {"type": "GeofenceControl", "kind": "exclusion", "action": "land", "choices": ["land", "hover"]}
+
+
+@pytest.mark.parametrize(
+    ("spec", "reason"),
+    [(FENCE | {"kind": "inclusion"}, "PolicyConflict"), (CHOICE, "ChoicesMissing")],
+    ids=["inclusion", "choices"],
+)
+async def test_policy_with_a_zone_elsewhere_restricts_a_plan_if_it_permits_or_has_choices(
+    spec: Body, reason: str
+) -> None:
+    world = World()
+    await world.step()
+    world.api.put(kinds.ZONE, zone("z", FAR, 20).to_dict())
+    world.api.put(kinds.POLICY, policy("p", zones=["z"], **spec).to_dict())
+    world.watch()
+    assert conditions(await world.step()).get("Restricted") == ("True", reason)
+
+
+async def test_restriction_ends_when_its_policy_was_invalid_before_its_deletion() -> None:
+    world = World()
+    await world.step()
+    world.api.put(kinds.ZONE, zone("z", (60, 70), 20).to_dict())
+    body = policy("keep-out", zones=["z"], **FENCE).to_dict()
+    world.api.put(kinds.POLICY, copy.deepcopy(body))
+    world.watch()
+    assert conditions(await world.step())["Restricted"] == ("True", "PolicyConflict")
+    body["spec"]["kind"] = "unknown"
+    world.api.put(kinds.POLICY, body)
+    world.watch()
+    await world.step()
+    del world.api.objects[kinds.POLICY.path("", "keep-out")]
+    world.watch()
+    assert "Restricted" not in conditions(await world.step())
+
+
+async def test_plan_is_judged_again_when_its_drone_gets_an_attribute_that_a_policy_selects() -> None:
+    world = World()
+    world.api.put(kinds.ZONE, zone("z", (60, 70), 20).to_dict())
+    heavy = [{"key": "labels.heavy", "operator": "In", "values": ["yes"]}]
+    world.api.put(kinds.POLICY, policy("keep-out", zones=["z"], nodes=heavy, **FENCE).to_dict())
+    drone = world.api.find(kinds.DRONE, ("", "d"))
+    assert drone is not None
+    drone["metadata"]["labels"] = {"heavy": "no"}
+    world.watch()
+    assert "Restricted" not in conditions(await world.step())
+    drone["metadata"]["labels"] = {"heavy": "yes"}
+    world.watch()
+    assert conditions(await world.step()).get("Restricted") == ("True", "PolicyConflict")
+
+
 async def test_policy_that_changes_during_the_write_of_a_judgement_is_judged_next() -> None:
     world = World()
     await world.step()
@@ -486,7 +538,7 @@ async def test_new_plan_is_decided_before_accepted_plans_are_judged_again() -> N
     world.controller.work_queue._reconcile = reconcile
     task = asyncio.create_task(world.controller.work_queue.run())
     async with asyncio.timeout(5):
-        while len(decided) < 3:
+        while len(decided) < 3:  # noqa: ASYNC110
             await asyncio.sleep(0)
     task.cancel()
     assert decided[0] == "new"

@@ -46,7 +46,7 @@ MAX_ROUNDING_M = 0.16
 AROUND_CORRIDOR_M = 100.0
 """Zones further than this from the corridor of a drone do not affect its route."""
 
-_PERMITTING_KINDS = frozenset({"inclusion", "grant"})
+PERMITTING_KINDS = frozenset({"inclusion", "grant"})
 """Kinds of policies that allow something only in their zones.
 
 Grants therefore also contain their zones out of reach.
@@ -394,10 +394,10 @@ def _granted(
         _zone(policy, i, name, inventory)
         for i, name in enumerate(named)
         if beyond is None
-        or policy.spec.kind in _PERMITTING_KINDS
+        or policy.spec.kind in PERMITTING_KINDS
         or not surely_beyond(inventory.zones.get(name), *beyond)
     ]
-    if bounds is None or policy.spec.kind in _PERMITTING_KINDS:
+    if bounds is None or policy.spec.kind in PERMITTING_KINDS:
         near = zones
     else:
         base, reach_m = bounds

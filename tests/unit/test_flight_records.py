@@ -146,6 +146,18 @@ def test_segments_of_other_times_are_not_read(
     ]
 
 
+def test_log_is_complete_after_the_clock_was_set_back(tmp_path: Path, flight: PlannedFlight) -> None:
+    write_log(tmp_path / "mobility.000000000001.jsonl", [grant(0, DRIVER), state(1)])
+    write_log(tmp_path / "mobility.000000000003.jsonl", [state(-40_000)], first=3)
+    write_log(tmp_path / "mobility.jsonl", [state(-39_000)], first=4)
+    assert track(tmp_path, flight) == [1]
+
+
+def test_log_is_read_while_its_full_file_becomes_a_segment(tmp_path: Path, flight: PlannedFlight) -> None:
+    write_log(tmp_path / "mobility.000000000001.jsonl", [grant(0, DRIVER), state(1)])
+    assert track(tmp_path, flight) == [1]
+
+
 @pytest.mark.parametrize(
     "line", [b"", b"\x00", b"[]", b'{"kind":"state"}', b'{"seq":true,"kind":"grant"}', b"[" * 5000]
 )
@@ -212,6 +224,11 @@ def test_every_other_location_returns_no_picture(pictures: Path, flight: Planned
     for offset, number in itertools.product(range(0, size, 7), (0, 1, 2, 3)):
         if (id_ := f"1-{offset}-{number}") not in known:
             assert read_picture(pictures, flight, id_) is None
+
+
+def test_pictures_are_returned_after_the_clock_was_set_back(pictures: Path, flight: PlannedFlight) -> None:
+    write_pictures(pictures / "000003-20260601T020000Z.mcap", [(-36_000, f"u/{FOREIGN}", jpeg(7))])
+    assert len(read_pictures(pictures, flight, 10, "").items) == 3
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ import heapq
 import json
 import re
 from collections.abc import Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from itertools import pairwise
 from pathlib import Path
 from typing import IO, Any, Generic, NamedTuple, TypeVar
@@ -131,15 +131,15 @@ def _entries(stack: ExitStack, log: Path, flight: PlannedFlight) -> Iterator[dic
 
 def _files(stack: ExitStack, log: Path, flight: PlannedFlight) -> Iterator[IO[bytes]]:
     """Yield the open files of a log that may contain the time of a flight, oldest first."""
-    try:
+    current: IO[bytes] | None = None
+    # While a full file becomes a segment, there is no present file for a moment.
+    with suppress(FileNotFoundError):
         # Open the present file first, because it may become a segment while the segments are read.
         current = stack.enter_context(open_file(log))
-    except FileNotFoundError:
-        return
     files = segments(log)
     begins = [*map(_begin_s, files), float("inf")]
     for path, (begin_s, next_s) in zip(files, pairwise(begins), strict=True):
-        if 0 < next_s < flight.begin_s or begin_s > flight.end_s:
+        if not flight.may_cover(begin_s, next_s):
             continue
         try:
             file = open_file(path)
@@ -147,7 +147,8 @@ def _files(stack: ExitStack, log: Path, flight: PlannedFlight) -> Iterator[IO[by
             continue  # removed to free space
         with file:
             yield file
-    yield current
+    if current is not None:
+        yield current
 
 
 def _begin_s(segment: Path) -> float:

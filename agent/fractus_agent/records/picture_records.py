@@ -129,9 +129,9 @@ def _segments(directory: Path, flight: PlannedFlight) -> Iterator[_Segment]:
                 begin = datetime.strptime(match["time"], "%Y%m%dT%H%M%SZ").replace(tzinfo=UTC)
                 found.append(_Segment(int(match["number"]), begin.timestamp(), path))
     found.sort(key=lambda segment: segment.number)
-    ends = [later.begin_s for _, later in pairwise(found)]
-    for segment, end_s in zip(found, [*ends, float("inf")], strict=True):
-        if end_s >= flight.begin_s and segment.begin_s <= flight.end_s:
+    nexts = [later.begin_s for _, later in pairwise(found)]
+    for segment, next_s in zip(found, [*nexts, float("inf")], strict=True):
+        if flight.may_cover(segment.begin_s, next_s):
             yield segment
 
 

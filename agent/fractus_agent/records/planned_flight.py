@@ -45,6 +45,16 @@ class PlannedFlight:
         """Return True if records of a time are searched."""
         return self.begin_s <= time_s <= self.end_s
 
+    def may_cover(self, begin_s: float, next_s: float) -> bool:
+        """Return True if a file of records may contain records that are searched.
+
+        Args:
+            begin_s: Time of the first record of the file.
+            next_s: Time of the first record of the next file. If the clock of the node was set back between these times, the
+                end of the file is unknown.
+        """
+        return next_s < begin_s or (next_s >= self.begin_s and begin_s <= self.end_s)
+
 
 def planned_flight(plan: FlightPlan, node: str) -> PlannedFlight:
     """Return the flight of a plan on a node.

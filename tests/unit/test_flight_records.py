@@ -69,6 +69,27 @@ def test_track_ends_in_the_air_when_the_drone_flies_for_another_application(
     assert track(tmp_path, flight) == [2]
 
 
+def test_track_ends_when_a_driver_that_shared_the_flight_takes_control(tmp_path: Path, flight: PlannedFlight) -> None:
+    entries = [
+        grant(0, FOREIGN), grant(1, DRIVER), state(2), state(3, controller=FOREIGN), grant(4, DRIVER, "removed"),
+        state(5, controller=FOREIGN), state(6),
+    ]  # fmt: skip
+    write_log(tmp_path / "mobility.jsonl", entries)
+    assert track(tmp_path, flight) == [2, 3]
+
+
+def test_entries_after_the_landing_do_not_belong_to_the_flight(tmp_path: Path, flight: PlannedFlight) -> None:
+    def control(second: float, action: str) -> dict[str, Any]:
+        return at(second, "control", action=action, controller="pilot", reason="r", code="", policies=[])
+
+    entries = [
+        grant(0, DRIVER), state(1), grant(2, DRIVER, "removed"), control(3, "returned"), control(4, "landed"),
+        control(5, "granted"),
+    ]  # fmt: skip
+    write_log(tmp_path / "mobility.jsonl", entries)
+    assert [verdict.time.second for verdict in read_verdicts(tmp_path, flight, 500, "").items] == [3, 4]
+
+
 def test_records_outside_the_window_are_not_returned(tmp_path: Path, flight: PlannedFlight) -> None:
     entries = [grant(-601, DRIVER), state(-601), call(-601, DRIVER), state(0), call(4500, DRIVER), call(4501, DRIVER)]
     write_log(tmp_path / "mobility.jsonl", entries)

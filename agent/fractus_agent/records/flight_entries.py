@@ -9,6 +9,7 @@ from typing import Any, cast
 
 from fractus_core.api.flight_records import FlightVerdict, TrackPoint, VerdictKind
 from fractus_core.api.names import ComponentIdentity, component_name
+from fractus_core.control.vehicle_events import MOTORS_STOPPED
 
 from fractus_agent.records.planned_flight import PlannedFlight
 
@@ -17,14 +18,17 @@ FlightRecord = FlightVerdict | TrackPoint
 _VEHICLE_KINDS = frozenset({"takeover", "control", "monitor"})
 """Kinds of entries about the vehicle. They name no application."""
 
+_LANDED = frozenset({"landed", MOTORS_STOPPED})
+"""Actions of control entries that end a flight."""
+
 _MAX_TEXT = 1000
 
 
 class FlightEntries:
     """Selects the entries of one log, which must be taken in their order.
 
-    Entries about the vehicle belong to the flight from its first Grant until its last Grant is removed and the drone is on the
-    ground. Entries about components of other applications never belong to it, even on a shared flight.
+    Entries about the vehicle belong to the flight from its first Grant until its last Grant is removed, and either the drone is
+    on the ground or a driver of another application has control. Entries about components of other applications never belong to it, even on a shared flight.
 
     Args:
         flight: The flight.
@@ -66,7 +70,10 @@ class FlightEntries:
             self._grants.clear()
         elif kind == "grant":
             self._follow_grant(entry)
-        self._flying = bool(self._grants) or (self._flying and self._in_air)
+        self._flying = bool(self._grants) or (self._flying and self._in_air and not self._foreign_driver)
+        if kind == "control" and entry.get("action") in _LANDED:
+            # The last state entry may be older than the landing. This entry still belongs to the flight.
+            self._in_air = False
 
     def _follow_grant(self, entry: Mapping[str, Any]) -> None:
         identity = entry.get("identity")

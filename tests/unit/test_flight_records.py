@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import json
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,7 @@ from fractus_agent.records.audit_records import InvalidContinue, read_track, rea
 from fractus_agent.records.picture_records import NotRecorded, read_picture, read_pictures
 from fractus_agent.records.planned_flight import NoFlight, PlannedFlight, planned_flight
 from fractus_core.api import FlightPlan
+from fractus_core.api.flight_records import VerdictPage
 from fractus_core.api.names import component_identity
 
 SEGMENT = "000001-20260601T120000Z.mcap"
@@ -188,10 +190,22 @@ def test_damaged_lines_are_skipped(tmp_path: Path, flight: PlannedFlight, line: 
     with log.open("ab") as file:
         file.write(line + b"\n")
     write_log(
-        log, [state(1, lat=float("nan")), at(2, "state", lat="x", in_air=1), at(3, "call", caller=["x"])], first=2
-    )
-    assert [point.lat for point in read_track(tmp_path, flight, 500, "").items] == [None, None]
+        log,
+        [
+            state(1, lat=float("nan")), at(2, "state", lat="x", in_air=1), at(3, "call", caller=["x"]), at(4, "grant", change=[]),
+            {**state(6), "kind": ["state"]}, state(7, lat=10**400),
+        ],
+        first=2,
+    )  # fmt: skip
+    assert [point.lat for point in read_track(tmp_path, flight, 500, "").items] == [None, None, None]
     assert read_verdicts(tmp_path, flight, 500, "").items == []
+
+
+def test_text_that_is_not_unicode_does_not_hide_the_page(tmp_path: Path, flight: PlannedFlight) -> None:
+    write_log(tmp_path / "mobility.jsonl", [call(1, DRIVER, reason="terrain-\udcff.tif", policies=["\udc80"])])
+    page = VerdictPage(items=tuple(read_verdicts(tmp_path, flight, 10, "").items))
+    received = VerdictPage.model_validate_json(json.dumps(page.to_dict()))
+    assert (received.items[0].reason, received.items[0].policies) == ("terrain-\\udcff.tif", ("\\udc80",))
 
 
 @pytest.mark.parametrize("token", ["x", "1", "1-2-3", "-1-2", "1-" + "9" * 16, "٣-١", "1-2\n", "../1-2"])

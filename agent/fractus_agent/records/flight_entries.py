@@ -43,7 +43,7 @@ class FlightEntries:
 
     def take(self, entry: Mapping[str, Any]) -> FlightRecord | None:
         """Return the record of the next entry, or None if the entry does not belong to the flight."""
-        kind = entry.get("kind")
+        kind = _text(entry.get("kind"))
         foreign_before = self._foreign_driver
         self._follow(kind, entry)
         time = entry_time(entry)
@@ -59,7 +59,7 @@ class FlightEntries:
             return _verdict(cast("VerdictKind", kind), time, entry)
         return None
 
-    def _follow(self, kind: object, entry: Mapping[str, Any]) -> None:
+    def _follow(self, kind: str, entry: Mapping[str, Any]) -> None:
         """Follow the Grants of the flight and the state of the drone."""
         if "controller" in entry:
             self._foreign_driver = self._is_foreign(entry["controller"])
@@ -71,13 +71,13 @@ class FlightEntries:
         elif kind == "grant":
             self._follow_grant(entry)
         self._flying = bool(self._grants) or (self._flying and self._in_air and not self._foreign_driver)
-        if kind == "control" and entry.get("action") in _LANDED:
+        if kind == "control" and _text(entry.get("action")) in _LANDED:
             # The last state entry may be older than the landing. This entry still belongs to the flight.
             self._in_air = False
 
     def _follow_grant(self, entry: Mapping[str, Any]) -> None:
         identity = entry.get("identity")
-        change = entry.get("change")
+        change = _text(entry.get("change"))
         if self._flight.owns(identity):
             if change == "removed":
                 self._grants.discard(str(identity))
@@ -134,7 +134,8 @@ def _verdict(kind: VerdictKind, time: datetime, entry: Mapping[str, Any]) -> Fli
 
 
 def _text(value: object) -> str:
-    return str(value)[:_MAX_TEXT] if value else ""
+    """Return a text. The log contains bytes that are not UTF-8, as in file names, as lone surrogates, which are not valid JSON."""
+    return str(value)[:_MAX_TEXT].encode(errors="backslashreplace").decode() if value else ""
 
 
 def _texts(value: object) -> tuple[str, ...]:
@@ -143,6 +144,10 @@ def _texts(value: object) -> tuple[str, ...]:
 
 def _number(value: object) -> float | None:
     """Return a finite number, or None for any other value. The log contains NaN as text."""
-    if isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value):
-        return float(value)
-    return None
+    if not isinstance(value, int | float) or isinstance(value, bool):
+        return None
+    try:
+        number = float(value)
+    except OverflowError:
+        return None
+    return number if math.isfinite(number) else None

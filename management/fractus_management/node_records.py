@@ -27,12 +27,14 @@ log = logging.getLogger(__name__)
 CONNECT_TIMEOUT_S = 5.0
 TIMEOUT_S = 30.0
 PICTURE_TIMEOUT_S = 120.0
-MAX_PAGE_BYTES = 8_000_000
-"""Maximum size of a page of records. A larger one, as a compromised node may send, is refused."""
+MAX_PAGE_BYTES = 4_000_000
+"""Maximum size of a page of records. A larger one, as a compromised node may send, is refused. The API needs up to 170 MB to
+parse it, for one page at a time."""
 
 MAX_PICTURE_BYTES = 16_000_000
 _MAX_PROBLEM_BYTES = 10_000
 _CHUNK_BYTES = 64 * 1024
+_PORTS = 65536
 
 _FORWARDED = frozenset({400, 401, 403, 404, 409, 503})
 """Statuses of the agent that describe the request, or a state of the node."""
@@ -86,12 +88,14 @@ class RecordingNode:
     ) -> AsyncIterator[aiohttp.ClientResponse]:
         """Send a request. The agent closes the connection after each response."""
         timeout = aiohttp.ClientTimeout(total=timeout_s, sock_connect=CONNECT_TIMEOUT_S)
-        async with aiohttp.ClientSession(timeout=timeout, trust_env=False) as session:
+        # Agents do not compress. A small compressed response of a compromised node could expand to any size.
+        session_of_node = aiohttp.ClientSession(timeout=timeout, trust_env=False, auto_decompress=False)
+        async with session_of_node as session:
             try:
                 response = await session.get(
                     url,
                     params=query,
-                    headers={"Authorization": f"Bearer {self.token}"},
+                    headers={"Authorization": f"Bearer {self.token}", "Accept-Encoding": "identity"},
                     ssl=self.context,
                     server_hostname=node_server_name(self.drone),
                     allow_redirects=False,
@@ -109,7 +113,7 @@ class RecordingNode:
             async for chunk in response.content.iter_chunked(_CHUNK_BYTES):
                 content += chunk
                 if len(content) > max_bytes:
-                    raise self._unusable("its response is too large")
+                    raise self._unusable("its response is too large; use a lower limit")
         except (aiohttp.ClientError, OSError, TimeoutError) as error:
             raise self._unreachable(error) from error
         return bytes(content)
@@ -148,30 +152,28 @@ async def recording_node(caller: Caller, namespace: str, name: str) -> Recording
         message = f"the flight of {name} has not started, so it has no records; read them after the takeoff"
         raise refused(HTTPStatus.CONFLICT, "NotStarted", message)
     try:
-        address = _address(await caller.client.get(DRONE, drone))
+        root = _root(await caller.client.get(DRONE, drone))
     except NotFound:
         message = f"the Drone {drone} was deleted, so the records of {name} cannot be found"
         raise refused(HTTPStatus.NOT_FOUND, "DroneDeleted", message) from None
-    if address is None:
+    if root is None:
         message = (
             f"{drone} serves no records; an administrator can enable them with management.records.enabled of the chart"
         )
         raise refused(HTTPStatus.SERVICE_UNAVAILABLE, "RecordsNotServed", message)
-    host, port = address
-    root = URL.build(scheme="https", host=host, port=port) / records_path(namespace, name, "").strip("/")
-    return RecordingNode(drone, root, caller.token, await asyncio.to_thread(_context, caller))
+    url = root / records_path(namespace, name, "").strip("/")
+    return RecordingNode(drone, url, caller.token, await asyncio.to_thread(_context, caller))
 
 
-def _address(drone: Body) -> tuple[str, int] | None:
-    """Return host and port of the recording endpoint of a Drone, or None if it has none."""
+def _root(drone: Body) -> URL | None:
+    """Return the URL of the recording endpoint of a Drone, or None if it has none, or its address is invalid."""
     try:
         address = DroneStatus.model_validate(drone.get("status") or {}).records_address
+        host, _, port = (address or "").rpartition(":")
+        root = URL.build(scheme="https", host=host.strip("[]"), port=int(port))
     except (InvalidObject, ValueError):
         return None
-    host, _, port = (address or "").rpartition(":")
-    if not host or not port.isdecimal():
-        return None
-    return host.strip("[]"), int(port)
+    return root if host and int(port) < _PORTS else None
 
 
 def _context(caller: Caller) -> ssl.SSLContext:

@@ -119,10 +119,11 @@ async def _page(
     records, name, namespace = source
     node = await recording_node(caller, namespace or caller.settings.namespace, name)
     query = {"limit": str(limit)} | ({"continue": continue_} if continue_ else {})
-    content = await node.page(records, query)
-    try:
-        page = model.model_validate_json(content)
-    except ValidationError as error:
-        message = f"the records of {node.drone} cannot be read: its agent has another release, or is compromised"
-        raise refused(HTTPStatus.SERVICE_UNAVAILABLE, "NodeInvalid", message) from error
+    with caller.limits.page_of_drone(node.drone):
+        content = await node.page(records, query)
+        try:
+            page = model.model_validate_json(content)
+        except ValidationError as error:
+            message = f"the records of {node.drone} cannot be read: its agent has another release, or is compromised"
+            raise refused(HTTPStatus.SERVICE_UNAVAILABLE, "NodeInvalid", message) from error
     return JSONResponse(page.to_dict())

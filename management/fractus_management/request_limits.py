@@ -1,4 +1,4 @@
-"""Limits of requests and event streams for each token."""
+"""Limits of requests and event streams for each token, and of pages of records for each drone."""
 
 from __future__ import annotations
 
@@ -30,6 +30,7 @@ class RequestLimits:
         self._free_at: OrderedDict[bytes, float] = OrderedDict()
         """Time at which each token may send a full burst again."""
         self._streams: Counter[bytes] = Counter()
+        self._pages: Counter[str] = Counter()
 
     @property
     def streams(self) -> int:
@@ -74,3 +75,21 @@ class RequestLimits:
             self._streams[token_hash] -= 1
             if not self._streams[token_hash]:
                 del self._streams[token_hash]
+
+    @contextmanager
+    def page_of_drone(self, drone: str) -> Iterator[None]:
+        """Count a page of records while it is read. A compromised drone could send many large pages slowly.
+
+        Raises:
+            Refused: Too many pages of the drone are read.
+        """
+        if self._pages[drone] >= self._settings.max_pages_of_drone:
+            message = f"{drone} reads records for other requests; try again"
+            raise refused(HTTPStatus.SERVICE_UNAVAILABLE, "NodeBusy", message)
+        self._pages[drone] += 1
+        try:
+            yield
+        finally:
+            self._pages[drone] -= 1
+            if not self._pages[drone]:
+                del self._pages[drone]

@@ -34,6 +34,7 @@ class Settings:
         requests_per_s: Requests that a token may send per second in the long run. It may send five times as many at once.
         max_streams: Maximum number of open event streams of this process.
         max_streams_of_token: Maximum number of open event streams of a token.
+        max_pages_of_drone: Maximum number of pages of records that are read from a drone at the same time.
         keepalive_s: Seconds without an event after which a stream sends a comment.
         automated_testing: Settings of the adapter for InterUSS' automated testing. None: the adapter is not served.
         node_ca: File of the CA that issues the certificates of drones. None: records of flights cannot be read.
@@ -46,6 +47,7 @@ class Settings:
     requests_per_s: float = DEFAULT_REQUESTS_PER_S
     max_streams: int = 256
     max_streams_of_token: int = 16
+    max_pages_of_drone: int = 8
     keepalive_s: float = 15.0
     automated_testing: AutomatedTesting | None = None
     node_ca: Path | None = None

@@ -3,17 +3,24 @@
 from __future__ import annotations
 
 import asyncio
+import gzip
 import ssl
 from collections.abc import AsyncIterator, Callable
 from contextlib import AsyncExitStack
+from dataclasses import dataclass
 from pathlib import Path
+from typing import cast
 
 import pytest
 from agent_pki import TestAuthority
 from fractus_agent.certificates import create_request
 from fractus_management import node_records
-from fractus_management.node_records import RecordingNode
+from fractus_management.api_server import Caller
+from fractus_management.node_records import RecordingNode, recording_node
 from fractus_management.problem_details import Refused
+from fractus_management.request_limits import RequestLimits
+from fractus_management.settings import Settings
+from fractus_runtime.kubernetes import Body, Client, Kind
 from yarl import URL
 
 Answers = Callable[[bytes], RecordingNode]
@@ -91,3 +98,36 @@ async def test_response_that_is_no_picture_of_known_size_is_refused(answering: A
         with pytest.raises(Refused) as refusal:
             await answering(response).picture("1-2-3", stack)
     assert refusal.value.reasons[0].reason == "NodeInvalid"
+
+
+async def test_compressed_response_is_not_expanded(answering: Answers) -> None:
+    body = gzip.compress(b" " * 5_000_000)
+    headers = ("Content-Type: image/jpeg", "Content-Encoding: gzip")
+    node = answering(http("200 OK", body, *headers))
+    assert await node.page("verdicts", {}) == body
+    async with AsyncExitStack() as stack:
+        size, parts = await node.picture("1-2-3", stack)
+        assert size == len(b"".join([part async for part in parts])) == len(body)
+
+
+@dataclass
+class Objects:
+    """Fake of the API server: a plan that flies with drone-1, which reports an address."""
+
+    address: str
+
+    async def get(self, kind: Kind, _name: str, _namespace: str = "") -> Body:
+        if kind.name == "FlightPlan":
+            return {"status": {"drone": "drone-1", "application": "flight-x"}}
+        return {"status": {"recordsAddress": self.address}}
+
+
+@pytest.mark.parametrize(
+    "address", ["", "host", ":1", "host:", "host:x", "host:99999", "user@host:1", "host/path:1", "a b:1", "h?x:1"]
+)
+async def test_invalid_address_of_a_drone_is_no_internal_error(tmp_path: Path, address: str) -> None:
+    settings = Settings(node_ca=tmp_path / "ca.crt")
+    caller = Caller(cast("Client", Objects(address)), settings, RequestLimits(settings), "token", b"")
+    with pytest.raises(Refused) as refusal:
+        await recording_node(caller, "team", "survey-1")
+    assert (refusal.value.status, refusal.value.reasons[0].reason) == (503, "RecordsNotServed")

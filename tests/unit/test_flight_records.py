@@ -26,8 +26,10 @@ from fractus_agent.records.audit_records import InvalidContinue, read_track, rea
 from fractus_agent.records.picture_records import NotRecorded, read_picture, read_pictures
 from fractus_agent.records.planned_flight import NoFlight, PlannedFlight, planned_flight
 from fractus_core.api import FlightPlan
-from fractus_core.api.flight_records import VerdictPage
+from fractus_core.api.flight_records import PicturePage, TrackPage, VerdictPage
+from fractus_core.api.model import OpenModel
 from fractus_core.api.names import component_identity
+from pydantic import ValidationError
 
 SEGMENT = "000001-20260601T120000Z.mcap"
 
@@ -206,6 +208,28 @@ def test_text_that_is_not_unicode_does_not_hide_the_page(tmp_path: Path, flight:
     page = VerdictPage(items=tuple(read_verdicts(tmp_path, flight, 10, "").items))
     received = VerdictPage.model_validate_json(json.dumps(page.to_dict()))
     assert (received.items[0].reason, received.items[0].policies) == ("terrain-\\udcff.tif", ("\\udc80",))
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b'{"items": [' + b"0," * 20_000 + b"0]}",
+        b'{"items": [{"time": 0, "kind": "call", "action": "", "policies": [' + b"0," * 20_000 + b"0]}]}",
+    ],
+    ids=["items", "policies"],
+)
+def test_page_with_many_invalid_items_is_refused_at_the_first(content: bytes) -> None:
+    with pytest.raises(ValidationError) as invalid:
+        VerdictPage.model_validate_json(content)
+    assert invalid.value.error_count() == 1
+
+
+@pytest.mark.parametrize("model", [VerdictPage, TrackPage, PicturePage])
+def test_page_with_too_many_records_is_refused(model: type[OpenModel]) -> None:
+    record = {"time": 0, "kind": "call", "action": "", "controller": "", "inAir": True, "id": "1", "component": ""}
+    content = {"items": [record | {"sizeBytes": 1}] * 501}
+    with pytest.raises(ValidationError, match="at most 500 items"):
+        model.model_validate(content)
 
 
 @pytest.mark.parametrize("token", ["x", "1", "1-2-3", "-1-2", "1-" + "9" * 16, "٣-١", "1-2\n", "../1-2"])

@@ -16,7 +16,7 @@ from typing import Any, Protocol
 
 from aiohttp import hdrs, web
 from fractus_core.api import FlightPlan, InvalidObject
-from fractus_core.api.flight_records import PicturePage, TrackPage, VerdictPage
+from fractus_core.api.flight_records import MAX_RECORDS, PicturePage, TrackPage, VerdictPage
 from fractus_core.api.names import is_subdomain
 from fractus_runtime.connection_limit import ConnectionLimit, mark_authorized
 
@@ -28,7 +28,6 @@ from fractus_agent.store import KubeError, Object
 
 log = logging.getLogger(__name__)
 
-MAX_LIMIT = 500
 DEFAULT_LIMIT = 100
 MAX_CONNECTIONS = 32
 ACCEPT_INTERVAL_S = 0.05
@@ -283,8 +282,8 @@ def _paging(request: web.Request) -> tuple[int, str]:
     """
     text = request.query.get("limit", str(DEFAULT_LIMIT))
     limit = int(text) if re.fullmatch(r"[0-9]{1,6}", text) else 0
-    if not 1 <= limit <= MAX_LIMIT:
-        raise Refused(HTTPStatus.BAD_REQUEST, "InvalidLimit", f"limit: use a number from 1 to {MAX_LIMIT}")
+    if not 1 <= limit <= MAX_RECORDS:
+        raise Refused(HTTPStatus.BAD_REQUEST, "InvalidLimit", f"limit: use a number from 1 to {MAX_RECORDS}")
     return limit, request.query.get("continue", "")
 
 

@@ -4,12 +4,19 @@ from __future__ import annotations
 
 import re
 from datetime import datetime
-from typing import Literal
+from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import FailFast, Field
 
 from fractus_core.api.model import OpenModel
 from fractus_core.api.names import DNS_LABEL, is_subdomain
+
+MAX_RECORDS = 500
+"""Maximum number of records in a page."""
+
+# A node may be compromised: the first invalid item ends the validation, so that many of them use no memory.
+_Names = Annotated[tuple[str, ...], FailFast()]
+_MAX_NAMES = 100
 
 VerdictKind = Literal["call", "takeover", "control", "monitor"]
 
@@ -27,8 +34,8 @@ class FlightVerdict(OpenModel):
     action: str = Field(description="Action: allow, correct, deny or takeover for a call.")
     code: str = Field(default="", description="Machine-readable CamelCase reason; empty: none.")
     reason: str = Field(default="", description="Human-readable explanation; empty: none.")
-    policies: tuple[str, ...] = Field(default=(), description="Policies that caused the verdict.")
-    filters: tuple[str, ...] = Field(default=(), description="Privacy filters that a picture needed.")
+    policies: _Names = Field(default=(), max_length=_MAX_NAMES, description="Policies that caused the verdict.")
+    filters: _Names = Field(default=(), max_length=_MAX_NAMES, description="Privacy filters that a picture needed.")
     lat: float | None = Field(default=None, description="Latitude of the drone in degrees; unset: unknown.")
     lon: float | None = Field(default=None, description="Longitude of the drone in degrees; unset: unknown.")
     alt: float | None = Field(default=None, description="Altitude of the drone in metres above home; unset: unknown.")
@@ -68,21 +75,27 @@ _CONTINUE = Field(
 class VerdictPage(OpenModel):
     """One page of the verdicts of a flight."""
 
-    items: tuple[FlightVerdict, ...] = Field(description="Verdicts in the order of time.")
+    items: Annotated[tuple[FlightVerdict, ...], FailFast()] = Field(
+        max_length=MAX_RECORDS, description="Verdicts in the order of time."
+    )
     continue_: str | None = _CONTINUE
 
 
 class TrackPage(OpenModel):
     """One page of the track of a flight."""
 
-    items: tuple[TrackPoint, ...] = Field(description="Positions in the order of time, at most two per second.")
+    items: Annotated[tuple[TrackPoint, ...], FailFast()] = Field(
+        max_length=MAX_RECORDS, description="Positions in the order of time, at most two per second."
+    )
     continue_: str | None = _CONTINUE
 
 
 class PicturePage(OpenModel):
     """One page of the recorded pictures of a flight."""
 
-    items: tuple[RecordedPicture, ...] = Field(description="Pictures in the order of recording.")
+    items: Annotated[tuple[RecordedPicture, ...], FailFast()] = Field(
+        max_length=MAX_RECORDS, description="Pictures in the order of recording."
+    )
     continue_: str | None = _CONTINUE
 
 

@@ -6,14 +6,19 @@ import hashlib
 import os
 import signal
 from collections.abc import AsyncIterator, Iterator
+from datetime import datetime
 from pathlib import Path
 
 import chart as fractus_chart
 import pytest
 from control_plane import ControlPlane, programs, wait_for
+from flight_log import START, call, grant, state, write_log
+from fractus_core.api.flight_plans import application_name
+from fractus_core.api.names import component_identity
 from management_server import ManagementServer, User, restriction, user_token
 from mobility_rig import Rig
 from operator_world import FRACTUS, OperatorProcess, World, approved_template, fresh_namespace
+from record_node import Flight, RecordNode, publish_address, started
 
 AUTHORITY_ROLES = (
     "fractus-policy-editor",
@@ -172,3 +177,53 @@ def observer(pilot: User, world: World, management: ManagementServer, namespace:
     user = User(management, user_token(world, namespace, "observer", ("fractus-flightplan-viewer",), ()), namespace)
     wait_for(lambda: user("GET", "/v1/plans").status == 200, "the role of the observer")
     return user
+
+
+@pytest.fixture
+def record_node(control_plane: ControlPlane, tmp_path: Path) -> Iterator[RecordNode]:
+    node = RecordNode(control_plane, tmp_path / "node")
+    node.certify("drone-1")
+    yield node
+    node.stop()
+
+
+@pytest.fixture
+def record_api(control_plane: ControlPlane, record_node: RecordNode, tmp_path: Path) -> Iterator[ManagementServer]:
+    ca = tmp_path / "ca.crt"
+    ca.write_bytes(record_node.authority.pem)
+    server = ManagementServer(control_plane, tmp_path / "api.log", f"--node-ca={ca}")
+    yield server
+    assert server.stop() == 0
+    assert '"level": "ERROR"' not in server.log.read_text()
+
+
+@pytest.fixture
+def recorded_flight(pilot: User, record_api: ManagementServer, world: World, record_node: RecordNode) -> Flight:
+    """A flight with one verdict, two positions, and calls and a picture of another tenant. The endpoint is not started."""
+    user = pilot.at(record_api)
+    path, plan = started(user, world)
+    uid = plan["metadata"]["uid"]
+    driver = component_identity(user.namespace, application_name(uid), "Navigator", "navigator")
+    foreign = component_identity("other", application_name(uid), "Navigator", "navigator")
+    start = datetime.fromisoformat(plan["spec"]["window"]["start"])
+    since_s = (start - START).total_seconds()
+    entries = [grant(since_s, driver), call(since_s + 1, foreign), call(since_s + 2, driver, "deny", reason="too far")]
+    log = record_node.state / "audit" / "mobility.jsonl"
+    write_log(log, [*entries, state(since_s + 3), state(since_s + 4, lat=39.3604)])
+    recorded = record_node.state / "recordings" / "camera" / start.strftime("000001-%Y%m%dT%H%M%SZ.mcap")
+    pictures = [
+        (since_s + 2, f"{uid}/{driver}", b"\xff\xd8 mine"),
+        (since_s + 3, f"{uid}/{foreign}", b"\xff\xd8 other"),
+    ]
+    return Flight(user, path, plan["metadata"]["name"], driver, log, since_s, recorded, pictures)
+
+
+@pytest.fixture
+def served_flight(recorded_flight: Flight, world: World, record_node: RecordNode) -> Flight:
+    """The flight, whose records the endpoint serves."""
+    publish_address(world, f"127.0.0.1:{record_node.port}")
+    record_node.start()
+    wait_for(
+        lambda: recorded_flight.user("GET", f"{recorded_flight.path}/verdicts").status == 200, "the recording endpoint"
+    )
+    return recorded_flight

@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import io
 import json
+import re
 from collections.abc import Iterator
 from pathlib import Path
+from urllib.parse import parse_qs, urlsplit
 
 import pytest
 from axe_playwright_python.sync_playwright import Axe
 from browser import CHROMIUM, SOFTWARE_GL, TIMEOUT_MS, launched
 from control_plane import wait_for
+from flight_log import call, write_log, write_pictures
 from management_server import Body, ManagementServer, User, plan, restriction, submitted, user_token
 from operator_world import FRACTUS, LAT, LON, World, approved_region_template, approved_template, at, fractus_object
+from PIL import Image
 from playwright.sync_api import Browser, Page, Playwright, Route, expect, sync_playwright
+from record_node import Flight, report_start, started
 
 IMPORTED = Path(__file__).parents[1] / "imported"
 
@@ -603,3 +609,184 @@ def test_plans_page_submits_a_plan_and_shows_restrictions_without_webgl(
     assert result.violations_count == 0, result.generate_report()
     page.get_by_role("button", name="Submit the plan").press("Enter")
     expect(page.locator("#plans > li")).to_contain_text("Accepted", timeout=TIMEOUT_MS)
+
+
+def jpeg() -> bytes:
+    content = io.BytesIO()
+    Image.new("RGB", (64, 36), "green").save(content, "JPEG")
+    return content.getvalue()
+
+
+def verdict(second: int, action: str = "deny", **more: object) -> Body:
+    time = f"2026-06-01T12:{second // 60:02}:{second % 60:02}Z"
+    content = {"kind": "call", "component": "Navigator", "method": "Goto", "reason": f"reason {second}"}
+    return {"time": time, "action": action, **content, **more}
+
+
+def picture(number: int, size: int = 1000) -> Body:
+    time = f"2026-06-01T12:00:{number:02}Z"
+    return {"id": f"1-{number}-0", "time": time, "component": "AerialViewer", "sizeBytes": size}
+
+
+class Records:
+    """Records of a flight that the page receives instead of those of a drone."""
+
+    def __init__(self, page: Page) -> None:
+        self.items: dict[str, list[Body]] = {"verdicts": [], "track": [], "pictures": []}
+        self.requests = list[str]()
+        page.route(re.compile(r"/v1/plans/[^/]+/(verdicts|track|pictures)\?"), self._send_page)
+        page.route(re.compile(r"/v1/plans/[^/]+/pictures/"), lambda route: route.fulfill(body=jpeg()))
+
+    def _send_page(self, route: Route) -> None:
+        url = urlsplit(route.request.url)
+        query = {name: int(value) for name, (value,) in parse_qs(url.query).items() if name != "namespace"}
+        begin = query.get("continue", 0)
+        end = begin + query["limit"]
+        records = self.items[url.path.rpartition("/")[2]]
+        self.requests.append(f"{url.path.rpartition('/')[2]} from {begin}")
+        more = {"continue": str(end)} if end < len(records) else {}
+        route.fulfill(json={"items": records[begin:end], **more})
+
+
+def follow(page: Page, plan: Body) -> None:
+    page.get_by_role("button", name=f"Follow {plan['metadata']['name']}").press("Enter")
+
+
+def pixels(page: Page, colour: tuple[int, int, int]) -> int:
+    """Return how many pixels of the map have a colour."""
+    screenshot = Image.open(io.BytesIO(page.locator("#map").screenshot())).convert("RGB")
+    colours = screenshot.getcolors(screenshot.width * screenshot.height) or []
+    return sum(count for count, each in colours if each == colour)
+
+
+def test_plans_page_shows_the_records_of_the_followed_flight(page: Page, served_flight: Flight) -> None:
+    user = served_flight.user
+    page.goto(user.url)
+    sign_in(page, user)
+    page.wait_for_selector("#map[data-map=ready]")
+    page.get_by_role("button", name=f"Follow {served_flight.name}").press("Enter")
+    verdicts = page.locator("#verdicts > li")
+    expect(verdicts).to_have_count(1, timeout=TIMEOUT_MS)
+    for text in ("Navigator Goto", "refused", "too far"):
+        expect(verdicts).to_contain_text(text)
+    expect(page.locator("#track")).to_contain_text("altitude 10.0 m above home, speed 3.0 m/s, in the air")
+    wait_for(lambda: pixels(page, (11, 87, 184)) > 150, "the track on the map")
+    expect(page.locator("#pictures-status")).to_contain_text("records no pictures")
+    verdicts.evaluate("item => { item.dataset.kept = 'yes' }")
+    corrected = call(served_flight.since_s + 5, served_flight.driver, "correct", reason="too fast")
+    write_log(served_flight.log, [corrected], 6)
+    second, owner, _ = served_flight.pictures[0]
+    write_pictures(served_flight.recorded, [(second, owner, jpeg()), *served_flight.pictures[1:]])
+    expect(verdicts).to_have_count(2, timeout=TIMEOUT_MS)
+    expect(verdicts.first).to_contain_text("too fast")
+    # The other items stay in the document, so that a screen reader does not lose its place.
+    expect(verdicts.last).to_have_attribute("data-kept", "yes")
+    expect(page.locator("#announcer")).to_contain_text("Navigator Goto corrected, too fast")
+    image = page.get_by_role("img", name="picture of Navigator at")
+    expect(image).to_have_count(1, timeout=TIMEOUT_MS)
+    assert image.evaluate("async image => { await image.decode(); return image.naturalWidth }") == 64
+    expect(page.locator("#pictures > li")).to_have_count(1)
+    result = Axe().run(page)
+    assert result.violations_count == 0, result.generate_report()
+    with page.expect_popup() as opened:
+        page.locator("#pictures a").press("Enter")
+    opened.value.wait_for_function("document.images[0]?.naturalWidth === 64")
+
+
+def test_plans_page_reads_records_from_the_start_of_the_flight_on(page: Page, pilot: User, world: World) -> None:
+    requests = list[str]()
+    page.on("request", lambda request: requests.append(urlsplit(request.url).path.rpartition("/")[2]))
+    body = submitted(pilot).body
+    sign_in(page, pilot)
+    follow(page, body)
+    expect(page.locator("#records-status")).to_contain_text("has not started")
+    page.wait_for_timeout(1000)
+    assert not {"verdicts", "track", "pictures"} & set(requests)
+    report_start(world, body)
+    # The drone of the test has no recording endpoint.
+    expect(page.locator("#records-status")).to_contain_text("drone-1 serves no records", timeout=TIMEOUT_MS)
+
+
+@pytest.mark.parametrize(
+    ("status", "detail", "sentence"),
+    [
+        (409, "the flight of this plan has not started", "the flight of this plan has not started"),
+        (403, "forbidden", "You may not read the records. An administrator can give you the roles"),
+        (503, "drone-1 does not respond", "drone-1 does not respond"),
+    ],
+)
+def test_plans_page_says_why_there_are_no_records(
+    page: Page, pilot: User, world: World, status: int, detail: str, sentence: str
+) -> None:
+    problem = {"status": status, "detail": detail}
+    page.route("**/verdicts?*", lambda route: route.fulfill(status=status, json=problem))
+    _, body = started(pilot, world)
+    sign_in(page, pilot)
+    follow(page, body)
+    expect(page.locator("#records-status")).to_contain_text(sentence, timeout=TIMEOUT_MS)
+    expect(page.locator("#records")).to_be_hidden()
+    expect(page.locator("#plans-problem")).to_be_empty()
+    expect(page.locator("#connection")).to_be_empty()
+    expect(page.get_by_role("button", name=f"Change {body['metadata']['name']}")).to_be_enabled()
+    result = Axe().run(page)
+    assert result.violations_count == 0, result.generate_report()
+
+
+def test_plans_page_reads_records_in_pages_and_keeps_the_latest(page: Page, pilot: User, world: World) -> None:
+    page.add_init_script(
+        "HTMLCanvasElement.prototype.getContext = () => null; window.revoked = [];"
+        "const revoke = URL.revokeObjectURL; URL.revokeObjectURL = (url) => { revoked.push(url); revoke.call(URL, url) }"
+    )
+    page.reload()
+    records = Records(page)
+    records.items["verdicts"] = [verdict(0), *(verdict(second, "allow") for second in range(1, 260))]
+    records.items["track"] = [
+        {"time": "2026-06-01T12:00:00Z", "lat": LAT, "lon": LON, "alt": 12, "controller": "system", "inAir": False},
+        {"time": "2026-06-01T12:00:01Z", "controller": "system", "inAir": True},
+    ]
+    records.items["pictures"] = [picture(0)]
+    _, body = started(pilot, world)
+    sign_in(page, pilot)
+    follow(page, body)
+    thumbnail = page.locator("#pictures img")
+    expect(thumbnail).to_have_count(1, timeout=TIMEOUT_MS)
+    source = thumbnail.get_attribute("src")
+    expect(page.locator("#track")).to_contain_text("12:00:00 UTC")
+    expect(page.locator("#track")).to_contain_text("speed –, on the ground")
+    expect(page.locator("#verdicts > li")).to_have_count(1)
+    expect(page.locator("#calls > li")).to_have_count(100)
+    expect(page.locator("#calls > li").first).to_contain_text("reason 259")
+    assert records.requests.count("verdicts from 0") == 1
+    records.items["verdicts"].append(verdict(300))
+    records.items["pictures"] += [*(picture(number, 2_000_000) for number in range(1, 12)), picture(12)]
+    expect(page.locator("#verdicts > li")).to_have_count(2, timeout=TIMEOUT_MS)
+    expect(page.locator("#pictures > li")).to_have_count(12)
+    # The large pictures are read only at the request of the user.
+    expect(thumbnail).to_have_count(1, timeout=TIMEOUT_MS)
+    assert page.evaluate("revoked").count(source) == 1
+    page.get_by_role("button", name="Load picture of AerialViewer at 12:00:05 UTC, 2.0 MB").press("Enter")
+    expect(thumbnail).to_have_count(2)
+    expect(page.locator("#pictures a").last).to_be_focused()
+    assert records.requests.count("verdicts from 0") == 1
+    assert "verdicts from 200" in records.requests
+    shown = page.locator("#pictures a").evaluate_all("links => links.map(link => link.href)")
+    follow(page, body)
+    assert set(shown) <= set(page.evaluate("revoked"))
+
+
+def test_plans_page_shows_the_area_of_the_policy_of_a_refusal(
+    page: Page, pilot: User, authority: User, world: World, namespace: str
+) -> None:
+    authority("POST", "/v1/restrictions", restriction("fair"))
+    user_token(world, namespace, "pilot", (), ("fractus-policy-viewer", "fractus-zone-viewer"))
+    wait_for(lambda: pilot("GET", "/v1/restrictions").status == 200, "the roles of the pilot")
+    Records(page).items["verdicts"] = [verdict(1, policies=["fair", "other"])]
+    _, body = started(pilot, world)
+    sign_in(page, pilot)
+    page.wait_for_selector("#map[data-map=ready]")
+    follow(page, body)
+    expect(page.locator("#verdicts")).to_contain_text("policy other", timeout=TIMEOUT_MS)
+    expect(page.locator("#verdicts button")).to_have_count(1)
+    before = page.locator("#map").screenshot()
+    page.get_by_role("button", name="Show the area of fair").press("Enter")
+    wait_for(lambda: page.locator("#map").screenshot() != before, "the area on the map")

@@ -69,7 +69,7 @@ export function altitudeLimits(feature: Feature): string {
   return `${band.lower ?? "ground"} to ${band.upper} m ${reference}`;
 }
 
-export function actionOf(verdict: Verdict): string {
+export function actionOf(verdict: Pick<Verdict, "action" | "kind">): string {
   const action = verdict.action || verdict.kind;
   return ACTIONS[action] ?? action;
 }
@@ -80,7 +80,7 @@ export function isIntervention(verdict: Verdict): boolean {
 }
 
 /** Component and method of a call. */
-export function callOf(verdict: Verdict): string {
+export function callOf(verdict: Partial<Pick<Verdict, "component" | "method">>): string {
   return [verdict.component, verdict.method].filter(Boolean).join(" ");
 }
 

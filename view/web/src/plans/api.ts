@@ -23,7 +23,7 @@ export interface Reply<T> {
   etag: string;
 }
 
-interface Page<T> {
+export interface Page<T> {
   items: T[];
   continue?: string | null;
 }
@@ -48,6 +48,11 @@ export class Api {
     const response = await this.fetch(path, { method, headers: { ...type, ...headers }, ...content, signal: signal ?? null });
     const received = (response.status === 204 ? undefined : await response.json()) as T;
     return { status: response.status, body: received, etag: response.headers.get("ETag") ?? "" };
+  }
+
+  /** Returns the content of a file. Throws the errors of `send`. */
+  async content(path: string, signal: AbortSignal): Promise<ArrayBuffer> {
+    return (await this.fetch(path, { signal })).arrayBuffer();
   }
 
   /** Returns all pages of a list. */

@@ -73,7 +73,7 @@ export class LandingPlace {
   }
 
   private createPicker(clicks: MapClicks): HTMLButtonElement {
-    const button = element("button", "picker", "Select on the map");
+    const button = element("button", "needs-map", "Select on the map");
     button.type = "button";
     const released = (): void => {
       button.textContent = "Select on the map";

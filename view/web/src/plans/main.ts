@@ -8,6 +8,7 @@ import { clock } from "../text";
 import { Api, Problem, type Reply, TEMPORARY } from "./api";
 import { showFindings } from "./decision";
 import { differences } from "./differences";
+import { FlightRecords } from "./flight_records";
 import { PlanForm } from "./plan_form";
 import { PlanList, stateOf } from "./plan_list";
 import { MapClicks } from "./map_clicks";
@@ -66,6 +67,13 @@ const restrictions = new Restrictions({
   explain: (error) => (isExpired(error) ? undefined : sentence(error)),
 });
 
+const records = new FlightRecords({
+  map: () => map,
+  zones: { has: (policy) => restrictions.has(policy), show: (policy) => restrictions.showArea(policy) },
+  announce: (text) => setText(byId("announcer"), text),
+  explain: sentence,
+});
+
 // -- sign-in --
 
 async function signIn(token: string, namespace: string): Promise<void> {
@@ -110,6 +118,7 @@ function signOut(reason = ""): void {
   api = undefined;
   stopChecking();
   following.abort();
+  followed = "";
   plans = [];
   drones = [];
   changed = undefined;
@@ -351,6 +360,8 @@ function follow(plan: FlightPlan): void {
   following.abort();
   following = new AbortController();
   followed = plan.metadata.name;
+  // Read the records again if the plan was followed before.
+  records.show(undefined, undefined);
   showPlans();
   showPlan(nameOf(plan));
   let state = stateOf(plan);
@@ -375,6 +386,7 @@ function put(plan: FlightPlan): void {
 
 function showPlans(): void {
   list.show(plans, followed);
+  records.show(api, plans.find(({ metadata }) => metadata.name === followed));
   const others = plans.filter((plan) => RESERVING.has(stateOf(plan)) && plan.metadata.name !== changed?.metadata.name);
   map?.set("corridor", others.flatMap(({ status }) => volumeFeatures([...(status?.volumes ?? []), ...(status?.offNominalVolumes ?? [])])));
 }
@@ -434,6 +446,7 @@ async function openMap(): Promise<void> {
   showRoute();
   showDrones();
   showPlans();
+  records.draw();
   restrictions.draw();
 }
 

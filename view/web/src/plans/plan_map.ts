@@ -1,4 +1,4 @@
-// Map of a plan: route, volumes, restrictions, other plans and drones. A click adds a point to the route or area.
+// Map of a plan: route, track, volumes, restrictions, other plans and drones. A click adds a point to the route or area.
 
 import { type GeoJSONSource, Map as MapLibre, NavigationControl, ScaleControl, type StyleSpecification, setWorkerUrl } from "maplibre-gl";
 import "maplibre-gl/dist/maplibre-gl.css";
@@ -11,7 +11,7 @@ setWorkerUrl(new URL(workerUrl, window.location.href).href);
 
 const FIT = { padding: 60, maxZoom: 18, animate: false };
 /** Layers of the map in drawing order. Their names are those of colours of the style sheet, unless `COLOURS` contains another one. */
-const LAYERS = ["methods", "limit", "pictures", "exclusion", "corridor", "operationArea", "selected", "area", "path", "depot", "landing"] as const;
+const LAYERS = ["methods", "limit", "pictures", "exclusion", "corridor", "operationArea", "selected", "area", "path", "flown", "depot", "landing"] as const;
 const COLOURS: Partial<Record<Layer, string>> = { selected: "link", area: "accent", landing: "accent" };
 /** Outlines differ in their dashes too, so that colours are not needed to tell them apart. */
 const DASHES: Partial<Record<Layer, [number, number]>> = { methods: [2, 2], limit: [4, 1.5], pictures: [1, 1.5], corridor: [3, 2], selected: [1, 1] };

@@ -105,6 +105,17 @@ export class Restrictions {
     if (this.mayPublish) this.form.addPoint(point);
   }
 
+  /** Returns true if the area of a policy can be shown. */
+  has(policy: string): boolean {
+    return this.items.some(({ name, zone }) => name === policy && zone);
+  }
+
+  /** Shows the area of a policy on the map. */
+  showArea(policy: string): void {
+    const restriction = this.items.find(({ name }) => name === policy);
+    if (restriction !== undefined) this.select(restriction);
+  }
+
   /** Draws the restrictions and the entered area. */
   draw(): void {
     const map = this.page.map();

@@ -3,7 +3,7 @@
 // The longitudes of a feature are continuous, so that a feature across the antimeridian is not drawn around the world. They may
 // therefore be outside -180 to 180.
 
-import type { Area, FlightPlanSpec, Point, ReservedVolume } from "./types";
+import type { Area, FlightPlanSpec, Point, ReservedVolume, TrackPoint } from "./types";
 
 type Coordinates = [number, number];
 
@@ -27,6 +27,18 @@ export function specFeatures(spec: FlightPlanSpec): GeoJSON.Feature[] {
 /** Returns the ground areas of volumes. */
 export function volumeFeatures(volumes: ReservedVolume[]): GeoJSON.Feature[] {
   return volumes.flatMap(({ areas }) => areas.flatMap(areaFeatures));
+}
+
+/** Returns the line of a track through its known positions, and the last of them. */
+export function trackFeatures(points: TrackPoint[]): GeoJSON.Feature[] {
+  const line = continuous(points.filter(hasPosition));
+  const features = line.slice(-1).map((coordinates) => feature({ type: "Point", coordinates }));
+  if (line.length > 1) features.push(feature({ type: "LineString", coordinates: line }));
+  return features;
+}
+
+export function hasPosition(point: TrackPoint): point is TrackPoint & Point {
+  return typeof point.lat === "number" && typeof point.lon === "number";
 }
 
 export function pointFeature({ lat, lon }: Point): GeoJSON.Feature {

@@ -106,6 +106,7 @@ export interface FlightPlanStatus {
   state?: string | null;
   message?: string | null;
   drone?: string | null;
+  application?: string | null;
   candidates?: Alternative[];
   rejected?: Rejection[];
   volumes?: ReservedVolume[];
@@ -120,6 +121,33 @@ export interface FlightPlan {
   metadata: Metadata;
   spec: FlightPlanSpec;
   status?: FlightPlanStatus | null;
+}
+
+export interface FlightVerdict {
+  time: string;
+  kind: string;
+  component?: string;
+  method?: string;
+  action: string;
+  code?: string;
+  reason?: string;
+  policies?: string[];
+}
+
+export interface TrackPoint {
+  time: string;
+  lat?: number | null;
+  lon?: number | null;
+  alt?: number | null;
+  speed?: number | null;
+  inAir: boolean;
+}
+
+export interface RecordedPicture {
+  id: string;
+  time: string;
+  component: string;
+  sizeBytes: number;
 }
 
 export interface ApplicationTemplateSpec {

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import socket
 import ssl
 from collections.abc import AsyncIterator
 from dataclasses import dataclass, field
@@ -193,6 +195,16 @@ async def test_renewed_certificate_is_used(endpoint: Endpoint) -> None:
     assert (await endpoint.get(f"{ROOT}/track", node="drone-2"))[0] == 200
 
 
+async def test_certificate_that_could_not_be_read_is_read_again(endpoint: Endpoint) -> None:
+    assert (await endpoint.get(f"{ROOT}/track"))[0] == 200
+    (endpoint.state / "tls" / "tls.crt").unlink()
+    endpoint.identity.serial += 1
+    assert (await endpoint.get(f"{ROOT}/track"))[0] == 200
+    endpoint.identity.serial -= 1
+    endpoint.certify("drone-2")
+    assert (await endpoint.get(f"{ROOT}/track", node="drone-2"))[0] == 200
+
+
 async def test_idle_connections_keep_no_caller_out(endpoint: Endpoint) -> None:
     context = ssl.create_default_context(cadata=endpoint.authority.pem.decode())
     name = "drone-1.node.fractus.dev"
@@ -225,3 +237,52 @@ async def test_records_are_read_for_one_request_at_a_time(endpoint: Endpoint, mo
     release.set()
     assert (await first)[0] == 200
     assert (await endpoint.get(f"{ROOT}/verdicts"))[0] == 200
+
+
+async def request_without_reading(endpoint: Endpoint, path: str) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
+    """Send a request, and receive only the first bytes of its response."""
+    context = ssl.create_default_context(cadata=endpoint.authority.pem.decode())
+    connection = socket.socket()
+    connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+    connection.connect(("127.0.0.1", endpoint.port))
+    reader, writer = await asyncio.open_connection(
+        sock=connection, ssl=context, server_hostname="drone-1.node.fractus.dev", limit=1024
+    )
+    writer.write(f"GET {path} HTTP/1.1\r\nHost: x\r\nAuthorization: Bearer alice\r\n\r\n".encode())
+    assert (await reader.readexactly(12)).endswith(b"200")
+    return reader, writer
+
+
+@pytest.fixture
+async def large_picture(endpoint: Endpoint) -> str:
+    """Path of a picture that is larger than the buffers of a connection."""
+    recorded = endpoint.state / "recordings" / "camera" / "000001-20260601T120000Z.mcap"
+    write_pictures(recorded, [(1, f"u/{VIEWER}", b"\xff\xd8" + bytes(5_500_000))])
+    _, listed = await endpoint.get(f"{ROOT}/pictures")
+    return f"{ROOT}/pictures/{listed['items'][0]['id']}"
+
+
+async def test_slow_caller_keeps_no_other_caller_out(
+    endpoint: Endpoint, large_picture: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(record_server, "TURN_TIMEOUT_S", 1.0)
+    _, writer = await request_without_reading(endpoint, large_picture)
+    assert (await endpoint.get(f"{ROOT}/track"))[0] == 200
+    status, picture = await endpoint.get(large_picture)
+    assert (status, len(picture)) == (200, 5_500_002)
+    writer.close()
+
+
+@pytest.mark.parametrize(("limit", "value"), [("MAX_TRANSFERS", 1), ("MAX_UNSENT_BYTES", 6_000_000)])
+async def test_oldest_transfer_is_aborted_for_another_one(
+    endpoint: Endpoint, large_picture: str, monkeypatch: pytest.MonkeyPatch, limit: str, value: int
+) -> None:
+    monkeypatch.setattr(record_server, limit, value)
+    reader, writer = await request_without_reading(endpoint, large_picture)
+    assert (await endpoint.get(large_picture))[0] == 200
+    received = 0
+    with contextlib.suppress(OSError):
+        while chunk := await asyncio.wait_for(reader.read(65536), 20):
+            received += len(chunk)
+    assert received < 5_500_000
+    writer.close()

@@ -10,6 +10,7 @@ import re
 import socket
 import ssl
 from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
 from http import HTTPStatus
 from pathlib import Path
 from typing import Any, Protocol
@@ -36,6 +37,9 @@ HANDSHAKE_TIMEOUT_S = 5.0
 TURN_TIMEOUT_S = 10.0
 """Seconds for which a request waits for the requests before it. Records are read for one request at a time."""
 SEND_TIMEOUT_S = 120.0
+MAX_TRANSFERS = 16
+MAX_UNSENT_BYTES = 24_000_000
+"""Maximum size of the responses that are being sent. Above it, and above `MAX_TRANSFERS`, the oldest transfer is aborted."""
 RETRY_S = 5.0
 _CHUNK_BYTES = 64 * 1024
 _TOKEN = re.compile(r"Bearer ([A-Za-z0-9._~+/=-]+)")
@@ -65,6 +69,14 @@ class Refused(Exception):
         super().__init__(message)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Transfer:
+    """A response that is being sent, with its size in bytes."""
+
+    request: web.Request
+    size: int
+
+
 class RecordServer:
     """The server.
 
@@ -84,6 +96,9 @@ class RecordServer:
         self._tls = tls
         self._plans = plans
         self._turn = asyncio.Lock()
+        self._transfers: dict[_Transfer, None] = {}
+        """Responses that are being sent, oldest first."""
+        self._problem = ""
 
     async def run(self, identity: NodeIdentity) -> None:
         """Serve until cancelled, once the node has a certificate."""
@@ -123,11 +138,11 @@ class RecordServer:
                     log.debug("records: connection not accepted (error=%s)", error)
                     await asyncio.sleep(RETRY_S)
                     continue
-                if serial != identity.serial:
+                renewed = self._context() if serial != identity.serial else None
+                if renewed is not None:
                     serial = identity.serial
-                    context = self._context() or context
+                    context = renewed
                 if context is None:
-                    serial = -1
                     connection.close()
                 else:
                     handshakes.create_task(_begin(connection, factory, context))
@@ -140,8 +155,11 @@ class RecordServer:
         try:
             context.load_cert_chain(self._tls / "tls.crt", self._tls / "tls.key")
         except (OSError, ValueError) as error:
-            log.warning("records: certificate not usable (directory=%s error=%s)", self._tls, error)
+            if str(error) != self._problem:
+                log.warning("records: certificate not usable (directory=%s error=%s)", self._tls, error)
+            self._problem = str(error)
             return None
+        self._problem = ""
         return context
 
     # -- requests --
@@ -180,8 +198,6 @@ class RecordServer:
             raise Refused(HTTPStatus.SERVICE_UNAVAILABLE, "NodeBusy", message) from None
         try:
             media_type, content = await asyncio.to_thread(read, request, flight)
-            log.info("records: sent (path=%s bytes=%d)", request.rel_url.raw_path, len(content))
-            return await _send(request, HTTPStatus.OK, media_type, content)
         except InvalidContinue as error:
             raise Refused(HTTPStatus.BAD_REQUEST, "InvalidContinue", str(error)) from error
         except NotRecorded:
@@ -193,6 +209,25 @@ class RecordServer:
             raise Refused(HTTPStatus.SERVICE_UNAVAILABLE, "Unreadable", message) from error
         finally:
             self._turn.release()
+        log.info("records: sending (path=%s bytes=%d)", request.rel_url.raw_path, len(content))
+        return await self._transfer(request, media_type, content)
+
+    async def _transfer(self, request: web.Request, media_type: str, content: bytes) -> web.StreamResponse:
+        """Send records while others are read. Callers that receive slowly therefore keep no other caller out."""
+        others = self._transfers
+        while others and (
+            len(others) >= MAX_TRANSFERS or sum(each.size for each in others) + len(content) > MAX_UNSENT_BYTES
+        ):
+            oldest = next(iter(others))
+            log.info("records: transfer aborted for another one (path=%s)", oldest.request.rel_url.raw_path)
+            del others[oldest]
+            _abort(oldest.request)
+        transfer = _Transfer(request, len(content))
+        self._transfers[transfer] = None
+        try:
+            return await _send(request, HTTPStatus.OK, media_type, content)
+        finally:
+            self._transfers.pop(transfer, None)
 
     async def _permitted_flight(self, request: web.Request) -> PlannedFlight:
         """Return the flight whose records the caller may read.
@@ -305,7 +340,12 @@ async def _send(request: web.Request, status: int, media_type: str, content: byt
                 await response.write(content[begin : begin + _CHUNK_BYTES])
             await response.write_eof()
     except (ConnectionError, TimeoutError):
-        if request.transport is not None:
-            with contextlib.suppress(RuntimeError):
-                request.transport.abort()
+        _abort(request)
     return response
+
+
+def _abort(request: web.Request) -> None:
+    """Close the connection of a request at once."""
+    if request.transport is not None:
+        with contextlib.suppress(RuntimeError):
+            request.transport.abort()

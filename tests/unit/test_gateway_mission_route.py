@@ -164,6 +164,12 @@ def test_condition_distance_without_a_distant_waypoint_has_no_effect(items: list
     assert len(route) == len(items)
 
 
+def test_route_on_the_ground_takes_off_before_the_leg_of_a_condition_distance() -> None:
+    near = Item(mavlink.MAV_CMD_CONDITION_DISTANCE, param1=5.0)
+    route = _route(near, _waypoint(39.37), on_ground=True)
+    assert [request.method for _, request in route] == ["Takeoff", "Goto", "Goto"]
+
+
 def test_route_with_too_many_steps_is_refused() -> None:
     nested = [*[_waypoint(39.37) for _ in range(300)], _jump(1, 9), _jump(1, 9)]
     with pytest.raises(Untranslatable, match=f"more than {MAX_STEPS} steps"):

@@ -186,7 +186,8 @@ def route_of(mission: Mission, first: int, at: Place, *, on_ground: bool) -> lis
             raise Untranslatable(f"the mission has more than {MAX_STEPS} steps; use fewer items or jumps")
         item = probe.items[number]
         requests, at = requests_of(probe, number, at)
-        if on_ground and item.navigates and item.command != mavlink.MAV_CMD_NAV_DELAY:
+        approaches = item.command == mavlink.MAV_CMD_CONDITION_DISTANCE and bool(requests)
+        if on_ground and (approaches or (item.navigates and item.command != mavlink.MAV_CMD_NAV_DELAY)):
             on_ground = False
             if item.command not in TAKEOFFS and at.reference == types_pb2.ALTITUDE_REFERENCE_HOME:
                 takeoff = Request("Takeoff", mobility_pb2.TakeoffRequest(altitude_m=at.altitude_m))

@@ -53,6 +53,21 @@ async def events(client: Client, silence_s: float = 20.0) -> AsyncGenerator[tupl
 # -- requests and responses --
 
 
+DEEP = b'{"a":' * 5000 + b'["\\"]}{",1]' + b"}" * 5000
+
+
+async def test_object_with_very_deep_values_does_not_hide_the_other_objects_of_a_list() -> None:
+    body = b'{"metadata":{},"items":[' + DEEP + b',{"text":"[{\\"","list":[[]]}]}'
+    async with client_of(Server(response(body))) as client:
+        deep, other = (await client.list_page(ZONE)).items
+    assert other == {"text": '[{"', "list": [[]]}
+    depth = 0
+    while deep is not None:
+        deep = deep["a"]
+        depth += 1
+    assert 100 < depth < 300
+
+
 async def test_request_is_sent_unchanged_and_connection_is_reused() -> None:
     server = Server(response({"a": [1]}))
     async with client_of(server) as client:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import copy
-import json
 from collections.abc import AsyncGenerator, AsyncIterator, Callable, Mapping, Sequence
 from functools import partial
 
@@ -17,7 +16,7 @@ import aiohttp
 from fractus_runtime.kubernetes.access import unchanging, with_tokens, without_credentials
 from fractus_runtime.kubernetes.connection import Connection, ContentType, translated
 from fractus_runtime.kubernetes.errors import Conflict, NotFound, from_status
-from fractus_runtime.kubernetes.objects import Body, Key, Kind, key_of
+from fractus_runtime.kubernetes.objects import Body, Key, Kind, key_of, parse_response
 
 LIST_TIMEOUT_S = 120.0
 """Maximum time of one page of a list, in seconds. Over slow links, a list that makes progress must not be restarted."""
@@ -194,7 +193,7 @@ class Client(Connection):
                 opened()
                 async for line in _lines(response.content, silence_s):
                     if line.endswith(b"\n") and line.strip():
-                        event = json.loads(line)
+                        event = parse_response(line)
                         if not isinstance(event, dict) or not event.keys() >= {"type", "object"}:
                             raise ValueError("the line is not a watch event")
                         if event["type"] == "ERROR":

@@ -21,7 +21,7 @@ from kubernetes.aio.config import ConfigException
 
 from fractus_runtime.kubernetes.access import Access, Unconfigured
 from fractus_runtime.kubernetes.errors import KubeError, from_status, unreachable
-from fractus_runtime.kubernetes.objects import Body
+from fractus_runtime.kubernetes.objects import Body, parse_response
 
 REQUEST_TIMEOUT_S = 15.0
 MAX_CONNECTIONS = 100
@@ -115,7 +115,7 @@ class Connection:
                     asyncio.timeout(timeout_s),
                     self.open_response(method, path, params, body, content_type, silence_s=silence_s) as response,
                 ):
-                    result: Body = json.loads(await response.read())
+                    result: Body = parse_response(await response.read())
             except TimeoutError as error:
                 raise unreachable(f"{method} {path}: no response in {timeout_s:.1f} s") from error
         return result

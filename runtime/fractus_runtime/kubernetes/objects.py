@@ -2,8 +2,19 @@
 
 from __future__ import annotations
 
+import json
+import logging
+import re
 from dataclasses import dataclass
 from typing import Any
+
+log = logging.getLogger(__name__)
+
+MAX_NESTING = 200
+"""Nesting of lists and objects beyond which values of a very deep response are dropped."""
+
+_TOKEN = re.compile(rb'"[^"\\]*(?:\\.[^"\\]*)*"|[][{}]', re.DOTALL)
+"""A string, or the begin or end of a list or an object."""
 
 Body = dict[str, Any]
 """An object as decoded JSON."""
@@ -36,6 +47,40 @@ class Kind:
         if self.namespaced:
             meta["namespace"] = namespace
         return {"apiVersion": self.api_version, "kind": self.name, "metadata": meta}
+
+
+def parse_response(content: bytes) -> Any:
+    """Return the JSON value of a response or a watch event of the API server.
+
+    The API server accepts 10,000 levels in fields without a schema, which Python cannot parse. Values that are nested more
+    than `MAX_NESTING` levels deep are then null, because one such object must not make its whole collection unreadable.
+
+    Raises:
+        ValueError: The content is not JSON.
+    """
+    try:
+        return json.loads(content)
+    except RecursionError:
+        log.warning("kubernetes: values that are nested too deeply dropped (bytes=%d)", len(content))
+        return json.loads(_without_deep_values(content))
+
+
+def _without_deep_values(content: bytes) -> bytes:
+    """Return JSON with null in place of the lists and objects that are nested too deeply."""
+    parts: list[bytes] = []
+    kept = 0
+    depth = 0
+    for token in _TOKEN.finditer(content):
+        if token[0] in {b"{", b"["}:
+            depth += 1
+            if depth == MAX_NESTING + 1:
+                parts += (content[kept : token.start()], b"null")
+                kept = len(content)
+        elif token[0] in {b"}", b"]"}:
+            if depth == MAX_NESTING + 1:
+                kept = token.end()
+            depth -= 1
+    return b"".join((*parts, content[kept:]))
 
 
 def key_of(body: Body) -> Key:

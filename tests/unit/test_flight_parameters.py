@@ -1,5 +1,7 @@
 """Parameters of flight plans, and the schemas of templates."""
 
+import time
+
 import pytest
 from fractus_core.api import InvalidObject
 from fractus_core.planning.flight_parameters import MAX_SCHEMA_DEPTH, check_parameter_schema, check_parameters
@@ -47,6 +49,45 @@ def test_parameter_that_violates_the_schema_is_named(parameters, sentence):
         check_parameters(flight(parameters=parameters), template(parameters=SCHEMA))
     assert sentence in str(refused.value)
     assert len(str(refused.value)) < 500
+
+
+def deep(levels):
+    value = 1
+    for _ in range(levels):
+        value = {"a": value}
+    return value
+
+
+@pytest.mark.parametrize("levels", [65, 120])
+def test_deeply_nested_values_are_refused(levels):
+    with pytest.raises(InvalidObject, match="nested more than 64 levels deep"):
+        check_parameters(flight(parameters={"speed": deep(levels)}), template(parameters={"type": "object"}))
+    with pytest.raises(InvalidObject, match="nested more than 64 levels deep"):
+        check_parameter_schema({"const": deep(levels)})
+
+
+@pytest.mark.parametrize(
+    "items", [{"anyOf": [{"const": 0}] * 1000}, {"enum": list(range(2000))}, {"required": ["a"] * 2000}]
+)
+def test_validation_takes_less_than_a_second_of_processor_time(items):
+    schema = {"properties": {"list": {"items": items}}}
+    for size in (20, 50, 5000):
+        begin_s = time.process_time()
+        with pytest.raises(InvalidObject):
+            check_parameters(flight(parameters={"list": [{}] * size, "list2": 1}), template(parameters=schema))
+        assert time.process_time() - begin_s < 2.0
+
+
+def test_long_list_fits_a_small_schema():
+    schema = {"properties": {"list": {"type": "array", "items": {"type": "number", "minimum": 0}}}}
+    check_parameters(flight(parameters={"list": [1] * 5000}), template(parameters=schema))
+
+
+@pytest.mark.parametrize("schema", [{}, {"additionalProperties": {"type": "number"}}])
+def test_refusal_is_short_although_the_name_of_a_parameter_is_long(schema):
+    with pytest.raises(InvalidObject) as refused:
+        check_parameters(flight(parameters={"x" * 16_000: "a"}), template(parameters=schema))
+    assert len(str(refused.value)) < 700
 
 
 def test_template_without_schema_has_no_parameters():

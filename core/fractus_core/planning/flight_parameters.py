@@ -25,6 +25,16 @@ MAX_SCHEMA_DEPTH = 16
 MAX_PARAMETERS_BYTES = 16_384
 """Maximum size of the parameters as JSON. They are an environment variable, which Linux limits to 128 KiB."""
 
+MAX_NESTING = 64
+"""Maximum nesting of lists and objects in a schema and in parameters."""
+
+MAX_COMPARISONS = 50_000
+"""Maximum product of the numbers of values in a schema and in parameters. The validation may compare each value with each part of
+the schema, and takes up to about 10 µs for a comparison."""
+
+_MAX_FIELD = 200
+"""Maximum length of the path of a field, whose names come from users, in characters."""
+
 _MAX_SENTENCE = 300
 """Maximum length of the reason of a refusal, which may quote a value, in characters."""
 
@@ -53,6 +63,7 @@ def check_parameter_schema(schema: dict[str, Any]) -> None:
     Raises:
         InvalidObject: It is no schema of the draft 2020-12, is too large, or uses a keyword that is refused.
     """
+    _count("the schema", schema)
     size = len(json.dumps(schema))
     if size > MAX_SCHEMA_BYTES:
         message = f"the schema has {size} bytes as JSON, more than {MAX_SCHEMA_BYTES}; shorten it"
@@ -79,7 +90,7 @@ def check_parameters(plan: FlightPlan, template: ApplicationTemplate) -> None:
     if not schema:
         if parameters:
             message = f"ApplicationTemplate {template.name} has no parameters; remove it"
-            raise InvalidObject(f"parameters.{next(iter(parameters))}", message)
+            raise InvalidObject(f"parameters.{next(iter(parameters))}"[:_MAX_FIELD], message)
         return
     try:
         check_parameter_schema(schema)
@@ -88,17 +99,36 @@ def check_parameters(plan: FlightPlan, template: ApplicationTemplate) -> None:
             f"ApplicationTemplate {template.name} has an invalid schema ({error}); ask its developer for a correction"
         )
         raise InvalidObject("parameters", message) from None
+    count = _count("the parameters", parameters)
     size = len(json.dumps(parameters))
     if size > MAX_PARAMETERS_BYTES:
         message = f"the parameters have {size} bytes as JSON, more than {MAX_PARAMETERS_BYTES}; shorten them"
         raise InvalidObject("parameters", message)
-    try:
-        violation = best_match(Draft202012Validator(schema).iter_errors(parameters))
-    except RecursionError:
-        raise InvalidObject("parameters", "the values are nested too deeply; nest them less") from None
+    most = MAX_COMPARISONS // _count("the schema", schema)
+    if count > most:
+        message = f"{count} values are more than the {most} that the schema permits with its size; use fewer values"
+        raise InvalidObject("parameters", message)
+    violation = best_match(Draft202012Validator(schema).iter_errors(parameters))
     if violation is not None:
         required = f"; see the schema of ApplicationTemplate {template.name}"
         raise InvalidObject(_field("parameters", violation), _sentence(violation) + required)
+
+
+def _count(name: str, value: Any) -> int:
+    """Return the number of values in a JSON value, including lists and objects.
+
+    Raises:
+        InvalidObject: The nesting exceeds `MAX_NESTING`.
+    """
+    count = 0
+    level = [value]
+    for _ in range(MAX_NESTING + 1):
+        count += len(level)
+        collections = [each for each in level if isinstance(each, dict | list)]
+        if not collections:
+            return count
+        level = [child for each in collections for child in (each.values() if isinstance(each, dict) else each)]
+    raise InvalidObject("parameters", f"{name}: values are nested more than {MAX_NESTING} levels deep; nest them less")
 
 
 def _subschemas(field: str, schema: Any, depth: int) -> Iterator[tuple[str, dict[str, Any]]]:
@@ -132,7 +162,7 @@ def _field(begin: str, error: ValidationError | SchemaError) -> str:
     field = begin
     for part in error.absolute_path:
         field += f"[{part}]" if isinstance(part, int) else f".{part}"
-    return field
+    return field if len(field) <= _MAX_FIELD else f"{field[:_MAX_FIELD]} ..."
 
 
 def _sentence(error: ValidationError | SchemaError) -> str:

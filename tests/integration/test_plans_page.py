@@ -566,6 +566,34 @@ def test_plans_page_changes_a_restriction_only_in_the_version_that_the_user_has_
     assert (stored["priority"], stored["selector"]) == (7, created["selector"])
 
 
+def test_plans_page_does_not_change_a_restriction_that_the_user_has_left(page: Page, authority: User) -> None:
+    authority("POST", "/v1/restrictions", restriction())
+    open_restrictions(page, authority)
+    page.get_by_role("button", name="Change fair").click()
+    page.get_by_label("Message to users").fill("Winter fair")
+    page.get_by_role("button", name="Show the impact").click()
+    authority("PATCH", "/v1/restrictions/fair", {"zone": {"description": "Spring fair"}}, If_Match="*")
+    pending: list[Route] = []
+
+    def held(route: Route) -> None:
+        pending.append(route)
+
+    page.route("**/v1/restrictions/fair?*", held, times=1)
+    with page.expect_request("**/v1/restrictions/fair?*"):
+        page.get_by_role("button", name="Change the restriction", exact=True).click()
+    page.get_by_role("button", name="Keep the restriction as it is").click()
+    pending[0].continue_()
+    page.get_by_label("Name", exact=True).fill("market")
+    center = at(50, 50)
+    page.get_by_label("Latitude of the centre").fill(str(center["lat"]))
+    page.get_by_label("Longitude of the centre").fill(str(center["lon"]))
+    page.get_by_label("Radius").fill("15")
+    page.get_by_role("button", name="Show the impact").click()
+    page.get_by_role("button", name="Publish the restriction").click()
+    expect(page.locator("#restrictions > li")).to_have_count(2, timeout=TIMEOUT_MS)
+    assert authority("GET", "/v1/restrictions/fair").body["zone"]["description"] == "Spring fair"
+
+
 def test_plans_page_does_not_delete_a_restriction_that_another_user_has_changed(page: Page, authority: User) -> None:
     authority("POST", "/v1/restrictions", restriction())
     open_restrictions(page, authority)

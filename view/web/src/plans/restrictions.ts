@@ -1,7 +1,7 @@
 // Restrictions: list, and for an authority the form with impact, publication, change and deletion.
 
 import { byId, element, setText } from "../elements";
-import { type Api, Problem } from "./api";
+import { type Api, Problem, type Reply } from "./api";
 import { differences, mergePatch } from "./differences";
 import type { MapClicks } from "./map_clicks";
 import type { PlanMap } from "./plan_map";
@@ -198,29 +198,36 @@ export class Restrictions {
     const { content } = this.form;
     const target = this.changed;
     await this.act("restriction-problem", async (client) => {
-      if (target === undefined) this.put((await client.send<Restriction>("POST", "/restrictions", content)).body);
-      else if (!(await this.change(client, target, content))) return;
+      const reply = target === undefined ? await client.send<Restriction>("POST", "/restrictions", content) : await this.change(client, target, content);
+      if (reply === undefined) return;
+      this.put(reply.body);
+      // The user has left the form, or has edited it meanwhile, so that it still changes the restriction.
+      if (this.changed !== target) return;
+      if (target !== undefined && JSON.stringify(this.form.content) !== JSON.stringify(content)) {
+        this.changed = { seen: reply.body, etag: reply.etag };
+        return;
+      }
       this.release();
       byId("restrictions-title").focus();
     });
   }
 
-  /** Changes a restriction. Returns false if another user has changed it, and shows the differences. */
-  private async change(client: Api, target: { seen: Restriction; etag: string }, content: NewRestriction): Promise<boolean> {
+  /** Changes a restriction. Returns undefined if another user has changed it, and shows the differences. */
+  private async change(client: Api, target: { seen: Restriction; etag: string }, content: NewRestriction): Promise<Reply<Restriction> | undefined> {
     const { name, zone, policy } = target.seen;
     const patch = mergePatch({ zone: zone ?? {}, policy }, { zone: content.zone, policy: content.policy });
     try {
-      this.put((await client.send<Restriction>("PATCH", `/restrictions/${name}`, patch, { "If-Match": target.etag })).body);
-      return true;
+      return await client.send<Restriction>("PATCH", `/restrictions/${name}`, patch, { "If-Match": target.etag });
     } catch (error) {
       if (!(error instanceof Problem) || error.status !== 412) throw error;
     }
     const present = await this.read(client, name);
+    if (this.changed !== target) return undefined;
     this.changed = { seen: present.body, etag: present.etag };
     const { name: _name, ...mine } = content;
     const text = differences(contentOf(present.body), mine) || "both versions are equal";
     setText(byId("restriction-problem"), `Another user changed the restriction meanwhile: ${text}. To replace that version by yours, press “Change the restriction” again.`);
-    return false;
+    return undefined;
   }
 
   private async beginChange(restriction: Restriction): Promise<void> {

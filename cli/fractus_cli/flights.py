@@ -335,7 +335,7 @@ def _completed(cluster: ClusterReader, plan: Body) -> bool:
 @click.option("--note", default="", help="Remark of the authority.")
 @kubeconfig_option
 def approve(template: str, yes: bool, note: str, config: str | None) -> None:
-    """Approve the present generation of the ApplicationTemplate TEMPLATE, after a question that shows its content.
+    """Approve the present generation of the ApplicationTemplate TEMPLATE, after a question that shows altitudes, images and methods.
 
     A template that is changed later must be approved again.
     """

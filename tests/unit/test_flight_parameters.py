@@ -19,6 +19,9 @@ SCHEMA = {
 }
 
 
+DRAFT_7 = "http://json-schema.org/draft-07/schema#"
+
+
 def nested(levels):
     schema = {"type": "number"}
     for _ in range(levels):
@@ -105,8 +108,16 @@ def test_template_without_schema_has_no_parameters():
             {"properties": {"speed": {"minimum": "0"}}},
             "parameters.properties.speed.minimum: '0' is not of type 'number'",
         ),
-        ({"$schema": "http://json-schema.org/draft-07/schema#"}, "parameters.$schema: must be https"),
+        ({"$schema": DRAFT_7}, "parameters.$schema: must be https"),
         ({"properties": {"a": {"$ref": "https://example.org/a"}}}, "parameters.properties.a.$ref: the keyword"),
+        (
+            {"properties": {"a": {"$schema": DRAFT_7, "dependencies": {"b": {"pattern": "^(a+)+$"}}}}},
+            "parameters.properties.a.$schema: only the whole schema",
+        ),
+        (
+            {"$id": "http://[::1", "properties": {"a": {"$id": "http://[::1"}}},
+            "parameters.properties.a.$id: only the whole",
+        ),
         ({"$ref": "#"}, "write the referenced schema in its place"),
         ({"anyOf": [{"items": {"pattern": "^(a+)+$"}}]}, "parameters.anyOf[0].items.pattern: the keyword"),
         ({"description": "x" * 20_000}, "more than 16384"),

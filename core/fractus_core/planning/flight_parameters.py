@@ -71,6 +71,10 @@ def check_parameter_schema(schema: dict[str, Any]) -> None:
     if schema.get("$schema", _DIALECT) != _DIALECT:
         raise InvalidObject("parameters.$schema", f"must be {_DIALECT}, or be removed")
     for field, part in _subschemas("parameters", schema, MAX_SCHEMA_DEPTH):
+        # Another draft has other keywords with subschemas, which are not checked here.
+        for keyword in ("$schema", "$id"):
+            if part is not schema and keyword in part:
+                raise InvalidObject(f"{field}.{keyword}", "only the whole schema may have it; remove it")
         for keyword in sorted(part.keys() & _REFUSED.keys()):
             raise InvalidObject(f"{field}.{keyword}", f"the keyword is not permitted; {_REFUSED[keyword]}")
     try:

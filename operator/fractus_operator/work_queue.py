@@ -19,6 +19,8 @@ log = logging.getLogger(__name__)
 
 _FIRST_RETRY_S = 1.0
 _MAX_RETRY_S = 60.0
+_MAX_PAUSE_S = 0.1
+"""Maximum pause after a key that can wait. An attempt whose write takes long needs less processor time than its duration."""
 
 
 async def run_periodically(name: str, step: Callable[[], Awaitable[None]], period_s: float) -> None:
@@ -143,7 +145,8 @@ class WorkQueue:
                 if self._queued(key):
                     self._added.set()
             # An attempt without a write never waits, so the event loop needs this pause.
-            await asyncio.sleep(time.monotonic() - begin_s if queue is self._can_wait else 0)
+            pause_s = min(time.monotonic() - begin_s, _MAX_PAUSE_S) if queue is self._can_wait else 0
+            await asyncio.sleep(pause_s)
 
     def _next(self) -> tuple[dict[Key, None], Key] | None:
         """Return the next key with its queue, or None if all queued keys are in progress."""

@@ -75,6 +75,25 @@ async def test_keys_that_can_wait_neither_delay_other_keys_nor_block_the_event_l
     task.cancel()
 
 
+async def test_new_key_does_not_wait_as_long_as_a_slow_attempt_took() -> None:
+    times_s: dict[Key, float] = {}
+
+    async def reconcile(key: Key) -> None:
+        await asyncio.sleep(1.0 if key == ("", "slow") else 0)
+        times_s[key] = asyncio.get_running_loop().time()
+
+    work_queue = WorkQueue("test", reconcile)
+    work_queue.add(("", "slow"), can_wait=True)
+    task = asyncio.create_task(work_queue.run())
+    await asyncio.sleep(0.1)
+    work_queue.add(("", "new"))
+    async with asyncio.timeout(10):
+        while ("", "new") not in times_s:  # noqa: ASYNC110
+            await asyncio.sleep(0.01)
+    task.cancel()
+    assert times_s["", "new"] - times_s["", "slow"] < 0.8
+
+
 async def test_event_loop_runs_between_attempts_that_do_not_wait() -> None:
     reconciled: list[Key] = []
 

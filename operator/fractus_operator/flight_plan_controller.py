@@ -75,8 +75,10 @@ class FlightPlanController:
 
     def rules_changed(self, key: Key) -> None:
         """Handle a change of policies or zones at the place of a plan."""
-        self._judge_at[key] = 0.0
-        self._queue(key)
+        # Many policies may change before a plan is judged.
+        if self._judge_at.get(key) != 0.0:
+            self._judge_at[key] = 0.0
+            self._queue(key)
 
     def application_changed(self, key: Key) -> None:
         """Handle a change of an Application or of its DeploymentPlan."""

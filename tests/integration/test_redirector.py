@@ -12,6 +12,7 @@ from ipaddress import IPv4Address
 from pathlib import Path
 
 import pytest
+from control_plane import wait_for
 from fractus_agent.links.device_addresses import DeviceAddresses
 from fractus_agent.redirector import redirector as module
 from fractus_agent.redirector.connections import Conntrack, PodNamespaces
@@ -323,7 +324,8 @@ def test_guarded_pod_accepts_only_calls_over_links(world: Rig, redirector: Redir
     def reached(address: str, node: str = other_pod) -> bool:
         return world.reaches(node, address, POD.port)
 
-    assert reached(str(POD.address))
+    # The first packets wait until the link of the new pod is up.
+    wait_for(lambda: reached(str(POD.address)), "the pod to be reachable")
     assert reached("10.96.0.9")
     edge = Redirector(world.maps("edge"), Conntrack(world.netlink("edge")), PodNamespaces(None))
     edge.set_services([], {POD: frozenset()})

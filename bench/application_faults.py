@@ -1,4 +1,4 @@
-"""Faults of an application against its test: the test must find nothing in the unmodified program, and every fault of a table.
+"""Check that the test of an application finds each of its known faults, and nothing in the unmodified program.
 
 The faults and the checks of the test are in tests/integration/inspection_faults.py. Each fault is flown on a virtual drone
 with real services. A flight takes about half a minute.

@@ -32,14 +32,12 @@ SPACING_S = 240.0
 """Time between the starts of two open plans. The last of 10,000 starts in 28 days."""
 
 _EDITOR = ("fractus-flightplan-editor",)
-_VIEWER = (
-    "fractus-drone-viewer", "fractus-applicationtemplate-viewer",
-)  # fmt: skip
+_VIEWER = ("fractus-drone-viewer", "fractus-applicationtemplate-viewer")
 _TIMEOUT_S = 600.0
 
 
 def open_plan(number: int) -> Body:
-    """Return an accepted plan, each with its own place and time."""
+    """Return an accepted plan. Each number has its own place and time."""
     start = datetime.now(UTC) + timedelta(seconds=86_400 + number * SPACING_S)
     drone = f"drone-{1 + number % DRONES}"
     north_m = 2000 + 200 * (number % 100)

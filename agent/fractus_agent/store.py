@@ -364,7 +364,7 @@ class Store:
     async def plan_with_records(self, token: str, namespace: str, name: str) -> Object:
         """Return a FlightPlan whose records the holder of a token may read.
 
-        The API server is asked with this token, so the agent needs no permission on plans of any user.
+        The requests are authorised with this token, so the agent needs no permissions on FlightPlans.
 
         Raises:
             KubeError: The holder may not read the plan or its records, the plan does not exist, or the API server does not respond.

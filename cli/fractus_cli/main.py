@@ -75,7 +75,7 @@ COMMANDS: dict[str, Entry] = {
     "flights": Entry("fractus_cli.flights:flights", "Order, start, watch and end flights of approved applications.", "operator"),
     "gateway": Entry("fractus_services.commands:gateway", "Run the gateway for MAVLink programs.", "services"),
     "grants": Entry("fractus_cli.grants:grants", "Sign Grants and issue certificates, without Kubernetes.", "operator"),
-    "images": Entry("fractus_cluster.images.cli:images", "Build the container images of Fractus with buildah.", "sim"),
+    "images": Entry("fractus_cluster.images.cli:images", "Build and list the container images of Fractus.", "sim"),
     "init": Entry("fractus_cli.init:init", "Write the files of a new application.", "model"),
     "mobility": Entry("fractus_services.commands:mobility", "Run the mobility service of a drone.", "services"),
     "plan": Entry("fractus_cli.plan:plan", "Plan Applications from manifests, without a cluster.", "geometry"),

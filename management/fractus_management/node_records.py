@@ -89,8 +89,7 @@ class RecordingNode:
         """Send a request. The agent closes the connection after each response."""
         timeout = aiohttp.ClientTimeout(total=timeout_s, sock_connect=CONNECT_TIMEOUT_S)
         # Agents do not compress. A small compressed response of a compromised node could expand to any size.
-        session_of_node = aiohttp.ClientSession(timeout=timeout, trust_env=False, auto_decompress=False)
-        async with session_of_node as session:
+        async with aiohttp.ClientSession(timeout=timeout, trust_env=False, auto_decompress=False) as session:
             try:
                 response = await session.get(
                     url,

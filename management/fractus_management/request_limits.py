@@ -1,4 +1,4 @@
-"""Limits of requests and event streams for each token, and of pages of records for each drone."""
+"""Limits of requests and streams (events and pictures) for each token, and of pages of records for each drone."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ MAX_TOKENS = 10_000
 
 
 class RequestLimits:
-    """Counts the requests and the open event streams of each token.
+    """Counts the requests and the open streams of each token, and the pages that are read from each drone.
 
     Args:
         settings: The limits.
@@ -34,7 +34,7 @@ class RequestLimits:
 
     @property
     def streams(self) -> int:
-        """Number of open event streams."""
+        """Number of open event streams and transfers of pictures."""
         return self._streams.total()
 
     def admit(self, token_hash: bytes) -> None:
@@ -57,7 +57,7 @@ class RequestLimits:
 
     @contextmanager
     def stream(self, token_hash: bytes) -> Iterator[None]:
-        """Count an event stream while it is open.
+        """Count an event stream or the transfer of a picture while it is open.
 
         Raises:
             Refused: Too many streams are open.
@@ -81,10 +81,10 @@ class RequestLimits:
         """Count a page of records while it is read. A compromised drone could send many large pages slowly.
 
         Raises:
-            Refused: Too many pages of the drone are read.
+            Refused: Too many pages are being read from the drone.
         """
         if self._pages[drone] >= self._settings.max_pages_of_drone:
-            message = f"{drone} reads records for other requests; try again"
+            message = f"{drone} is reading records for other requests; try again"
             raise refused(HTTPStatus.SERVICE_UNAVAILABLE, "NodeBusy", message)
         self._pages[drone] += 1
         try:

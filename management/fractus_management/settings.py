@@ -32,8 +32,8 @@ class Settings:
         max_body_bytes: Maximum size of a request body in bytes.
         body_timeout_s: Seconds within which a request body must arrive.
         requests_per_s: Requests that a token may send per second in the long run. It may send five times as many at once.
-        max_streams: Maximum number of open event streams of this process.
-        max_streams_of_token: Maximum number of open event streams of a token.
+        max_streams: Maximum number of open event streams and transfers of pictures of this process.
+        max_streams_of_token: Maximum number of open event streams and transfers of pictures of a token.
         max_pages_of_drone: Maximum number of pages of records that are read from a drone at the same time.
         keepalive_s: Seconds without an event after which a stream sends a comment.
         automated_testing: Settings of the adapter for InterUSS' automated testing. None: the adapter is not served.

@@ -253,12 +253,12 @@ class ClusterCache:
     def flight_inventory(self, plan: FlightPlan, now_s: float, own: str | None) -> Inventory:
         """Return the input for matching a flight plan with a drone. The result is valid until the next await.
 
-        Claims that end before the window are missing, and bookings are missing if the window begins later than `SOON_S`.
+        Claims that end before the window are omitted. Bookings are omitted if the window begins later than `SOON_S`.
 
         Args:
             plan: The plan.
             now_s: Time in seconds since 1970 UTC.
-            own: Uid of the plan whose reservation is missing, because the plan may use it.
+            own: Uid of the plan whose reservation is omitted, because `plan` may use it.
         """
         begin_s = max(plan.spec.window.begin_s, now_s)
         inventory = self.snapshot(("", ""), "")
@@ -404,7 +404,7 @@ class ClusterCache:
             self._restriction_changed(None, old, new)
 
     def _restriction_changed(self, zones: Sequence[Zone] | None, old: Any, new: Any) -> None:
-        """Report the flight plans that a changed policy or zone may concern. Zones of None concern all plans."""
+        """Report the flight plans in some zones that a changed policy or zone may concern. None: report all plans."""
         if old is not None and new is not None and type(old) is type(new) and old.spec == new.spec:
             return
         self._report_flights(self.flights.keys() if zones is None else self.flights.in_zones(zones))

@@ -102,7 +102,7 @@ class FlightPlanController:
         self.work_queue.add(key, can_wait=self._can_wait(key))
 
     def _can_wait(self, key: Key) -> bool:
-        """Return True if other plans come first: a plan is decided, is unchanged, and flies later or not at all."""
+        """Return True if other plans come first: the plan is decided and unchanged, and flies later or not at all."""
         plan = self._cache.flight_plans.get(key)
         if not isinstance(plan, FlightPlan) or plan.status is None or plan.spec.use == "Closed":
             return False

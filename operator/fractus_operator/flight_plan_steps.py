@@ -72,7 +72,10 @@ class PlanSituation:
 
     @property
     def name(self) -> str:
-        """namespace/name of the plan, or of the plan whose change a dry run decides. The reservation of this plan is its own."""
+        """namespace/name of the plan, or of the plan whose change a dry run decides.
+
+        The plan does not conflict with the reservation under this name.
+        """
         return f"{self.plan.metadata.namespace or 'default'}/{self.plan.spec.change_of or self.plan.name}"
 
     @property
@@ -285,7 +288,7 @@ def _refuse_change(now: PlanSituation, refusals: tuple[PlanFinding, ...]) -> Pla
 def _rematch(now: PlanSituation, *, soon: bool) -> PlanStep:
     """Check that the drone is suitable and the policies allow the flight. Select another drone if the reserved one is not.
 
-    Policies may change again before the flight, so a plan that they do not allow any more stays accepted until its start.
+    Policies may change again before the flight, so a plan that they no longer allow stays accepted until its start.
     """
     try:
         match = _match(now)
@@ -319,7 +322,7 @@ def _without_drone(now: PlanSituation, unfit: Unfit) -> PlanStep:
 def _judged(
     now: PlanSituation, findings: tuple[PlanFinding, ...], restrictions: tuple[PlanRestriction, ...]
 ) -> PlanStep:
-    """Keep an accepted plan with what the present policies say about it."""
+    """Keep an accepted plan, with its conflicts with the present policies and their restrictions."""
     status = now.status.model_copy(update={"advisories": findings, "restrictions": restrictions})
     plan = now.plan.model_copy(update={"status": status})
     return replace(_keep(replace(now, plan=plan)), next_s=_until_start_s(now))

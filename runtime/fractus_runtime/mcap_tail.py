@@ -59,7 +59,7 @@ class Tail:
 
     Args:
         path: MCAP file.
-        max_record_bytes: Larger records, compressed or not, are skipped, which bounds the memory of the reader.
+        max_record_bytes: Maximum size of a record, also after decompression. Larger records are skipped, to limit memory.
 
     Attributes:
         finished: True if the writer closed the file and all its messages were read.

@@ -1,4 +1,4 @@
-"""Recording endpoint of the agent over TLS, with a fake of the API server's answers."""
+"""Recording endpoint of the agent over TLS, with a fake API server."""
 
 from __future__ import annotations
 

@@ -606,7 +606,7 @@ def test_plans_page_does_not_delete_a_restriction_that_another_user_has_changed(
     assert authority("GET", "/v1/restrictions/fair").status == 200
 
 
-def test_plans_page_says_why_a_user_cannot_publish_restrictions(page: Page, pilot: User) -> None:
+def test_plans_page_shows_why_a_user_cannot_publish_restrictions(page: Page, pilot: User) -> None:
     open_restrictions(page, pilot)
     expect(page.locator("#publish-permission")).to_contain_text("fractus-policy-editor and fractus-zone-editor")
     expect(page.locator("#restrictions")).to_contain_text("fractus-policy-viewer and fractus-zone-viewer")
@@ -743,7 +743,7 @@ def test_plans_page_reads_records_from_the_start_of_the_flight_on(page: Page, pi
         (503, "drone-1 does not respond", "drone-1 does not respond"),
     ],
 )
-def test_plans_page_says_why_there_are_no_records(
+def test_plans_page_shows_why_there_are_no_records(
     page: Page, pilot: User, world: World, status: int, detail: str, sentence: str
 ) -> None:
     problem = {"status": status, "detail": detail}

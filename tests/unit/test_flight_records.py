@@ -302,7 +302,7 @@ def test_large_pictures_are_not_read(pictures: Path, flight: PlannedFlight, monk
     write_pictures(pictures / "000004-20260601T121200Z.mcap", [(800, f"u/{VIEWER}", jpeg(8))])
     assert len(read_pictures(pictures, flight, 10, "").items) == 4
     # The large picture is compressed to less than the limit.
-    monkeypatch.setattr(picture_records, "MAX_RECORD_BYTES", 2**30)
+    monkeypatch.setattr(picture_records, "MAX_PICTURE_RECORD_BYTES", 2**30)
     assert len(read_pictures(pictures, flight, 10, "").items) == 5
 
 

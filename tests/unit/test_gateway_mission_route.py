@@ -113,7 +113,7 @@ def test_circle_is_flown_as_legs_between_its_points_from_the_nearest_one_on(radi
 
 
 @pytest.mark.parametrize(("turns", "legs"), [(0.0, 1), (0.5, 9), (1.0, 17), (3.0, 49)])
-def test_circle_is_repeated_as_often_as_its_item_says(turns: float, legs: int) -> None:
+def test_circle_is_repeated_as_often_as_its_item_requires(turns: float, legs: int) -> None:
     requests, _ = _requests(_circle(turns), HERE)
     assert len(requests) == legs
     assert _corners(requests)[0][0] == pytest.approx(10.0)

@@ -144,7 +144,7 @@ def test_streams_are_limited_for_each_token_and_in_total(limits: RequestLimits) 
 def test_pages_of_records_are_limited_for_each_drone() -> None:
     limits = RequestLimits(Settings(max_pages_of_drone=1))
     with limits.page_of_drone("drone-1"), limits.page_of_drone("drone-2"):
-        with pytest.raises(Refused, match="drone-1 reads records") as refusal, limits.page_of_drone("drone-1"):
+        with pytest.raises(Refused, match="drone-1 is reading records") as refusal, limits.page_of_drone("drone-1"):
             pass
         assert (refusal.value.status, refusal.value.reasons[0].reason) == (503, "NodeBusy")
     with limits.page_of_drone("drone-1"):

@@ -70,7 +70,11 @@ def read_track(directory: Path, flight: PlannedFlight, limit: int, continue_: st
 def _page(
     logs: tuple[Path, ...], flight: PlannedFlight, wanted: type[Record], limit: int, continue_: str
 ) -> Page[Record]:
-    """Return a page. The logs are read from the begin of the flight each time, because earlier entries decide about later ones."""
+    """Return a page.
+
+    The logs are read from the start of the flight for each page, because earlier entries determine which later entries belong to
+    the flight.
+    """
     reached = list(_parse_continue(continue_))
     items: list[Record] = []
     with ExitStack() as stack:
@@ -114,11 +118,12 @@ def _records(
 
 
 def _entries(stack: ExitStack, log: Path, flight: PlannedFlight) -> Iterator[dict[str, Any]]:
-    """Yield the entries of a log in the time of a flight that may matter to it. Lines that are not entries are skipped."""
+    """Yield the entries of a log that may belong to a flight. Lines that are not entries are skipped."""
     own = f"/ns/{flight.namespace}/app/{flight.application}/".encode()
     for file in _files(stack, log, flight):
         for line in file:
-            # Most entries are calls of other flights. In a text of JSON, quotes are escaped, so that no text looks like a kind.
+            # Skip calls of other flights, which are most entries, without parsing them. Quotes inside JSON strings are escaped, so
+            # this text cannot occur inside a string.
             if b'"kind":"call"' in line and own not in line:
                 continue
             try:

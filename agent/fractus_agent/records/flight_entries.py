@@ -27,8 +27,9 @@ _MAX_TEXT = 1000
 class FlightEntries:
     """Selects the entries of one log, which must be taken in their order.
 
-    Entries about the vehicle belong to the flight from its first Grant until its last Grant is removed, and either the drone is
-    on the ground or a driver of another application has control. Entries about components of other applications never belong to it, even on a shared flight.
+    Entries about the vehicle belong to the flight from its first Grant on. The flight ends when it has no Grant, and the drone is
+    on the ground or a driver of another application has control. Entries about components of other applications never belong
+    to the flight, even if the applications share it.
 
     Args:
         flight: The flight.
@@ -134,7 +135,11 @@ def _verdict(kind: VerdictKind, time: datetime, entry: Mapping[str, Any]) -> Fli
 
 
 def _text(value: object) -> str:
-    """Return a text. The log contains bytes that are not UTF-8, as in file names, as lone surrogates, which are not valid JSON."""
+    """Return a value as text.
+
+    The log represents bytes that are not UTF-8, such as those of file names, as lone surrogates. They are escaped, because UTF-8
+    cannot encode them.
+    """
     return str(value)[:_MAX_TEXT].encode(errors="backslashreplace").decode() if value else ""
 
 

@@ -19,7 +19,7 @@ from fractus_runtime.mcap_tail import DamagedFile, RecordedMessage, Tail
 from fractus_agent.records.audit_records import InvalidContinue, Page
 from fractus_agent.records.planned_flight import PlannedFlight
 
-MAX_RECORD_BYTES = 8_000_000
+MAX_PICTURE_RECORD_BYTES = 8_000_000
 """Maximum size of a record that is read: a picture of 6 MB, for which the agent needs 45 MB. Larger pictures are not returned."""
 
 _SEGMENT = re.compile(r"(?P<number>[0-9]{6,9})-(?P<time>[0-9]{8}T[0-9]{6}Z)\.mcap")
@@ -59,7 +59,7 @@ def read_pictures(directory: Path, flight: PlannedFlight, limit: int, continue_:
         NotRecorded: There is no directory.
         OSError: The directory cannot be read.
     """
-    reached = parse_id(continue_) if continue_ else _PictureId(-1, 0, 0)
+    reached = _parse_id(continue_) if continue_ else _PictureId(-1, 0, 0)
     if reached is None:
         raise InvalidContinue("continue: use the value of the previous page, or omit it for the first page")
     items: list[RecordedPicture] = []
@@ -87,13 +87,13 @@ def read_pictures(directory: Path, flight: PlannedFlight, limit: int, continue_:
 def read_picture(directory: Path, flight: PlannedFlight, id_: str) -> bytes | None:
     """Return a picture (JPEG) of a flight, or None if the flight has no picture with this id.
 
-    The segment is read from its begin. A location that is not that of a message is therefore never read.
+    The segment is read from its start, so an id that does not refer to a message never causes a read at its offset.
 
     Raises:
         NotRecorded: There is no directory.
         OSError: The directory cannot be read.
     """
-    wanted = parse_id(id_)
+    wanted = _parse_id(id_)
     if wanted is None:
         return None
     for segment in _segments(directory, flight):
@@ -105,7 +105,7 @@ def read_picture(directory: Path, flight: PlannedFlight, id_: str) -> bytes | No
     return None
 
 
-def parse_id(text: str) -> _PictureId | None:
+def _parse_id(text: str) -> _PictureId | None:
     """Parse the id of a picture, or return None if it is invalid."""
     match = _ID.fullmatch(text)
     return _PictureId(*map(int, match.groups())) if match is not None else None
@@ -138,7 +138,7 @@ def _segments(directory: Path, flight: PlannedFlight) -> Iterator[_Segment]:
 def _pictures(segment: _Segment, flight: PlannedFlight) -> Iterator[RecordedMessage]:
     """Yield the pictures of a flight in a segment. The rest of a damaged segment is skipped."""
     with suppress(DamagedFile, OSError):
-        for message in Tail(segment.path, MAX_RECORD_BYTES).read():
+        for message in Tail(segment.path, MAX_PICTURE_RECORD_BYTES).read():
             if (
                 message.schema == "foxglove.CompressedImage"
                 and flight.owns(_identity(message))

@@ -78,7 +78,7 @@ class _Transfer:
 
 
 class RecordServer:
-    """The server.
+    """HTTPS server of the recording endpoint.
 
     Args:
         listen: HOST:PORT.
@@ -194,7 +194,7 @@ class RecordServer:
         try:
             await asyncio.wait_for(self._turn.acquire(), TURN_TIMEOUT_S)
         except TimeoutError:
-            message = f"{self._node} reads other records; try again"
+            message = f"{self._node} is reading records for other requests; try again"
             raise Refused(HTTPStatus.SERVICE_UNAVAILABLE, "NodeBusy", message) from None
         try:
             media_type, content = await asyncio.to_thread(read, request, flight)
@@ -213,7 +213,7 @@ class RecordServer:
         return await self._transfer(request, media_type, content)
 
     async def _transfer(self, request: web.Request, media_type: str, content: bytes) -> web.StreamResponse:
-        """Send records while others are read. Callers that receive slowly therefore keep no other caller out."""
+        """Send records. The next request is read meanwhile, so slow callers do not block other callers."""
         others = self._transfers
         while others and (
             len(others) >= MAX_TRANSFERS or sum(each.size for each in others) + len(content) > MAX_UNSENT_BYTES
@@ -298,7 +298,7 @@ async def _listener(listen: str) -> socket.socket:
 
 
 async def _begin(connection: socket.socket, factory: ConnectionLimit, context: ssl.SSLContext) -> None:
-    """Perform the TLS handshake of a connection. Then the web server handles it."""
+    """Perform the TLS handshake of a connection, and pass the connection to the web server."""
     loop = asyncio.get_running_loop()
     try:
         await loop.connect_accepted_socket(

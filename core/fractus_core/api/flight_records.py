@@ -68,7 +68,10 @@ class RecordedPicture(OpenModel):
 
 
 _CONTINUE = Field(
-    default=None, alias="continue", max_length=64, description="Parameter of the next page; unset: no more for now."
+    default=None,
+    alias="continue",
+    max_length=64,
+    description="Parameter `continue` of the next page; unset: no more records for now.",
 )
 
 

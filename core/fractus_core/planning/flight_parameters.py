@@ -61,7 +61,7 @@ def check_parameter_schema(schema: dict[str, Any]) -> None:
     """Check the schema of a template.
 
     Raises:
-        InvalidObject: It is no schema of the draft 2020-12, is too large, or uses a keyword that is refused.
+        InvalidObject: The schema is not valid in the draft 2020-12, is too large, or uses a refused keyword.
     """
     _count("the schema", schema)
     size = len(json.dumps(schema))
@@ -162,7 +162,7 @@ def _subschemas(field: str, schema: Any, depth: int) -> Iterator[tuple[str, dict
 
 
 def _field(begin: str, error: ValidationError | SchemaError) -> str:
-    """Return the path of the value that violates a schema. A missing property is the field itself."""
+    """Return the path of the value that violates a schema. For a missing property, this is the path of its object."""
     field = begin
     for part in error.absolute_path:
         field += f"[{part}]" if isinstance(part, int) else f".{part}"

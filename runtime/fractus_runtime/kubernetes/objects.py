@@ -10,7 +10,7 @@ from typing import Any
 
 log = logging.getLogger(__name__)
 
-MAX_NESTING = 200
+_MAX_NESTING = 200
 """Nesting of lists and objects beyond which values of a very deep response are dropped."""
 
 _TOKEN = re.compile(rb'"[^"\\]*(?:\\.[^"\\]*)*"|[][{}]', re.DOTALL)
@@ -53,7 +53,7 @@ def parse_response(content: bytes) -> Any:
     """Return the JSON value of a response or a watch event of the API server.
 
     The API server accepts 10,000 levels in fields without a schema, which Python cannot parse. Values that are nested more
-    than `MAX_NESTING` levels deep are then null, because one such object must not make its whole collection unreadable.
+    than `_MAX_NESTING` levels deep are then null, because one such object must not make its whole collection unreadable.
 
     Raises:
         ValueError: The content is not JSON.
@@ -61,7 +61,7 @@ def parse_response(content: bytes) -> Any:
     try:
         return json.loads(content)
     except RecursionError:
-        log.warning("kubernetes: values that are nested too deeply dropped (bytes=%d)", len(content))
+        log.warning("kubernetes: deeply nested values dropped (bytes=%d)", len(content))
         return json.loads(_without_deep_values(content))
 
 
@@ -73,11 +73,11 @@ def _without_deep_values(content: bytes) -> bytes:
     for token in _TOKEN.finditer(content):
         if token[0] in {b"{", b"["}:
             depth += 1
-            if depth == MAX_NESTING + 1:
+            if depth == _MAX_NESTING + 1:
                 parts += (content[kept : token.start()], b"null")
                 kept = len(content)
         elif token[0] in {b"}", b"]"}:
-            if depth == MAX_NESTING + 1:
+            if depth == _MAX_NESTING + 1:
                 kept = token.end()
             depth -= 1
     return b"".join((*parts, content[kept:]))

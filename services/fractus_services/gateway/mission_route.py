@@ -231,7 +231,7 @@ def _circle(item: Item, at: Place) -> list[Place]:
 
 
 def _approach(mission: Mission, number: int, at: Place) -> list[Place]:
-    """Return the place at the distance of a CONDITION_DISTANCE before the next waypoint; none if the drone is nearer."""
+    """Return the place at which a CONDITION_DISTANCE ends, or no place if the drone is already nearer to the next waypoint."""
     following = mission.peek_after(number)
     if following is None or mission.items[following].command not in _LEGS:
         return []

@@ -15,7 +15,7 @@ from fractus_cluster.images.store import ImageStore
 
 @click.group()
 def images() -> None:
-    """Build the container images of Fractus from its Dockerfile with buildah."""
+    """Build the container images of Fractus from its Dockerfile with buildah, and list them."""
 
 
 @images.command()
@@ -44,6 +44,6 @@ def build(targets: tuple[str, ...], source: Path | None, tag: str, force: bool, 
 
 @images.command("list")
 def list_images() -> None:
-    """Print the images that clusters of this machine have, by digest, as templates of flights name them."""
+    """Print the images of the clusters on this machine with their digests, as ApplicationTemplates name images."""
     for image in ImageStore.default(report=print_report).layout.images().values():
         click.echo(image.pinned_name)

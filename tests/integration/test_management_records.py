@@ -14,7 +14,8 @@ from record_node import Flight, RecordNode, publish_address, started
 
 
 def test_records_of_a_flight_are_returned(served_flight: Flight) -> None:
-    user, path = served_flight.user, served_flight.path
+    user = served_flight.user
+    path = served_flight.path
     (verdict,) = user("GET", f"{path}/verdicts").body["items"]
     assert (verdict["component"], verdict["action"], verdict["reason"]) == ("Navigator", "deny", "too far")
     first = user("GET", f"{path}/track?limit=1").body
@@ -56,7 +57,8 @@ def test_hostile_parameters_are_refused(served_flight: Flight) -> None:
 def test_records_need_the_permission_on_records(
     served_flight: Flight, record_api: ManagementServer, observer: User, world: World
 ) -> None:
-    path, namespace = served_flight.path, served_flight.user.namespace
+    path = served_flight.path
+    namespace = served_flight.user.namespace
     problem(observer.at(record_api)("GET", f"{path}/verdicts"), 403)
     token = user_token(world, namespace, "reader", ("fractus-flightplan-viewer",), ("fractus-drone-viewer",))
     reader = User(record_api, token, namespace)
@@ -69,7 +71,8 @@ def test_records_need_the_permission_on_records(
 def test_missing_endpoint_is_explained(
     recorded_flight: Flight, world: World, record_node: RecordNode, record_api: ManagementServer
 ) -> None:
-    user, path = recorded_flight.user, recorded_flight.path
+    user = recorded_flight.user
+    path = recorded_flight.path
     (reason,) = problem(user("GET", f"{path}/track"), 503)
     assert (reason["reason"], "management.records.enabled" in reason["message"]) == ("RecordsNotServed", True)
     publish_address(world, f"127.0.0.1:{record_node.port}")

@@ -501,7 +501,9 @@ async def test_plan_is_judged_again_when_its_drone_gets_an_attribute_that_a_poli
     assert conditions(await world.step()).get("Restricted") == ("True", "PolicyConflict")
 
 
-async def test_policy_that_changes_during_the_write_of_a_judgement_is_judged_next() -> None:
+async def test_policy_that_changes_during_the_write_of_a_judgement_is_judged_next(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     world = World()
     await world.step()
     world.api.put(kinds.ZONE, zone("z", (60, 70), 20).to_dict())
@@ -510,12 +512,12 @@ async def test_policy_that_changes_during_the_write_of_a_judgement_is_judged_nex
     write = world.api._write
 
     def write_while_the_policy_is_deleted(*arguments: Any) -> Any:
-        world.api._write = write  # type: ignore[method-assign]
+        monkeypatch.setattr(world.api, "_write", write)
         world.api.objects.pop(kinds.POLICY.path("", "keep-out"))
         world.watch()
         return write(*arguments)
 
-    world.api._write = write_while_the_policy_is_deleted  # type: ignore[method-assign]
+    monkeypatch.setattr(world.api, "_write", write_while_the_policy_is_deleted)
     status = await world.step()
     assert conditions(status)["Restricted"] == ("True", "PolicyConflict")
     assert "Restricted" not in {n for n, (value, _) in conditions(await world.step()).items() if value == "True"}
@@ -530,16 +532,18 @@ async def test_new_plan_is_decided_before_accepted_plans_are_judged_again() -> N
     world.api.put(kinds.FLIGHT_PLAN, plan_named("new", "u-new").to_dict())
     world.watch()
     world.controller.changed(("team", "new"))
-    decided = []
+    decided: list[str] = []
+    done = asyncio.Event()
 
     async def reconcile(key: Key) -> None:
         decided.append(key[1])
+        if len(decided) == len(names):
+            done.set()
 
     world.controller.work_queue._reconcile = reconcile
     task = asyncio.create_task(world.controller.work_queue.run())
     async with asyncio.timeout(5):
-        while len(decided) < 3:  # noqa: ASYNC110
-            await asyncio.sleep(0)
+        await done.wait()
     task.cancel()
     assert decided[0] == "new"
 

@@ -54,33 +54,41 @@ async def test_key_is_reconciled_once_for_many_changes() -> None:
 
 async def test_keys_that_can_wait_neither_delay_other_keys_nor_block_the_event_loop() -> None:
     reconciled: list[Key] = []
+    begun = asyncio.Event()
+    new = asyncio.Event()
 
     async def reconcile(key: Key) -> None:
         reconciled.append(key)
+        if len(reconciled) == 10:
+            begun.set()
+        if key == ("", "new"):
+            new.set()
 
     work_queue = WorkQueue("test", reconcile)
     for number in range(100):
         work_queue.add(("", f"later-{number}"), can_wait=True)
     task = asyncio.create_task(work_queue.run())
-    while len(reconciled) < 10:  # noqa: ASYNC110 - the queue runs in between
-        await asyncio.sleep(0)
+    async with asyncio.timeout(5):
+        await begun.wait()
     work_queue.add(("", "later-99"))
     work_queue.add(("", "new"))
     before = len(reconciled)
     assert before < 50
     async with asyncio.timeout(5):
-        while ("", "new") not in reconciled:  # noqa: ASYNC110
-            await asyncio.sleep(0)
+        await new.wait()
     assert reconciled[before:] == [("", "later-99"), ("", "new")]
     task.cancel()
 
 
 async def test_new_key_does_not_wait_as_long_as_a_slow_attempt_took() -> None:
     times_s: dict[Key, float] = {}
+    new = asyncio.Event()
 
     async def reconcile(key: Key) -> None:
         await asyncio.sleep(1.0 if key == ("", "slow") else 0)
         times_s[key] = asyncio.get_running_loop().time()
+        if key == ("", "new"):
+            new.set()
 
     work_queue = WorkQueue("test", reconcile)
     work_queue.add(("", "slow"), can_wait=True)
@@ -88,8 +96,7 @@ async def test_new_key_does_not_wait_as_long_as_a_slow_attempt_took() -> None:
     await asyncio.sleep(0.1)
     work_queue.add(("", "new"))
     async with asyncio.timeout(10):
-        while ("", "new") not in times_s:  # noqa: ASYNC110
-            await asyncio.sleep(0.01)
+        await new.wait()
     task.cancel()
     assert times_s["", "new"] - times_s["", "slow"] < 0.8
 
